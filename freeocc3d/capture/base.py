@@ -1,0 +1,81 @@
+"""The contract of a capture: a folder of frames that are decoded one at a time.
+
+A reader is one file of this folder with a class ``Reader(Capture)``. It finds its files and intrinsics when it is
+constructed (cheaply: nothing is decoded), and decodes frame i when asked. Everything that is peculiar to a format
+(units, axes, file names, invalid values) ends here: what leaves a reader follows the conventions of ``types``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import Frame
+
+
+@dataclass(frozen=True)
+class Options:
+    """How any capture is read."""
+
+    format: str = "auto"
+    """Name of the reader, or "auto" to recognise the layout of the folder."""
+    start: int = 0
+    """First frame that is used."""
+    stop: int | None = None
+    """Frame before which to stop; null = the last."""
+    stride: int = 1
+    """Use every n-th frame."""
+    depth_scale: float | None = None
+    """Depth units per metre (1000 for millimetres); null = what the format or its files say."""
+    max_depth: float = 6.0
+    """Depth beyond this many metres counts as not measured."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """fx, fy, cx, cy of the colour image in pixels, in place of what the files say."""
+    max_broken: float = 0.1
+    """Share of the frames that may be unreadable before the run stops."""
+
+
+class Capture(ABC):
+    """A captured scan of N frames. Constructing a reader raises CaptureError for a folder that it cannot read."""
+
+    format: ClassVar[str]
+    """The reader's name, the same as its file's."""
+    layout: ClassVar[str]
+    """What ``recognises`` looks for, in words, for the message about an unrecognised folder."""
+
+    path: Path
+    timestamps: NDArray[np.float64]
+    """(N,) seconds, ascending; 0, 1, 2, … where the format has none."""
+    classes: tuple[str, ...] = ()
+    """Names of the class images' values, index 0 = nothing; empty where the capture has no class images."""
+
+    def __init__(self, path: Path, options: Options):
+        self.path = path
+        self.options = options
+
+    @classmethod
+    @abstractmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether the folder ``path`` has this format's layout (cheap: looks at names only)."""
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @abstractmethod
+    def __getitem__(self, index: int) -> Frame:
+        """Decode frame ``index``. Thread-safe. Raises FrameError if one of its files is missing or broken."""
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        """(4, 4) T_world_cam that the capture states for the frame, or None. Read by the ``known`` tracker and by
+        evaluation alone."""
+        return None
+
+    def labels(self, index: int) -> NDArray[np.uint8] | None:
+        """(H, W) class image of the frame (values index ``classes``, 0 = nothing), or None. Read by the ``labels``
+        encoder and by evaluation alone."""
+        return None

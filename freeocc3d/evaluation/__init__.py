@@ -1,0 +1,1 @@
+"""Scores of trajectories and maps against the truth."""

@@ -1,0 +1,124 @@
+"""Rigid and similarity transforms, quaternions, pinhole projection. NumPy only; poses are ``T_to_from`` (4, 4)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import FreeOccError
+from .types import Intrinsics
+
+Array = NDArray[np.floating]
+
+
+def invert(T_a_b: Array) -> Array:
+    """Inverse of rigid transforms, (..., 4, 4) to (..., 4, 4): T_b_a."""
+    R = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    out = np.zeros_like(T_a_b)
+    out[..., :3, :3] = R
+    out[..., :3, 3] = -(R @ T_a_b[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def transform(T_a_b: Array, points_b: Array) -> Array:
+    """Move points: (4, 4), (..., 3) in frame b to (..., 3) in frame a, in the points' dtype."""
+    T = np.asarray(T_a_b, points_b.dtype)
+    return points_b @ T[:3, :3].T + T[:3, 3]
+
+
+def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
+    """Whether a (4, 4) matrix is finite, has last row (0, 0, 0, 1) and a rotation of determinant +1."""
+    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[3] - (0, 0, 0, 1)).max() > tolerance:
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < tolerance and np.linalg.det(R) > 0)
+
+
+def quats_to_rotations(quats_wxyz: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) wxyz to rotation matrices (..., 3, 3)."""
+    w, x, y, z = np.moveaxis(np.asarray(quats_wxyz), -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotations_to_quats(R: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) to unit quaternions (..., 4) wxyz with w >= 0 (Shepperd's method: the largest of
+    the four squared components is computed first, so that nothing is divided by a small number)."""
+    R = np.asarray(R)
+    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    squares = np.stack((1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22), -1)
+    wx, wy, wz = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
+    candidates = np.stack(
+        [
+            np.stack((squares[..., 0], wx, wy, wz), -1),
+            np.stack((wx, squares[..., 1], xy, xz), -1),
+            np.stack((wy, xy, squares[..., 2], yz), -1),
+            np.stack((wz, xz, yz, squares[..., 3]), -1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(squares, axis=-1)[..., None, None]
+    quats = np.take_along_axis(candidates, best, axis=-2)[..., 0, :]
+    quats = quats / np.linalg.norm(quats, axis=-1, keepdims=True)
+    return np.where(quats[..., :1] < 0, -quats, quats)
+
+
+def multiply_quats(a_wxyz: Array, b_wxyz: Array) -> Array:
+    """Hamilton product, (..., 4) x (..., 4): the rotation b followed by the rotation a."""
+    aw, ax, ay, az = np.moveaxis(a_wxyz, -1, 0)
+    bw, bx, by, bz = np.moveaxis(b_wxyz, -1, 0)
+    return np.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        axis=-1,
+    )
+
+
+def project(points_cam: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
+    """Camera-frame points (..., 3) to pixels (..., 2) and depths (...,); points at or behind the camera give NaN."""
+    z = points_cam[..., 2]
+    safe = np.where(z > 0, z, np.nan)
+    u = intrinsics.fx * points_cam[..., 0] / safe + intrinsics.cx
+    v = intrinsics.fy * points_cam[..., 1] / safe + intrinsics.cy
+    return np.stack((u, v), axis=-1), z
+
+
+def back_project(pixels: Array, depth_m: Array, intrinsics: Intrinsics) -> Array:
+    """Pixels (..., 2) and depths (...,) in metres to camera-frame points (..., 3)."""
+    x = (pixels[..., 0] - intrinsics.cx) / intrinsics.fx * depth_m
+    y = (pixels[..., 1] - intrinsics.cy) / intrinsics.fy * depth_m
+    return np.stack((x, y, depth_m), axis=-1)
+
+
+def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Array, Array]:
+    """The similarity (s, R, t) that minimises sum |target - (s R source + t)|^2 over (N, 3) point pairs.
+
+    Source: S. Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point Patterns, PAMI 1991;
+    equation numbers below are that paper's. Raises FreeOccError for fewer than three pairs or collinear points, for
+    which the rotation is not determined.
+    """
+    if len(source) < 3:
+        raise FreeOccError(f"Alignment needs at least 3 matched poses, got {len(source)}: check that timestamps match.")
+    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
+    centred_source, centred_target = source - mean_source, target - mean_target
+    variance = (centred_source**2).sum() / len(source)  # eq. 36
+    covariance = centred_target.T @ centred_source / len(source)  # eq. 38
+    U, D, Vt = np.linalg.svd(covariance)
+    if D[1] <= 1e-9 * max(D[0], 1e-12):
+        raise FreeOccError("Alignment is not determined: the camera centres are identical or lie on one line.")
+    S = np.eye(3)
+    if np.linalg.det(U) * np.linalg.det(Vt) < 0:
+        S[2, 2] = -1.0  # eq. 39
+    R = U @ S @ Vt  # eq. 40
+    scale = float((D * np.diag(S)).sum() / variance) if with_scale else 1.0  # eq. 42
+    return scale, R, mean_target - scale * R @ mean_source  # eq. 41

@@ -1,0 +1,1 @@
+"""LAYER 3: language-aligned features on the Gaussians."""

@@ -1,0 +1,164 @@
+"""What the layers hand to each other: arrays with their shapes, units and frames. No behaviour beyond reading them.
+
+Conventions: camera-to-world poses, OpenCV camera axes (x right, y down, z forward), metres, seconds; ``T_a_b`` maps
+coordinates of frame b to frame a; voxel (i, j, k) covers ``origin + [i, i+1) * voxel_size``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+BLOCK = 8
+"""Voxels along one edge of a voxel block."""
+
+FREE, OCCUPIED, UNKNOWN = 0, 1, 255
+"""States of a voxel."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole camera without distortion: pixel = (fx x/z + cx, fy y/z + cy); integer pixels are pixel centres."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(3, 3) calibration matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """The same camera with its image resampled to ``width`` x ``height`` pixels."""
+        sx, sy = width / self.width, height / self.height
+        return Intrinsics(
+            width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        )
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One decoded frame of a capture. Poses and class images are never part of it: a layer that may read them asks
+    the capture for them by name, so that a pose-free run cannot see the truth by accident.
+
+    index: its place in the capture, 0 … len(capture)-1.
+    timestamp: seconds; equal to ``index`` where the format has none.
+    color: (H, W, 3) uint8 RGB.
+    depth_m: (H, W) float32 metres, registered to ``color``'s pixels; 0 = no measurement.
+    intrinsics: of ``color`` and ``depth_m``, which have the same size.
+    """
+
+    index: int
+    timestamp: float
+    color: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    intrinsics: Intrinsics
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Camera poses of a capture's frames, row n = frame n of the capture.
+
+    timestamps: (N,) float64 seconds.
+    T_world_cam: (N, 4, 4) float64; all NaN where the frame has no pose.
+    keyframes: (K,) int32, ascending indices of the frames that are keyframes.
+    status: (N,) of "keyframe", "tracked", "lost", "broken" (could not be decoded) or "unused" (not asked for).
+    confidence: (N,) float32 in 0…1.
+    """
+
+    timestamps: NDArray[np.float64]
+    T_world_cam: NDArray[np.float64]
+    keyframes: NDArray[np.int32]
+    status: NDArray[np.str_]
+    confidence: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def has_pose(self) -> NDArray[np.bool_]:
+        """(N,) whether each frame has a pose."""
+        return np.asarray(np.isfinite(self.T_world_cam).all(axis=(1, 2)))
+
+    @property
+    def T_world_keyframe(self) -> NDArray[np.float64]:
+        """(K, 4, 4) poses of the keyframes."""
+        return self.T_world_cam[self.keyframes]
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N anchored Gaussians G = (mu, s, r, o, c). A mean is never a free parameter: it is ``anchor_cam`` moved by the
+    pose of its keyframe (paper, "Geometrically Anchored Gaussian Updates").
+
+    means: (N, 3) float32, world, metres.
+    scales: (N, 3) float32, standard deviations along the principal axes, metres.
+    quats_wxyz: (N, 4) float32, unit, principal axes to world.
+    opacities: (N,) float32 in 0…1.
+    colors: (N, 3) uint8 RGB.
+    anchor_keyframe: (N,) int32, row of ``Trajectory.keyframes``.
+    anchor_cam: (N, 3) float32, the anchored point in that keyframe's camera frame, metres; its pixel and depth are
+        the projection of this point.
+    """
+
+    means: NDArray[np.float32]
+    scales: NDArray[np.float32]
+    quats_wxyz: NDArray[np.float32]
+    opacities: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    anchor_keyframe: NDArray[np.int32]
+    anchor_cam: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __getitem__(self, rows: NDArray[np.generic] | slice) -> Gaussians:
+        return Gaussians(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """Occupancy in sparse blocks of 8 x 8 x 8 voxels; what no block covers is unknown.
+
+    voxel_size: edge of a voxel, metres.  origin: (3,) float64 world position of the lower corner of voxel (0, 0, 0).
+    keys: (B, 3) int32, block index; block b covers voxels ``8 * keys[b] + (0…7)``; unique, in no particular order.
+    Per voxel, (B, 512), the local index being (i * 8 + j) * 8 + k:
+    probability: float32 alpha(x) at the voxel's centre (paper, Gaussian-to-Occupancy Projection), in 0…1.
+    free: uint16 number of depth images that saw through the voxel.  hits: uint16 number that ended in it.
+    state: uint8 FREE, OCCUPIED or UNKNOWN.
+    Per occupied voxel, (V, …), in the order of ``occupied_voxels()``:
+    features: (V, D) float16 unit language features, zero where nothing is known.  colors: (V, 3) uint8 RGB.
+    """
+
+    voxel_size: float
+    origin: NDArray[np.float64]
+    keys: NDArray[np.int32]
+    probability: NDArray[np.float32]
+    free: NDArray[np.uint16]
+    hits: NDArray[np.uint16]
+    state: NDArray[np.uint8]
+    features: NDArray[np.float16] = field(default_factory=lambda: np.zeros((0, 0), np.float16))
+    colors: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+
+    def voxels(self, state: int) -> NDArray[np.int32]:
+        """(V, 3) indices (i, j, k) of the voxels in ``state``, in storage order."""
+        block, local = np.nonzero(self.state == state)
+        return self.keys[block] * BLOCK + np.stack((local // 64, local // 8 % 8, local % 8), axis=1).astype(np.int32)
+
+    def occupied_voxels(self) -> NDArray[np.int32]:
+        """(V, 3) indices of the occupied voxels: the row order of ``features`` and ``colors``."""
+        return self.voxels(OCCUPIED)
+
+    def centers(self, voxels: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(V, 3) world positions of voxel centres."""
+        return self.origin + (voxels + 0.5) * self.voxel_size
+
+    def replace(self, **changes: object) -> Occupancy:
+        """A copy with some fields changed."""
+        return replace(self, **changes)  # type: ignore[arg-type]
