@@ -35,6 +35,17 @@ def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
     return bool(np.abs(R @ R.T - np.eye(3)).max() < tolerance and np.linalg.det(R) > 0)
 
 
+def nearest_rigid(T: Array) -> Array:
+    """The rigid (4, 4) transform whose rotation is closest to that of ``T`` in the Frobenius norm. Composing estimates
+    doubles a rotation's departure from orthonormality at every frame, so an estimate is brought back before it is used.
+    """
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    out = np.eye(4)
+    out[:3, :3] = U @ np.diag((1.0, 1.0, np.linalg.det(U @ Vt))) @ Vt
+    out[:3, 3] = T[:3, 3]
+    return out
+
+
 def quats_to_rotations(quats_wxyz: ArrayLike) -> Array:
     """Unit quaternions (..., 4) wxyz to rotation matrices (..., 3, 3)."""
     w, x, y, z = np.moveaxis(np.asarray(quats_wxyz), -1, 0)

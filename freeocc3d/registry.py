@@ -12,6 +12,7 @@ import difflib
 import functools
 import importlib
 import importlib.util
+import itertools
 import math
 import types
 from collections.abc import Iterable, Mapping
@@ -136,7 +137,7 @@ def _assigned(node: ast.stmt, name: str) -> bool:
 def _options(tree: ast.Module) -> tuple[Option, ...]:
     body = next((n.body for n in tree.body if isinstance(n, ast.ClassDef) and n.name == "Options"), [])
     options = []
-    for node, after in zip(body, [*body[1:], None], strict=True):
+    for node, after in itertools.zip_longest(body, body[1:]):
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value is not None:
             is_doc = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
             doc = " ".join(str(after.value.value).split()) if is_doc else ""  # type: ignore[union-attr]

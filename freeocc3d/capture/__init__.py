@@ -1,1 +1,7 @@
 """INPUT: captured scans. ``open_capture`` finds the reader of a folder; ``read_ahead`` decodes on a second thread."""
+
+from .base import Capture, Options
+from .opening import check_depth_scale, open_capture, used_frames
+from .readahead import read_ahead
+
+__all__ = ["Capture", "Options", "check_depth_scale", "open_capture", "read_ahead", "used_frames"]

@@ -70,6 +70,11 @@ class Capture(ABC):
     def __getitem__(self, index: int) -> Frame:
         """Decode frame ``index``. Thread-safe. Raises FrameError if one of its files is missing or broken."""
 
+    def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
+        """(H, W) depth as stored (0 = no measurement) and its units per metre, or None where depth is not stored as
+        integers. Read by ``check_depth_scale`` alone. Raises FrameError."""
+        return None
+
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """(4, 4) T_world_cam that the capture states for the frame, or None. Read by the ``known`` tracker and by
         evaluation alone."""

@@ -1,0 +1,123 @@
+"""What the readers of numbered colour and depth files share: pairing them by number, and decoding a pair.
+
+Where a few frames lack one of their two files (at most ``capture.max_broken`` of them), these frames are broken, and
+reading one raises FrameError; where more do, the capture is not usable and the constructor raises CaptureError.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import CaptureError, FrameError
+from ..types import Frame
+from .base import Capture, Options
+from .images import Size, image_size, metres, read_classes, read_color, read_depth
+from .registration import Grid
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Colour and depth files of N frames, ascending by number. A missing file is None.
+
+    numbers: the frames' numbers in the file names.  color_size, depth_size: of the first readable image of each kind.
+    """
+
+    numbers: tuple[int, ...]
+    color: tuple[Path | None, ...]
+    depth: tuple[Path | None, ...]
+    color_size: Size
+    depth_size: Size
+
+
+def pair(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Path, max_broken: float) -> Pairs:
+    """Pair the files by their numbers.
+
+    Raises CaptureError: no colour, no depth, more than ``max_broken`` of the frames lack a file, no readable image.
+    """
+    if not color:
+        raise CaptureError(f"{folder} holds no colour images of this format.")
+    if not depth:
+        raise CaptureError(f"{folder} holds {len(color)} colour images but no depth: a capture needs both.")
+    numbers = sorted(color.keys() | depth.keys())
+    incomplete = sorted(color.keys() ^ depth.keys())
+    if len(incomplete) > max_broken * len(numbers):
+        alone = color.get(incomplete[0]) or depth[incomplete[0]]
+        missing = "depth" if incomplete[0] in color else "colour"
+        raise CaptureError(
+            f"{folder} holds {len(color)} colour and {len(depth)} depth images, and {len(incomplete)} frames lack one "
+            f"of the two, the first being frame {incomplete[0]} ({alone.name} has no {missing} image): complete the "
+            "capture, or raise capture.max_broken."
+        )
+    return Pairs(
+        tuple(numbers),
+        tuple(map(color.get, numbers)),
+        tuple(map(depth.get, numbers)),
+        _first_size(color.values(), folder),
+        _first_size(depth.values(), folder),
+    )
+
+
+class ImagePairs(Capture):
+    """A capture of numbered colour and depth files; a reader finds the files and the cameras."""
+
+    def __init__(self, path: Path, options: Options, pairs: Pairs, grid: Grid, units_per_metre: float):
+        """units_per_metre: of the stored depth, unless ``options.depth_scale`` says otherwise."""
+        super().__init__(path, options)
+        self._pairs = pairs
+        self._grid = grid
+        self._units_per_metre = options.depth_scale or units_per_metre
+        self.timestamps = np.arange(len(pairs.numbers), dtype=np.float64)
+
+    def __getitem__(self, index: int) -> Frame:
+        color_path, depth_path = self._files(index)
+        color = read_color(color_path)
+        _check_size(color, self._pairs.color_size, color_path)
+        depth_m = metres(self._stored_depth(depth_path), self._units_per_metre, self.options.max_depth)
+        grid = self._grid
+        timestamp = float(self.timestamps[index])
+        return Frame(index, timestamp, grid.color(color), grid.depth(depth_m), grid.intrinsics)
+
+    def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float]:
+        return self._stored_depth(self._files(index)[1]), self._units_per_metre
+
+    def _class_image(self, path: Path | None) -> NDArray[np.uint8] | None:
+        """The class image at ``path`` on the frames' pixel grid. Raises FrameError if it is there but not usable."""
+        if path is None or not self.classes:
+            return None
+        image = read_classes(path, len(self.classes))
+        _check_size(image, self._pairs.color_size, path)
+        return self._grid.classes(image)
+
+    def _files(self, index: int) -> tuple[Path, Path]:
+        if not 0 <= index < len(self):
+            raise IndexError(f"Frame {index} of a capture of {len(self)} frames.")
+        color, depth = self._pairs.color[index], self._pairs.depth[index]
+        if color is None or depth is None:
+            alone, missing = (color, "depth") if color else (depth, "colour")
+            raise FrameError(f"Frame {self._pairs.numbers[index]} has no {missing} image beside {alone}.")
+        return color, depth
+
+    def _stored_depth(self, path: Path) -> NDArray[np.uint16]:
+        raw = read_depth(path)
+        _check_size(raw, self._pairs.depth_size, path)
+        return raw
+
+
+def _first_size(paths: Iterable[Path], folder: Path) -> Size:
+    for path in paths:
+        try:
+            return image_size(path)
+        except FrameError:
+            continue
+    raise CaptureError(f"No image of {folder} can be read: all are damaged, or neither PNG nor JPEG.")
+
+
+def _check_size(image: NDArray[np.generic], size: Size, path: Path) -> None:
+    if image.shape[1::-1] != size:
+        height, width = image.shape[:2]
+        raise FrameError(f"{path} has {width} x {height} pixels, other frames have {size[0]} x {size[1]}.")

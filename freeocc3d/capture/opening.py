@@ -1,0 +1,153 @@
+"""Finds the reader of a capture, and says when what it reads cannot be a room."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import registry
+from ..errors import CaptureError, ConfigError, FrameError
+from .base import Capture, Options
+
+BUILTIN = "builtin:"
+"""Paths that start with this name something that is rendered, not a folder."""
+
+USUAL_UNITS = (1.0, 100.0, 1000.0, 5000.0, 6553.5, 10000.0)
+"""Depth units per metre that formats use."""
+
+INDOOR_MEDIAN_M = 0.1, 20.0
+"""The median depth of an indoor scan lies between these."""
+
+TYPICAL_MEDIAN_M = 2.0
+
+
+def open_capture(
+    path: str | Path, options: Options | None = None, backend_options: Mapping[str, Mapping[str, Any]] | None = None
+) -> Capture:
+    """The capture at ``path``, by the reader that ``options.format`` names or, if that is "auto", that recognises it.
+
+    backend_options: reader name -> its own options; readers that are not used are ignored.
+    Raises CaptureError (no such folder, unknown layout, what the reader finds missing), ConfigError (unknown format,
+    option out of range), DependencyError.
+    """
+    options = options or Options()
+    _check(options)
+    if str(path).startswith(BUILTIN):
+        return _construct("synthetic", Path(path), options, backend_options or {})
+    folder = Path(path).expanduser()
+    if not folder.exists():
+        raise CaptureError(f"There is no folder {folder}: check the path of the capture.")
+    if not folder.is_dir():
+        raise CaptureError(f"{folder} is a file, but a capture is a folder: give the folder that holds the frames.")
+    try:
+        name = _recognise(folder) if options.format == "auto" else options.format
+        return _construct(name, folder, options, backend_options or {})
+    except OSError as error:
+        raise CaptureError(f"Cannot read {error.filename or folder}: {error.strerror}.") from error
+
+
+def used_frames(capture: Capture) -> range:
+    """Indices of the frames that ``start``, ``stop`` and ``stride`` select. Raises CaptureError if there are none."""
+    options = capture.options
+    frames = range(len(capture))[options.start : options.stop : options.stride]
+    if not frames:
+        raise CaptureError(
+            f"No frame of {capture.path} is used: it has {len(capture)}, and capture.start = {options.start}, "
+            f"capture.stop = {options.stop} select none of them."
+        )
+    return frames
+
+
+def check_depth_scale(capture: Capture, samples: int = 5) -> str | None:
+    """A warning in one sentence if depth seems to be stored in other units than assumed, or None.
+
+    Looks at some frames spread over the capture, before depth is clipped at ``max_depth``, because depth that is read
+    1000 times too large would be clipped away entirely.
+    """
+    median_units, within, units_per_metre = _sample_depth(capture, samples)
+    if median_units is None:
+        return None
+    median_m = median_units / units_per_metre
+    nearest, farthest = INDOOR_MEDIAN_M
+    if nearest <= median_m <= farthest and within >= 0.05:
+        return None
+    likely = min(USUAL_UNITS, key=lambda units: abs(math.log(median_units / units / TYPICAL_MEDIAN_M)))
+    advice = f"capture.depth_scale is probably {likely:g} and not {units_per_metre:g}"
+    if likely == units_per_metre:
+        advice = "check capture.depth_scale and capture.max_depth"
+    return (
+        f"The median depth of {capture.path} is {median_m:.3g} m and {within:.0%} of it lies within "
+        f"capture.max_depth = {capture.options.max_depth:g} m, which does not look like a room: {advice}."
+    )
+
+
+def _sample_depth(capture: Capture, samples: int) -> tuple[float | None, float, float]:
+    """Median of the stored depth (None if there is none), the share of it within ``max_depth``, units per metre."""
+    values, units_per_metre = [], 1.0
+    for index in np.unique(np.linspace(0, len(capture) - 1, samples).astype(int)).tolist():
+        try:
+            stored = capture.raw_depth(index)
+        except FrameError:
+            continue
+        if stored is not None:
+            raw, units_per_metre = stored
+            values.append(raw[(raw > 0) & (raw < np.iinfo(raw.dtype).max)])
+    measured = np.concatenate(values) if values else np.zeros(0)
+    if not len(measured):
+        return None, 0.0, units_per_metre
+    within = float((measured <= capture.options.max_depth * units_per_metre).mean())
+    return float(np.median(measured)), within, units_per_metre
+
+
+def _check(options: Options) -> None:
+    """Raises ConfigError for a value that no reader can work with."""
+    if not options.max_depth > 0:
+        raise ConfigError(f"capture.max_depth must be positive, got {options.max_depth:g}.")
+    if options.depth_scale is not None and not (options.depth_scale > 0 and math.isfinite(options.depth_scale)):
+        raise ConfigError(f"capture.depth_scale must be a positive number, got {options.depth_scale:g}.")
+    if not 0 <= options.max_broken <= 1:
+        raise ConfigError(f"capture.max_broken must lie in 0…1, got {options.max_broken:g}.")
+    if options.stride < 1 or options.start < 0:
+        raise ConfigError(
+            f"capture.stride must be at least 1 and capture.start at least 0, got {options.stride} and {options.start}."
+        )
+
+
+def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mapping[str, Any]]) -> Capture:
+    module = registry.load("capture", name)
+    if registry.backends("capture")[name].options:
+        return module.Reader(path, options, registry.build_options(module, own.get(name) or {}))
+    return module.Reader(path, options)
+
+
+def _recognise(folder: Path) -> str:
+    """Name of the one reader that recognises the folder. Raises CaptureError if none does, or several."""
+    readers = _readers()
+    found = [name for name, reader in readers.items() if reader.recognises(folder)]
+    if len(found) > 1:
+        raise CaptureError(f"{folder} looks like {' and like '.join(found)}: name one with capture.format.")
+    if found:
+        return found[0]
+    raise CaptureError(
+        f"{folder} is not a capture of a known format{_below(folder, readers)}. Looked for: "
+        + "; ".join(f"{reader.layout} ({name})" for name, reader in readers.items())
+        + "."
+    )
+
+
+def _readers() -> dict[str, type[Capture]]:
+    """Readers by name; those whose packages are not installed cannot recognise anything."""
+    names = [name for name, backend in registry.backends("capture").items() if not backend.missing]
+    return {name: registry.load("capture", name).Reader for name in names}
+
+
+def _below(folder: Path, readers: Mapping[str, type[Capture]]) -> str:
+    """A hint at the first subfolder that is a capture, for data sets that hold several."""
+    for child in sorted(folder.iterdir()):
+        if child.is_dir() and any(reader.recognises(child) for reader in readers.values()):
+            return f", but {child} is: give that folder"
+    return ""

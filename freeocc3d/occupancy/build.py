@@ -1,0 +1,86 @@
+"""Layer 4 as a whole: anchored Gaussians and depth images in, classified voxels with features out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Frame, Gaussians, Occupancy
+from . import carve, splat
+from .grid import union, unpack
+
+
+def build_occupancy(
+    gaussians: Gaussians,
+    features: NDArray[np.float16],
+    keyframes: Sequence[Frame],
+    T_world_keyframe: NDArray[np.float64],
+    splatting: splat.Options,
+    carving: carve.Options,
+    origin: NDArray[np.float64] | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Occupancy:
+    """The occupancy map of Gaussians (N) with features (N, D) and the keyframes' depth images, whose poses are (K, 4, 4).
+
+    origin: (3,) lower corner of voxel (0, 0, 0); the world's origin by default.  progress: called with the number of
+    keyframes looked at.
+    """
+    origin = np.zeros(3) if origin is None else np.asarray(origin, np.float64)
+    size = splatting.voxel_size
+    bins = splat.bin_gaussians(gaussians, origin, size, splatting.cutoff)
+
+    seen = [
+        carve.visible_blocks(frame, T, origin, size, carving.ray_step)
+        for frame, T in zip(keyframes, T_world_keyframe, strict=True)
+    ]
+    packed = union(bins.packed, *seen)
+    evidence = carve.Evidence(packed, origin, size, carving)
+    for done, (frame, T) in enumerate(zip(keyframes, T_world_keyframe, strict=True), start=1):
+        evidence.add(frame, T)
+        progress(done)
+
+    probability = np.zeros((len(packed), BLOCK**3), np.float32)
+    splatted = np.searchsorted(packed, bins.packed)
+    probability[splatted] = splat.probability(bins, unpack(bins.packed))
+    state = classify(probability, evidence.free, evidence.hits, splatting, carving)
+
+    slots = np.full(state.shape, -1, np.int32)
+    occupied = state == OCCUPIED
+    slots[occupied] = np.arange(np.count_nonzero(occupied))
+    values = np.concatenate((gaussians.colors.astype(np.float32), features.astype(np.float32)), axis=1)
+    means = splat.posterior_mean(bins, unpack(bins.packed), slots[splatted], values)
+    return Occupancy(
+        voxel_size=size,
+        origin=origin,
+        keys=unpack(packed),
+        probability=probability,
+        free=evidence.free,
+        hits=evidence.hits,
+        state=state,
+        features=normalized(means[:, 3:]),
+        colors=np.rint(means[:, :3]).astype(np.uint8),
+    )
+
+
+def classify(
+    probability: NDArray[np.float32],
+    free: NDArray[np.uint16],
+    hits: NDArray[np.uint16],
+    splatting: splat.Options,
+    carving: carve.Options,
+) -> NDArray[np.uint8]:
+    """State of each voxel: occupied by alpha unless the depth images contradict it, free where they saw through, else
+    unknown. Unknown is never taken for free."""
+    contradicted = free > splatting.seen_through * np.maximum(hits.astype(np.float32), 1.0)
+    occupied = (probability >= splatting.threshold) & ~contradicted
+    state = np.where(free >= carving.min_free, FREE, UNKNOWN).astype(np.uint8)
+    state[occupied] = OCCUPIED
+    return state
+
+
+def normalized(features: NDArray[np.float32]) -> NDArray[np.float16]:
+    """(V, D) rows to unit length; zero rows, of which nothing is known, stay zero."""
+    norms = np.linalg.norm(features, axis=1, keepdims=True)
+    return (features / np.where(norms > 1e-6, norms, 1.0)).astype(np.float16)

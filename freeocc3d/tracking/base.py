@@ -1,0 +1,63 @@
+"""The contract of a tracker: frames in, one by one; camera poses out.
+
+A tracker is one file of this folder with ``load(options, capture) -> Tracker``. The frames that it names as keyframes
+carry the map: layers 2–4 use only these, so a tracker chooses them such that together they show the whole scene.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import Frame, Trajectory
+
+
+@dataclass(frozen=True)
+class Options:
+    """Layer 1."""
+
+    backend: str = "rgbd"
+    """Where poses come from: "rgbd" estimates them, "known" takes the capture's own."""
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What became of one frame.
+
+    status: "keyframe", "tracked" or "lost".
+    T_world_cam: (4, 4) the current estimate, None if lost; a later optimisation may still move it.
+    confidence: 0…1.
+    """
+
+    status: str
+    T_world_cam: NDArray[np.float64] | None
+    confidence: float
+
+
+class Tracker(ABC):
+    """Follows the camera through a capture. Frames must come in ascending order; some may be left out."""
+
+    @abstractmethod
+    def track(self, frame: Frame) -> Tracked:
+        """Take the next frame."""
+
+    @abstractmethod
+    def optimize(self) -> None:
+        """Make all poses so far consistent with all measurements so far. The world frame is the first keyframe's
+        (trackers that are given poses keep theirs)."""
+
+    @abstractmethod
+    def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
+        """Poses of all frames of the capture; frames that were never given to ``track`` are "unused"."""
+
+    @abstractmethod
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        """Everything needed to go on later, as plain arrays."""
+
+    @abstractmethod
+    def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
+        """Take up a saved ``state``; ``keyframes`` gives the keyframes' images, in order."""

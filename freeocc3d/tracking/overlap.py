@@ -1,0 +1,50 @@
+"""How much of what one depth image shows another camera sees as well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry import back_project, invert, project, transform
+from ..types import Intrinsics
+
+
+def sample_points(depth_m: NDArray[np.float32], intrinsics: Intrinsics, step: int = 8) -> NDArray[np.float32]:
+    """(P, 3) camera-frame points of every ``step``-th pixel that has a depth."""
+    v, u = np.mgrid[step // 2 : depth_m.shape[0] : step, step // 2 : depth_m.shape[1] : step]
+    depth = depth_m[v, u]
+    valid = depth > 0
+    pixels = np.stack((u[valid], v[valid]), axis=-1).astype(np.float32)
+    return np.asarray(back_project(pixels, depth[valid], intrinsics), np.float32)
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """A depth image (H, W) in metres, its camera, and a sample of its points (P, 3) in the camera's frame."""
+
+    depth_m: NDArray[np.float32]
+    intrinsics: Intrinsics
+    points: NDArray[np.float32]
+
+
+def mutual_overlap(a: DepthView, b: DepthView, T_b_a: NDArray[np.float64]) -> float:
+    """The smaller of the shares that each sees of what the other shows: it falls when the camera turns away as well as
+    when it steps back."""
+    return min(overlap(a.points, T_b_a, b), overlap(b.points, invert(T_b_a), a))
+
+
+def overlap(points_a: NDArray[np.float32], T_b_a: NDArray[np.float64], b: DepthView) -> float:
+    """Share of camera a's points that camera b sees too: they project into its image, and its depth there is missing or
+    agrees within 10 %. 0 for no points."""
+    if len(points_a) == 0:
+        return 0.0
+    pixels, z = project(transform(T_b_a, points_a), b.intrinsics)
+    height, width = b.depth_m.shape
+    with np.errstate(invalid="ignore"):  # points behind the camera project to NaN, which is nowhere inside
+        inside = (pixels > -0.5).all(axis=1) & (pixels < (width - 0.5, height - 0.5)).all(axis=1)
+    u, v = np.rint(pixels[inside]).astype(int).T
+    depth = b.depth_m[v, u]
+    agrees = (depth == 0) | (np.abs(depth - z[inside]) < 0.1 * z[inside])
+    return float(agrees.sum() / len(points_a))

@@ -1,0 +1,235 @@
+"""Estimates poses from colour and depth: hybrid odometry against keyframes, pose graph over keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture.base import Capture
+from ..geometry import invert, nearest_rigid
+from ..types import Frame, Intrinsics, Trajectory
+from . import pose_graph
+from .base import Tracked, Tracker
+from .overlap import DepthView, mutual_overlap, sample_points
+from .pose_graph import Edge
+from .records import Records
+
+REQUIRES: tuple[str, ...] = ("open3d",)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Odometry and keyframes."""
+
+    width: int = 320
+    """Images are tracked at this width (a smaller one is kept)."""
+    iterations: tuple[int, int, int] = (10, 6, 4)
+    """Gauss–Newton iterations per pyramid level, coarse to fine."""
+    depth_difference: float = 0.07
+    """Pixels whose depths differ by more than this many metres are no correspondence."""
+    keyframe_overlap: float = 0.85
+    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
+    min_fitness: float = 0.3
+    """Share of pixels that must find a correspondence."""
+    max_residual: float = 0.03
+    """Largest root mean square of the odometry's residual (metres and grey levels, 0…1, mixed)."""
+    min_information: float = 1e-3
+    """Smallest eigenvalue of the information matrix, per correspondence, that still counts as constrained."""
+    overlap_edges: int = 6
+    """Earlier keyframes that a new one is registered to, beyond the last: those that share most of its view."""
+    min_edge_overlap: float = 0.4
+    """Share of the view that such a keyframe must have in common."""
+
+
+@dataclass(frozen=True)
+class _View(DepthView):
+    """A frame as the odometry needs it, at tracking size."""
+
+    rgbd: object
+
+
+@dataclass(frozen=True)
+class _Match:
+    T_target_source: NDArray[np.float64]
+    information: NDArray[np.float64]
+    fitness: float
+    ok: bool
+
+
+def load(options: Options, capture: Capture) -> RgbdTracker:
+    """The tracker; ``capture`` is not read."""
+    return RgbdTracker(options)
+
+
+class RgbdTracker(Tracker):
+    """Registers each frame to the present keyframe, starting from constant velocity; a frame that shares too little
+    with it becomes the next keyframe, and is registered to earlier keyframes that look at the same place.
+
+    Odometry: J. Park, Q.-Y. Zhou, V. Koltun, Colored Point Cloud Registration Revisited, ICCV 2017, in Open3D's tensor
+    implementation (hybrid photometric and geometric residual, multi-scale).
+    """
+
+    def __init__(self, options: Options):
+        self.options = options
+        self.records = Records()
+        self.edges: list[Edge] = []
+        self._keyframes: list[_View] = []
+        self._T_keyframe_last: NDArray[np.float64] | None = None  # last tracked frame, in the present keyframe
+        self._velocity = np.eye(4)  # T_previous_last
+        self._frames_lost = 0
+
+    def track(self, frame: Frame) -> Tracked:
+        view = self._view(frame)
+        if not self._keyframes:
+            return self._start(frame.index, view)
+        match = self._register_to_keyframe(view)
+        if match is None:
+            self._frames_lost += 1
+            self.records.add_lost(frame.index)
+            return Tracked("lost", None, 0.0)
+        self._update_velocity(match.T_target_source)
+        T_world_cam = self.records.T_world_keyframe[-1] @ match.T_target_source
+        confidence = self._confidence(match)
+        if self._is_keyframe(view, match):
+            self._add_keyframe(frame.index, view, match, confidence)
+            return Tracked("keyframe", T_world_cam, confidence)
+        self.records.add_tracked(frame.index, len(self._keyframes) - 1, match.T_target_source, confidence)
+        return Tracked("tracked", T_world_cam, confidence)
+
+    def optimize(self) -> None:
+        self.records.T_world_keyframe = pose_graph.optimize(self.records.T_world_keyframe, self.edges)
+
+    def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
+        return self.records.trajectory(timestamps)
+
+    def _start(self, index: int, view: _View) -> Tracked:
+        if np.count_nonzero(view.depth_m) < 0.05 * view.depth_m.size:
+            self.records.add_lost(index)
+            return Tracked("lost", None, 0.0)
+        self.records.add_keyframe(index, np.eye(4), 1.0)
+        self._keyframes.append(view)
+        self._T_keyframe_last = np.eye(4)
+        return Tracked("keyframe", np.eye(4), 1.0)
+
+    def _register_to_keyframe(self, view: _View) -> _Match | None:
+        """The match with the present keyframe from the first starting guess that passes the failure test."""
+        assert self._T_keyframe_last is not None
+        guesses = [self._T_keyframe_last @ self._velocity, self._T_keyframe_last]
+        for guess in guesses:
+            match = self._register(view, self._keyframes[-1], guess)
+            if match.ok:
+                return match
+        return None
+
+    def _register(self, source: _View, target: _View, T_target_source: NDArray[np.float64]) -> _Match:
+        """Odometry of ``source`` against ``target`` and its failure test."""
+        import open3d as o3d
+
+        odometry = o3d.t.pipelines.odometry
+        failed = _Match(T_target_source, np.eye(6), 0.0, ok=False)
+        valid = np.count_nonzero(source.depth_m) / source.depth_m.size
+        if valid < 0.05:
+            return failed
+        K = o3d.core.Tensor(source.intrinsics.matrix)
+        try:
+            result = odometry.rgbd_odometry_multi_scale(
+                source.rgbd, target.rgbd, K, o3d.core.Tensor(T_target_source), 1.0, 1000.0,
+                [odometry.OdometryConvergenceCriteria(n) for n in self.options.iterations],
+                odometry.Method.Hybrid,
+                odometry.OdometryLossParams(self.options.depth_difference, 0.05, 0.1),
+            )  # fmt: skip
+        except RuntimeError:  # a singular system: nothing to align
+            return failed
+        T = result.transformation.numpy()
+        fitness, residual = result.fitness / valid, result.inlier_rmse
+        if not np.isfinite(T).all() or fitness < self.options.min_fitness or residual > self.options.max_residual:
+            return failed
+        information = odometry.compute_odometry_information_matrix(
+            source.rgbd.depth, target.rgbd.depth, K, result.transformation,  # type: ignore[attr-defined]
+            self.options.depth_difference, 1.0, 1000.0,
+        ).numpy()  # fmt: skip
+        weakest = np.linalg.eigvalsh(information)[0] / max(information[5, 5], 1.0)
+        return _Match(nearest_rigid(T), information, fitness, ok=bool(weakest >= self.options.min_information))
+
+    def _update_velocity(self, T_keyframe_cam: NDArray[np.float64]) -> None:
+        assert self._T_keyframe_last is not None
+        moved = invert(self._T_keyframe_last) @ T_keyframe_cam
+        self._velocity = moved if self._frames_lost == 0 else np.eye(4)
+        self._T_keyframe_last = T_keyframe_cam
+        self._frames_lost = 0
+
+    def _is_keyframe(self, view: _View, match: _Match) -> bool:
+        return mutual_overlap(view, self._keyframes[-1], match.T_target_source) < self.options.keyframe_overlap
+
+    def _confidence(self, match: _Match) -> float:
+        return float(np.clip(match.fitness, 0.0, 1.0))
+
+    def _add_keyframe(self, index: int, view: _View, match: _Match, confidence: float) -> None:
+        row = len(self._keyframes)
+        self.records.add_keyframe(index, self.records.T_world_keyframe[-1] @ match.T_target_source, confidence)
+        self.edges.append(Edge(row, row - 1, match.T_target_source, match.information, uncertain=False))
+        self._keyframes.append(view)
+        self._T_keyframe_last = np.eye(4)
+        self._add_overlap_edges(row)
+
+    def _add_overlap_edges(self, row: int) -> None:
+        """Register keyframe ``row`` to the earlier ones that share most of its view by the present poses."""
+        view, T_cam_world = self._keyframes[row], invert(self.records.T_world_keyframe[row])
+        shared = [
+            mutual_overlap(other, view, T_cam_world @ self.records.T_world_keyframe[k])
+            for k, other in enumerate(self._keyframes[: row - 1])
+        ]
+        best = np.argsort(shared)[::-1][: self.options.overlap_edges]
+        for k in (int(k) for k in best if shared[k] >= self.options.min_edge_overlap):
+            guess = invert(self.records.T_world_keyframe[k]) @ self.records.T_world_keyframe[row]
+            match = self._register(view, self._keyframes[k], guess)
+            if match.ok:
+                self.edges.append(Edge(row, k, match.T_target_source, match.information, uncertain=True))
+
+    def _view(self, frame: Frame) -> _View:
+        import open3d as o3d
+
+        camera = frame.intrinsics
+        step = max(1, round(camera.width / self.options.width))
+        color, depth = frame.color, frame.depth_m
+        if step > 1:
+            # Depth is picked, never averaged across an edge; picking pixel step*i + step//2 shifts the principal point.
+            width, height = camera.width // step, camera.height // step
+            color = cv2.resize(color[: height * step, : width * step], (width, height), interpolation=cv2.INTER_AREA)
+            depth = depth[step // 2 :: step, step // 2 :: step][:height, :width]
+            camera = Intrinsics(
+                width, height, camera.fx / step, camera.fy / step,
+                (camera.cx + 0.5) / step - 0.5, (camera.cy + 0.5) / step - 0.5,
+            )  # fmt: skip
+        depth = np.ascontiguousarray(depth)
+        rgbd = o3d.t.geometry.RGBDImage(
+            o3d.t.geometry.Image(np.ascontiguousarray(color)), o3d.t.geometry.Image(depth[..., None])
+        )
+        return _View(depth, camera, sample_points(depth, camera), rgbd)
+
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        last = self._T_keyframe_last if self._T_keyframe_last is not None else np.eye(4)
+        return {
+            **self.records.to_arrays(),
+            "last": np.stack((last, self._velocity)),
+            "frames_lost": np.array(self._frames_lost),
+            "edge_nodes": np.array([(e.source, e.target, e.uncertain) for e in self.edges], np.int64).reshape(-1, 3),
+            "edge_T_target_source": np.array([e.T_target_source for e in self.edges]).reshape(-1, 4, 4),
+            "edge_information": np.array([e.information for e in self.edges]).reshape(-1, 6, 6),
+        }
+
+    def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
+        self.records = Records.from_arrays(state)
+        self._keyframes = [self._view(frame) for frame in keyframes]
+        self._T_keyframe_last, self._velocity = np.asarray(state["last"], np.float64)
+        self._frames_lost = int(state["frames_lost"])
+        self.edges = [
+            Edge(int(source), int(target), np.asarray(T), np.asarray(information), bool(uncertain))
+            for (source, target, uncertain), T, information in zip(
+                state["edge_nodes"].tolist(), state["edge_T_target_source"], state["edge_information"], strict=True
+            )
+        ]
