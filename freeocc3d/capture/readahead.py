@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from ..errors import FrameError
@@ -11,7 +11,7 @@ from ..types import Frame
 from .base import Capture
 
 
-def read_ahead(capture: Capture, indices: Iterable[int], depth: int = 4) -> Iterator[tuple[int, Frame | FrameError]]:
+def read_ahead(capture: Capture, indices: Iterable[int], depth: int = 4) -> Generator[tuple[int, Frame | FrameError]]:
     """Yield ``(index, frame)`` in the order of ``indices``, or ``(index, error)`` for a frame that is broken.
 
     depth: how many frames are decoded ahead of use, and so how many are held in memory besides the one in use.

@@ -26,8 +26,8 @@ class Options:
 
     cell_size: float | None = None
     """Edge of the cells that hold one Gaussian each, metres; null = half the voxel size."""
-    pixel_stride: int = 2
-    """Every n-th pixel of a keyframe, in both directions, is lifted."""
+    pixel_stride: int | None = None
+    """Every n-th pixel of a keyframe, in both directions, is lifted; null = as many as leave 320 columns."""
     coverage: float = 0.62
     """s_perp over the spacing of the Gaussians. At 0.62 a flat wall reaches alpha = 0.5 half a voxel from its surface,
     so that a voxel is occupied where the surface passes through it."""
@@ -38,7 +38,7 @@ class Options:
     edge: float = 0.05
     """Pixels whose depth differs from a neighbour's by more than this share of it are dropped: at an edge the sensor
     reports depths that belong to neither side."""
-    min_pixels: int = 3
+    min_pixels: int = 2
     """Measurements that a cell needs."""
 
 
@@ -139,7 +139,7 @@ class AnchoredCells:
         return ray_aligned(anchor_cam, keyframe, T_world_keyframe, self.options.coverage * spacing, color, self.options)
 
     def _measure(self, frame: Frame, T_world_cam: NDArray[np.float64], row: int) -> _Cells | None:
-        step = self.options.pixel_stride
+        step = self.options.pixel_stride or max(1, frame.intrinsics.width // 320)
         usable = away_from_edges(frame.depth_m, self.options.edge)[::step, ::step]
         v, u = (step * index for index in np.nonzero(usable))
         if len(v) == 0:

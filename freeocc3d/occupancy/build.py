@@ -22,7 +22,7 @@ def build_occupancy(
     origin: NDArray[np.float64] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Occupancy:
-    """The occupancy map of Gaussians (N) with features (N, D) and the keyframes' depth images, whose poses are (K, 4, 4).
+    """The occupancy map of N Gaussians with features (N, D) and of the K keyframes' depth images at (K, 4, 4) poses.
 
     origin: (3,) lower corner of voxel (0, 0, 0); the world's origin by default.  progress: called with the number of
     keyframes looked at.

@@ -113,7 +113,7 @@ def _count(
                 continue
             u = fx * (R[0, 0] * vx + R[0, 1] * vy + R[0, 2] * vz + t[0]) / z + cx
             v = fy * (R[1, 0] * vx + R[1, 1] * vy + R[1, 2] * vz + t[1]) / z + cy
-            column, row = int(math.floor(u + 0.5)), int(math.floor(v + 0.5))
+            column, row = math.floor(u + 0.5), math.floor(v + 0.5)
             if column < 0 or row < 0 or column >= width or row >= height:
                 continue
             depth = depth_m[row, column]

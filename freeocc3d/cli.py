@@ -1,0 +1,316 @@
+"""The ``freeocc3d`` command: parses, calls Python, prints. Heavy imports happen inside the commands."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from . import __version__
+from .errors import FreeOccError
+from .progress import Progress
+
+app = typer.Typer(
+    help="A captured indoor scan in, an occupancy map that answers words out: no training, no given poses.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="Map folder.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set one option; repeatable.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what exists.")]
+
+
+class ConsoleProgress(Progress):
+    """Progress on stderr: one line that is redrawn on a terminal, a line per stage and warning elsewhere."""
+
+    def __init__(self) -> None:
+        self._name, self._total, self._start, self._drawn = "", None, 0.0, 0.0  # type: tuple[str, int | None, float, float]
+        self._on_terminal = sys.stderr.isatty()
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        self.close()
+        self._name, self._total, self._start = name, total, time.monotonic()
+        if self._on_terminal:
+            self._draw(0)
+
+    def advance(self, done: int) -> None:
+        if self._on_terminal and (done == self._total or time.monotonic() - self._drawn > 0.1):
+            self._draw(done)
+
+    def warn(self, text: str) -> None:
+        self._clear()
+        print(f"warning: {text}", file=sys.stderr)
+
+    def close(self) -> None:
+        """End the present stage's line."""
+        if self._name:
+            self._clear()
+            seconds = time.monotonic() - self._start
+            steps = f", {self._total} frames" if self._total else ""
+            print(f"{self._name}: {seconds:.1f} s{steps}", file=sys.stderr)
+        self._name = ""
+
+    def _draw(self, done: int) -> None:
+        self._drawn = time.monotonic()
+        line = self._name
+        if self._total:
+            filled = 30 * done // self._total
+            elapsed = self._drawn - self._start
+            left = elapsed / done * (self._total - done) if done else 0.0
+            line += f" [{'=' * filled}{' ' * (30 - filled)}] {done}/{self._total}, {left:.0f} s left"
+        print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+
+    def _clear(self) -> None:
+        if self._on_terminal:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+@app.callback(invoke_without_command=True)
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+) -> None:
+    if version:
+        print(__version__)
+        raise typer.Exit
+
+
+@app.command()
+def reconstruct(
+    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Folder of a scan, or builtin:room.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="MAP", help="Map folder to write.")],
+    config_file: Annotated[Path | None, typer.Option("--config", help="YAML file with options.")] = None,
+    overrides: Set = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
+    overwrite: Overwrite = False,
+    device: Annotated[str, typer.Option("--device", help="cpu or cuda:0.")] = "cpu",
+) -> None:
+    """Turn a captured scan into a map."""
+    from . import config, pipeline
+
+    settings = config.load(config_file, [*(overrides or []), f"tracking.device={device}"])
+    progress = ConsoleProgress()
+    try:
+        made = pipeline.reconstruct(capture, output, settings, overwrite=overwrite, resume=resume, progress=progress)
+    finally:
+        progress.close()
+    print(_info_text(_info(made)))
+
+
+@app.command()
+def query(
+    map_path: MapPath,
+    words: Annotated[list[str], typer.Argument(metavar="WORD...", help="Words or quoted phrases.")],
+    as_json: Json = False,
+    top: Annotated[int | None, typer.Option("--top", metavar="K", help="At most K regions a word.")] = None,
+    threshold: Annotated[float | None, typer.Option("--threshold", help="Least similarity, 0…1.")] = None,
+    ply: Annotated[Path | None, typer.Option("--ply", help="Write the map as PLY, matches coloured.")] = None,
+    picture: Annotated[Path | None, typer.Option("--picture", help="Write a picture, matches coloured (PNG).")] = None,
+) -> None:
+    """Ask a map where something is."""
+    from . import query as asking
+    from .store import load_map
+
+    options: dict[str, Any] = {}
+    if top is not None:
+        options["top_k"] = top
+    if threshold is not None:
+        options["threshold"] = threshold
+    loaded = load_map(map_path)
+    results = loaded.query_words(words, **options)
+    if ply is not None:
+        from .export.ply import write_query_ply
+
+        write_query_ply(loaded.occupancy, results, ply)
+    if picture is not None:
+        from .viewer import pictures
+
+        pictures.query_picture(loaded, results, picture)
+    if as_json:
+        print(json.dumps(asking.to_json(map_path, results)))
+    else:
+        print(asking.to_text(results))
+
+
+@app.command()
+def export(
+    map_path: MapPath,
+    format_name: Annotated[str, typer.Option("--format", help="See 'freeocc3d list'.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")],
+    overrides: Set = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a map in another program's format."""
+    import yaml
+
+    from .errors import ConfigError
+    from .export import export_map
+    from .store import load_map
+
+    options = {}
+    for override in overrides or []:
+        name, separator, text = override.partition("=")
+        if not separator:
+            raise ConfigError(f"An option reads name=value, got '{override}'.")
+        options[name.strip()] = yaml.safe_load(text)
+    export_map(load_map(map_path), format_name, output, options, overwrite=overwrite)
+    print(f"{output}: {output.stat().st_size:,} bytes")
+
+
+@app.command()
+def view(
+    map_path: MapPath,
+    picture: Annotated[Path, typer.Option("--picture", help="PNG file to write.")],
+    word: Annotated[str | None, typer.Option("--query", metavar="WORD", help="Show what matches a word.")] = None,
+    by: Annotated[str, typer.Option("--by", help="Colour by rgb, class or height.")] = "rgb",
+) -> None:
+    """Draw a map from above and from a corner."""
+    from .store import load_map
+    from .viewer import pictures
+
+    loaded = load_map(map_path)
+    if word is None:
+        pictures.map_picture(loaded, picture, by=by)
+    else:
+        pictures.query_picture(loaded, loaded.query_words([word]), picture)
+    print(picture)
+
+
+@app.command()
+def info(map_path: MapPath, as_json: Json = False) -> None:
+    """Say what is in a map and how it was made."""
+    from .store import load_map
+
+    facts = _info(load_map(map_path))
+    print(json.dumps(facts) if as_json else _info_text(facts))
+
+
+@app.command("list")
+def list_backends(as_json: Json = False) -> None:
+    """List readers, trackers, encoders and exporters with their options."""
+    from . import registry
+
+    found = {title: registry.backends(folder) for folder, title in registry.FOLDERS.items()}
+    if as_json:
+        print(
+            json.dumps(
+                {
+                    title: {
+                        b.name: {
+                            "summary": b.summary,
+                            "missing": b.missing,
+                            "options": {
+                                o.name: {"type": o.type, "default": o.default, "doc": o.doc} for o in b.options
+                            },
+                        }
+                        for b in backends.values()
+                    }
+                    for title, backends in found.items()
+                }
+            )
+        )
+        return
+    for title, backends in found.items():
+        print(f"{title}s")
+        for backend in backends.values():
+            missing = f"  [needs {', '.join(backend.missing)}]" if backend.missing else ""
+            print(f"  {backend.name:<14} {backend.summary}{missing}")
+            for option in backend.options:
+                print(f"      {option.name} = {option.default!r}  ({option.type}) {option.doc}")
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the map and the pictures.")] = Path("demo"),
+    overwrite: Overwrite = False,
+) -> None:
+    """Build and map the built-in room, ask it three words, write pictures."""
+    from . import pipeline
+    from . import query as asking
+    from .viewer import pictures
+
+    progress = ConsoleProgress()
+    try:
+        made = pipeline.reconstruct("builtin:room", output / "map", overwrite=overwrite, progress=progress)
+    finally:
+        progress.close()
+    print(_info_text(_info(made)))
+    written = [output / "map.png"]
+    pictures.map_picture(made, written[0], by="rgb")
+    results = made.query_words(["red", "dark blue", "green"])
+    print(asking.to_text(results))
+    for result in results:
+        written.append(output / f"query_{result.word.replace(' ', '_')}.png")
+        pictures.query_picture(made, [result], written[-1])
+    print("pictures: " + ", ".join(str(path) for path in written))
+
+
+def _info(loaded: Any) -> dict[str, Any]:
+    """What ``info --json`` prints."""
+    manifest, report = loaded.manifest, loaded.report
+    counts = manifest["counts"]
+    return {
+        "version": manifest["freeocc3d"],
+        "map": str(loaded.path),
+        "capture": manifest["capture"],
+        "frames": counts["frames"],
+        "frames_with_pose": counts["frames_with_pose"],
+        "frame_status": report["frames"],
+        "keyframes": len(manifest["keyframes"]),
+        "submaps": counts["submaps"],
+        "gaussians": counts["gaussians"],
+        "voxels": {"occupied": counts["voxels"]["occupied"], "free": counts["voxels"]["free"]},
+        "voxel_size_m": manifest["voxel_size_m"],
+        "encoder": manifest["encoder"]["name"],
+        "bytes": {
+            name: sum(size for file, size in manifest["files"].items() if file.split("/")[0] == name)
+            for name in dict.fromkeys(file.split("/")[0] for file in manifest["files"])
+        },
+        "seconds": report["seconds"],
+        "peak_memory_bytes": report["peak_memory_bytes"],
+        "warnings": report["warnings"],
+    }
+
+
+def _info_text(facts: dict[str, Any]) -> str:
+    size = sum(facts["bytes"].values())
+    seconds = ", ".join(f"{name} {value:.1f}" for name, value in facts["seconds"].items())
+    lines = [
+        f"map        {facts['map']}  ({size / 1e6:.1f} MB)",
+        f"capture    {facts['capture']['path']}  ({facts['capture']['format']})",
+        f"frames     {facts['frames']}, {facts['frames_with_pose']} with a pose, {facts['keyframes']} keyframes, "
+        f"{facts['submaps']} submap{'s' if facts['submaps'] != 1 else ''}",
+        f"gaussians  {facts['gaussians']:,}",
+        f"voxels     {facts['voxels']['occupied']:,} occupied, {facts['voxels']['free']:,} free, "
+        f"edge {facts['voxel_size_m']:g} m",
+        f"encoder    {facts['encoder']}"
+        + (" (colour names only: no image network is installed)" if facts["encoder"] == "colour" else ""),
+        f"time       {sum(facts['seconds'].values()):.1f} s: {seconds}",
+        f"memory     {facts['peak_memory_bytes'] / 1e9:.2f} GB at most",
+    ]
+    lines += [f"warning    {text}" for text in facts["warnings"]]
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command; a known error is one line on stderr and exit code 1."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        app(args=arguments, prog_name="freeocc3d")
+    except FreeOccError as error:
+        if "--debug" in arguments:
+            raise
+        print(f"freeocc3d: {' '.join(str(error).split())}", file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Keyframes on disk: colour (JPEG), depth (16-bit PNG, millimetres) and intrinsics, enough to build every later layer
+without the capture. They are written while the camera is tracked and read one at a time, so that memory stays flat."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import overload
+
+import cv2
+import numpy as np
+
+from .errors import MapError
+from .types import Frame, Intrinsics
+
+INDEX = "keyframes.json"
+_UNITS_PER_METRE = 1000.0
+_JPEG_QUALITY = 95
+
+
+class Keyframes(Sequence[Frame]):
+    """The keyframes in a folder, in order; ``self[row]`` decodes one. Raises MapError for a missing or broken file."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self._entries: list[dict[str, float]] = []
+
+    @classmethod
+    def load(cls, folder: Path) -> Keyframes:
+        """Those that a folder's index lists."""
+        keyframes = cls(folder)
+        try:
+            entries = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+            keyframes._entries = [{str(k): float(v) for k, v in entry.items()} for entry in entries]
+        except (OSError, ValueError, AttributeError, TypeError) as error:
+            raise MapError(f"Cannot read the keyframes' index {folder / INDEX}: {error}.") from error
+        return keyframes
+
+    @property
+    def frame_indices(self) -> list[int]:
+        """Each keyframe's index in the capture."""
+        return [int(entry["frame"]) for entry in self._entries]
+
+    def append(self, frame: Frame) -> None:
+        """Write a keyframe. Raises OSError."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        bgr = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
+        color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+        units = np.clip(np.rint(frame.depth_m * _UNITS_PER_METRE), 0, 65535).astype(np.uint16)
+        depth = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+        self._color_path(frame.index).write_bytes(color.tobytes())
+        self._depth_path(frame.index).write_bytes(depth.tobytes())
+        camera = frame.intrinsics
+        self._entries.append(
+            {"frame": frame.index, "timestamp": frame.timestamp, "width": camera.width, "height": camera.height,
+             "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        )  # fmt: skip
+
+    def truncate(self, length: int) -> None:
+        """Forget all but the first ``length``; their files are overwritten when the frames come again."""
+        del self._entries[length:]
+
+    def save_index(self) -> None:
+        """Write the index, whole or not at all. Raises OSError."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        temporary = self.folder / (INDEX + ".tmp")
+        temporary.write_text(json.dumps(self._entries, indent=0), encoding="utf-8")
+        temporary.replace(self.folder / INDEX)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @overload
+    def __getitem__(self, row: int) -> Frame: ...
+    @overload
+    def __getitem__(self, row: slice) -> list[Frame]: ...
+    def __getitem__(self, row: int | slice) -> Frame | list[Frame]:
+        if isinstance(row, slice):
+            return [self._read(entry) for entry in self._entries[row]]
+        return self._read(self._entries[row])
+
+    def __iter__(self) -> Iterator[Frame]:
+        return map(self._read, list(self._entries))
+
+    def _read(self, entry: dict[str, float]) -> Frame:
+        index = int(entry["frame"])
+        camera = Intrinsics(
+            int(entry["width"]), int(entry["height"]), entry["fx"], entry["fy"], entry["cx"], entry["cy"]
+        )
+        color = _decode(self._color_path(index), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        units = _decode(self._depth_path(index), cv2.IMREAD_UNCHANGED)
+        if color.shape != (camera.height, camera.width, 3) or units.shape != color.shape[:2]:
+            raise MapError(f"{self._color_path(index)} or its depth does not have the size that {INDEX} states.")
+        depth_m = units.astype(np.float32) / np.float32(_UNITS_PER_METRE)
+        return Frame(index, entry["timestamp"], cv2.cvtColor(color, cv2.COLOR_BGR2RGB), depth_m, camera)
+
+    def _color_path(self, index: int) -> Path:
+        return self.folder / f"{index:06d}.color.jpg"
+
+    def _depth_path(self, index: int) -> Path:
+        return self.folder / f"{index:06d}.depth.png"
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise MapError(f"Cannot read the keyframe image {path}: {error.strerror}.") from error
+    image = cv2.imdecode(data, flags) if len(data) else None
+    if image is None:
+        raise MapError(f"The keyframe image {path} is damaged.")
+    return image

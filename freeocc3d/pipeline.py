@@ -1,0 +1,347 @@
+"""The only file that knows all four layers: capture -> track -> gaussians -> language -> occupancy -> store.
+
+A ``Mapper`` takes frames one by one: it tracks each and keeps the keyframes on disk, and ``build`` gives layers 2-4 of
+what was seen so far. ``reconstruct`` is that Mapper fed from a capture, followed by one refinement over the whole scan
+and one clean pass of layers 2-4. Its work lies in ``MAP.partial`` until it is whole, then takes its name.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import resource
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import __version__, config, registry, store
+from .capture import Capture, check_depth_scale, open_capture, read_ahead, used_frames
+from .capture import base as capture_base
+from .config import Config
+from .errors import CaptureError, FrameError, Interrupted, MapError, TrackingError
+from .gaussians import anchors
+from .keyframes import Keyframes
+from .language import lift
+from .language.codec import Codec
+from .language.encoders.base import Encoder
+from .occupancy import build, carve, splat
+from .progress import Progress
+from .store import Map, load_map
+from .tracking.base import Tracked, Tracker
+from .types import Frame, Gaussians, Occupancy, Trajectory
+from .work import WorkFolder
+
+_CHECKPOINT_FRAMES = 50
+_FEW_TRACKED = 0.5
+
+
+class Mapper:
+    """Takes frames one by one. ``folder`` receives the keyframes; what is in memory grows with keyframes only."""
+
+    def __init__(self, settings: Config, capture: Capture, folder: Path):
+        self.settings = settings
+        self.capture = capture
+        self.keyframes = Keyframes(folder / store.KEYFRAMES)
+        self.tracker: Tracker = _load_backend(settings, "tracking", "backend", capture)
+
+    def add(self, frame: Frame) -> Tracked:
+        """Track the next frame, and keep it if it is a keyframe."""
+        tracked = self.tracker.track(frame)
+        if tracked.status == "keyframe":
+            self.keyframes.append(frame)
+        return tracked
+
+    def refine(self) -> None:
+        """Make all poses so far consistent with each other."""
+        self.tracker.optimize()
+
+    def trajectory(self) -> Trajectory:
+        """Poses so far, one row per frame of the capture."""
+        return self.tracker.trajectory(self.capture.timestamps)
+
+    def build_gaussians(self, progress: Progress | None = None) -> Gaussians:
+        """Layer 2 from all keyframes so far at their present poses."""
+        progress = progress or Progress()
+        options = _options(anchors, self.settings["gaussians"])
+        cells = anchors.AnchoredCells(options, options.cell_size or 0.5 * self.settings["occupancy"]["voxel_size"])
+        progress.stage("gaussians", len(self.keyframes))
+        for done, (frame, T) in enumerate(zip(self.keyframes, self.trajectory().T_world_keyframe, strict=True), 1):
+            cells.add(frame, T)
+            progress.advance(done)
+        return cells.gaussians()
+
+    def build_features(
+        self, gaussians: Gaussians, encoder: Encoder, progress: Progress | None = None
+    ) -> NDArray[np.float16]:
+        """Layer 3: (N, D) unit features of the Gaussians, fused over the keyframes that see them."""
+        progress = progress or Progress()
+        options = _options(lift, config.options(self.settings, "language"))
+        fusion = lift.FeatureFusion(len(gaussians), encoder.dimension, options)
+        progress.stage("language", len(self.keyframes))
+        for done, (frame, T) in enumerate(zip(self.keyframes, self.trajectory().T_world_keyframe, strict=True), 1):
+            fusion.add(gaussians, frame, T, encoder.encode(frame))
+            progress.advance(done)
+        return fusion.features()
+
+    def build_occupancy(
+        self, gaussians: Gaussians, features: NDArray[np.float16], progress: Progress | None = None
+    ) -> Occupancy:
+        """Layer 4: voxels with probabilities, evidence, features and colours."""
+        progress = progress or Progress()
+        progress.stage("occupancy", len(self.keyframes))
+        return build.build_occupancy(
+            gaussians,
+            features,
+            self.keyframes,
+            self.trajectory().T_world_keyframe,
+            _options(splat, self.settings["occupancy"]),
+            _options(carve, self.settings["carving"]),
+            progress=progress.advance,
+        )
+
+
+def reconstruct(
+    capture: str | Path,
+    output: str | Path,
+    settings: Config | dict[str, Any] | None = None,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> Map:
+    """Turn the capture in a folder into a map folder, and return the map.
+
+    settings: a configuration as ``config.load`` gives it, or any part of one, {"section": {"key": value}}.
+    overwrite: replace an existing map, and drop an interrupted run's work.  resume: go on with an interrupted run.
+    Raises FreeOccError; Interrupted after Ctrl-C, with the work done so far kept for ``resume``.
+    """
+    progress = progress or Progress()
+    resolved = config.resolve(settings or {})
+    output = Path(output)
+    work = WorkFolder.open(output, overwrite, resume)
+    try:
+        opened = _open(capture, resolved, progress, work)
+        work.begin([_absolute(opened.path), len(opened), __version__], resolved)
+        return _run(opened, resolved, output, work, progress)
+    except KeyboardInterrupt as error:
+        raise Interrupted(
+            f"Stopped. The work so far is in {work.folder}: run the same command with --resume to go on."
+        ) from error
+    except OSError as error:
+        reason = "the disk is full" if error.errno == errno.ENOSPC else str(error.strerror or error).lower()
+        raise MapError(
+            f"Cannot write to {error.filename or work.folder}: {reason}. The work so far is in {work.folder}: "
+            "make room, then run the same command with --resume."
+        ) from error
+    finally:
+        work.drop_if_empty()
+
+
+def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, progress: Progress) -> Map:
+    """The stages in order; each leaves a result in the work folder, which a resumed run picks up."""
+    mapper = Mapper(settings, capture, work.folder)
+    encoder: Encoder = _load_backend(settings, "language", "encoder", capture)
+
+    with work.timed("tracking"):
+        _track(mapper, work, progress)
+    with work.timed("refinement"):
+        progress.stage("refinement")
+        mapper.refine()
+    trajectory = mapper.trajectory()
+    with work.timed("gaussians"):
+        gaussians = work.gaussians(lambda: mapper.build_gaussians(progress))
+    if len(gaussians) == 0:
+        raise TrackingError(
+            f"The {len(mapper.keyframes)} keyframes of {capture.path} hold too little depth for a map: is its depth in "
+            "metres after scaling (capture.depth_scale), and nearer than capture.max_depth?"
+        )
+    with work.timed("language"):
+        features = work.features(lambda: mapper.build_features(gaussians, encoder, progress))
+    with work.timed("occupancy"):
+        occupancy = mapper.build_occupancy(gaussians, features, progress)
+    _check_result(trajectory, progress, work)
+    progress.stage("saving")
+    _save(work, capture, settings, trajectory, gaussians, features, occupancy, encoder, mapper.keyframes)
+    work.finish(output)
+    return load_map(output)
+
+
+def _track(mapper: Mapper, work: WorkFolder, progress: Progress) -> None:
+    """Layer 1 over all frames that are used, with checkpoints."""
+    capture = mapper.capture
+    frames = used_frames(capture)
+    first = _restore(mapper, work)
+    progress.stage("tracking", len(frames))
+    allowed = capture.options.max_broken * len(frames)
+    stream = read_ahead(capture, frames[first:])
+    done = first
+    try:
+        for _, frame in stream:
+            if isinstance(frame, FrameError):
+                work.broken.append(str(frame))
+                progress.warn(str(frame))
+                if len(work.broken) > allowed:
+                    raise CaptureError(
+                        f"{len(work.broken)} of {len(frames)} frames are unreadable, the last: {frame} Repair the "
+                        "capture, or raise capture.max_broken."
+                    )
+            else:
+                mapper.add(frame)
+            done += 1
+            progress.advance(done)
+            if done % _CHECKPOINT_FRAMES == 0:
+                _checkpoint(mapper, work, done)
+    finally:
+        stream.close()
+    if done > first:
+        _checkpoint(mapper, work, done)
+    if len(mapper.keyframes) == 0:
+        raise TrackingError(
+            f"No frame of {capture.path} could be used as a start: their depth is empty. Is it in other units "
+            "(capture.depth_scale), or all beyond capture.max_depth?"
+        )
+
+
+def _checkpoint(mapper: Mapper, work: WorkFolder, done: int) -> None:
+    mapper.keyframes.save_index()
+    work.save_tracking({"done": np.array(done), "keyframes": np.array(len(mapper.keyframes)), **mapper.tracker.state()})
+
+
+def _restore(mapper: Mapper, work: WorkFolder) -> int:
+    """Take up the last checkpoint of layer 1, if it is valid; returns the number of frames that are done."""
+    state = work.restore_tracking()
+    if state is None:
+        return 0
+    keyframes = Keyframes.load(mapper.keyframes.folder)
+    keyframes.truncate(int(state.pop("keyframes")))
+    done = int(state.pop("done"))
+    mapper.keyframes = keyframes
+    mapper.tracker.restore(state, keyframes)
+    return done
+
+
+def _open(capture: str | Path, settings: Config, progress: Progress, work: WorkFolder) -> Capture:
+    section = settings["capture"]
+    opened = open_capture(capture, _options(capture_base, config.options(settings, "capture")), section)
+    used_frames(opened)
+    if warning := check_depth_scale(opened):
+        work.warnings.append(warning)
+        progress.warn(warning)
+    return opened
+
+
+def _check_result(trajectory: Trajectory, progress: Progress, work: WorkFolder) -> None:
+    """Warn about a run whose map shows only part of the scan."""
+    used = trajectory.status != "unused"
+    lost = int(np.count_nonzero(trajectory.status == "lost"))
+    if lost:
+        share = lost / max(int(np.count_nonzero(used)), 1)
+        first = int(np.flatnonzero(trajectory.status == "lost")[0])
+        text = f"Tracking lost {lost} frames ({share:.0%}), the first is frame {first}; they are not in the map."
+        if share > _FEW_TRACKED:
+            text += " Most of the scan is missing: was it captured slowly, with depth in most of each image?"
+        work.warnings.append(text)
+        progress.warn(text)
+
+
+def _save(
+    work: WorkFolder,
+    capture: Capture,
+    settings: Config,
+    trajectory: Trajectory,
+    gaussians: Gaussians,
+    features: NDArray[np.float16],
+    occupancy: Occupancy,
+    encoder: Encoder,
+    keyframes: Keyframes,
+) -> None:
+    folder = work.folder
+    with work.timed("saving"):
+        codec = Codec.fit(features)
+        store.write_occupancy(folder, occupancy, codec, features)
+        store.write_tum(folder / store.TRAJECTORY, trajectory)
+        (folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
+        keyframes.save_index()
+        work.drop_checkpoints()
+    report = _report(work, capture, trajectory, gaussians, occupancy)
+    (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
+    store.write_manifest(folder, _manifest(capture, trajectory, gaussians, occupancy, encoder, settings))
+
+
+def _manifest(
+    capture: Capture,
+    trajectory: Trajectory,
+    gaussians: Gaussians,
+    occupancy: Occupancy,
+    encoder: Encoder,
+    settings: Config,
+) -> dict[str, Any]:
+    return {
+        "freeocc3d": __version__,
+        "capture": {"path": _absolute(capture.path), "format": capture.format, "frames": len(capture)},
+        "frame": "OpenCV camera axes of the first keyframe, metres"
+        if settings["tracking"]["backend"] != "known"
+        else "world frame of the capture's poses, metres",
+        "poses": "camera to world",
+        "voxel_size_m": occupancy.voxel_size,
+        "origin": occupancy.origin.tolist(),
+        "up": estimate_up(trajectory).tolist(),
+        "T_world_map": np.eye(4).tolist(),
+        "encoder": {"name": encoder.name, "dimension": encoder.dimension, "state": encoder.text_state()},
+        "codec": "scalar quantisation, 8 bits a dimension",
+        "counts": {
+            "gaussians": len(gaussians),
+            "voxels": store.counts(occupancy),
+            "frames": len(trajectory),
+            "frames_with_pose": int(trajectory.has_pose.sum()),
+            "submaps": 1,
+        },
+        "keyframes": trajectory.keyframes.tolist(),
+    }
+
+
+def _report(
+    work: WorkFolder, capture: Capture, trajectory: Trajectory, gaussians: Gaussians, occupancy: Occupancy
+) -> dict[str, Any]:
+    status, count = np.unique(trajectory.status, return_counts=True)
+    peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {
+        "seconds": {name: round(value, 3) for name, value in work.seconds.items()},
+        "peak_memory_bytes": peak_kib * 1024,
+        "frames": {str(s): int(n) for s, n in zip(status, count, strict=True)},
+        "broken": work.broken,
+        "warnings": work.warnings,
+        "bytes_per_gaussian": 67,
+        "frame_log": {
+            "timestamp": trajectory.timestamps.tolist(),
+            "status": trajectory.status.tolist(),
+            "confidence": np.round(trajectory.confidence.astype(np.float64), 3).tolist(),
+        },
+    }
+
+
+def estimate_up(trajectory: Trajectory) -> NDArray[np.float64]:
+    """(3,) unit vector: the keyframes' mean upward image axis, for people hold cameras level more or less."""
+    up = -trajectory.T_world_keyframe[:, :3, 1].sum(axis=0)
+    return np.asarray(up / max(float(np.linalg.norm(up)), 1e-9))
+
+
+def _load_backend(settings: Config, section: str, key: str, capture: Capture) -> Any:
+    """The backend that ``settings[section][key]`` names, made with its own options."""
+    name = settings[section][key]
+    folder = config.SECTIONS[section][1]
+    assert folder is not None
+    module = registry.load(folder, name)
+    if not hasattr(module, "Options"):
+        return module.load(capture)
+    return module.load(registry.build_options(module, settings[section].get(name, {})), capture)
+
+
+def _options(module: Any, values: dict[str, Any]) -> Any:
+    return registry.build_options(module, values)
+
+
+def _absolute(path: Path) -> str:
+    return str(path) if str(path).startswith("builtin:") else str(path.resolve())

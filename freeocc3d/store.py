@@ -1,0 +1,328 @@
+"""The map folder: what is in it, saving it whole, loading it lazily.
+
+    map.yaml  config.yaml  report.json  trajectory.txt  gaussians.ply  occupancy.npz  features.npz  keyframes/
+
+Loading reads the manifest only; each part is read when it is first asked for, so that a query pays for nothing else.
+Nothing is unpickled, and an array's size is checked against its file's before memory is taken.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from . import registry
+from .errors import MapError
+from .geometry import quats_to_rotations, rotations_to_quats
+from .language.codec import Codec
+from .types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, Trajectory
+
+if TYPE_CHECKING:
+    from .keyframes import Keyframes
+    from .language.encoders.base import TextEncoder
+    from .query import QueryResult
+
+FORMAT_VERSION = 1
+MANIFEST, CONFIG, REPORT, TRAJECTORY = "map.yaml", "config.yaml", "report.json", "trajectory.txt"
+GAUSSIANS, OCCUPANCY, FEATURES, KEYFRAMES = "gaussians.ply", "occupancy.npz", "features.npz", "keyframes"
+
+_LARGEST_ARRAY = 8 << 30
+_OCCUPANCY_ARRAYS = {
+    "keys": ("i", 2), "probability": ("f", 2), "free": ("u", 2), "hits": ("u", 2), "state": ("u", 2),
+    "colors": ("u", 2), "feature_codes": ("u", 2),
+}  # fmt: skip
+"""Arrays of occupancy.npz: kind of number and dimensions."""
+
+
+class Map:
+    """A saved map. ``query("red cup")`` asks it; its parts are properties that are read when first used."""
+
+    def __init__(self, path: Path, manifest: dict[str, Any]):
+        self.path = path
+        self.manifest = manifest
+
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """(3,) unit vector that points up in the map's frame, as well as the camera's attitude tells."""
+        return np.array(self.manifest["up"], np.float64)
+
+    @functools.cached_property
+    def occupancy(self) -> Occupancy:
+        """The voxels with probabilities, evidence, features and colours."""
+        arrays = read_arrays(self.path / OCCUPANCY, _OCCUPANCY_ARRAYS)
+        tables = {k: v for k, v in self._feature_arrays.items() if k.startswith("codec_")}
+        codec = Codec.from_tables({k.removeprefix("codec_"): v for k, v in tables.items()})
+        blocks = len(arrays["keys"])
+        occupied = int(np.count_nonzero(arrays["state"] == OCCUPIED))
+        shapes_fit = (
+            arrays["keys"].shape == (blocks, 3)
+            and all(arrays[name].shape == (blocks, BLOCK**3) for name in ("probability", "free", "hits", "state"))
+            and arrays["colors"].shape == (occupied, 3)
+            and len(arrays["feature_codes"]) == occupied
+        )
+        if not shapes_fit:
+            raise MapError(f"{self.path / OCCUPANCY} is damaged: its arrays do not belong together.")
+        return Occupancy(
+            voxel_size=float(self.manifest["voxel_size_m"]),
+            origin=np.array(self.manifest["origin"], np.float64),
+            keys=arrays["keys"].astype(np.int32),
+            probability=arrays["probability"].astype(np.float32),
+            free=arrays["free"].astype(np.uint16),
+            hits=arrays["hits"].astype(np.uint16),
+            state=arrays["state"].astype(np.uint8),
+            features=codec.decode(arrays["feature_codes"]),
+            colors=arrays["colors"].astype(np.uint8),
+        )
+
+    @functools.cached_property
+    def gaussians(self) -> Gaussians:
+        """The anchored Gaussians (imports Open3D)."""
+        from .gaussians.cloud import read_ply
+
+        self._require(GAUSSIANS)
+        return read_ply(self.path / GAUSSIANS)
+
+    @functools.cached_property
+    def gaussian_features(self) -> NDArray[np.float16]:
+        """(N, D) unit features of the Gaussians."""
+        arrays = self._feature_arrays
+        codec = Codec.from_tables({k.removeprefix("codec_"): v for k, v in arrays.items() if k.startswith("codec_")})
+        return codec.decode(arrays["gaussian_codes"])
+
+    @functools.cached_property
+    def trajectory(self) -> Trajectory:
+        """Poses, status and confidence of all frames of the capture."""
+        try:
+            log = self.report["frame_log"]
+            timestamps = np.array(log["timestamp"], np.float64)
+            return Trajectory(
+                timestamps=timestamps,
+                T_world_cam=_place(timestamps, *read_tum(self.path / TRAJECTORY)),
+                keyframes=np.array(self.manifest["keyframes"], np.int32),
+                status=np.array(log["status"], dtype="<U8"),
+                confidence=np.array(log["confidence"], np.float32),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise MapError(f"{self.path / REPORT} or {TRAJECTORY} is damaged: {error}.") from error
+
+    @functools.cached_property
+    def report(self) -> dict[str, Any]:
+        """Timings, frames used and lost, memory, warnings of the run that made the map."""
+        try:
+            return dict(json.loads((self.path / REPORT).read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            raise MapError(f"Cannot read {self.path / REPORT}: {error}.") from error
+
+    @functools.cached_property
+    def keyframes(self) -> Keyframes:
+        """The keyframes' images."""
+        from .keyframes import Keyframes
+
+        return Keyframes.load(self.path / KEYFRAMES)
+
+    @functools.cached_property
+    def text_encoder(self) -> TextEncoder:
+        """The word side of the encoder that the map was built with."""
+        encoder = self.manifest["encoder"]
+        restored: TextEncoder = registry.load("language.encoders", encoder["name"]).load_text(encoder["state"])
+        return restored
+
+    @property
+    def vocabulary(self) -> list[str]:
+        """The words that pictures and exports by class use: what the encoder tells apart without being asked."""
+        return self.text_encoder.contrast_words()
+
+    @functools.cached_property
+    def _class_labels(self) -> NDArray[np.uint8]:
+        words = self.vocabulary[:254]
+        features = self.occupancy.features.astype(np.float32)
+        if not words or not len(features):
+            return np.zeros(len(features), np.uint8)
+        scores = features @ self.text_encoder.encode_words(words).features.T
+        return np.where(features.any(axis=1), scores.argmax(axis=1) + 1, 0).astype(np.uint8)
+
+    def labels(self) -> NDArray[np.uint8]:
+        """(V,) class of each occupied voxel: 0 = nothing known, k = ``vocabulary[k - 1]``."""
+        return self._class_labels
+
+    def query(self, word: str, **options: Any) -> QueryResult:
+        """Where ``word`` is: regions with score, box, centroid and volume. ``options``: fields of ``query.Options``."""
+        return self.query_words([word], **options)[0]
+
+    def query_words(self, words: list[str], **options: Any) -> list[QueryResult]:
+        """``query`` for several words."""
+        from . import query
+
+        checked = registry.build_options(query, options)
+        return query.query(self.occupancy, self.text_encoder, words, checked)
+
+    @functools.cached_property
+    def _feature_arrays(self) -> dict[str, NDArray[Any]]:
+        return read_arrays(self.path / FEATURES, {"gaussian_codes": ("u", 2)})
+
+    def _require(self, name: str) -> None:
+        expected = self.manifest["files"].get(name)
+        try:
+            size = (self.path / name).stat().st_size
+        except OSError as error:
+            raise MapError(f"The map {self.path} lacks its {name}: copy the whole folder, or map again.") from error
+        if size != expected:
+            raise MapError(f"{self.path / name} is damaged: it has {size} bytes in place of {expected}.")
+
+
+def load_map(path: str | Path) -> Map:
+    """Open a map folder: the manifest is read, and every file that it lists must be there and have its size.
+
+    Raises MapError: no such folder, not a map, from a newer version, a missing or damaged file.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise MapError(f"There is no map folder {path}.")
+    try:
+        manifest = yaml.load((path / MANIFEST).read_text(encoding="utf-8"), Loader=_SafeLoader)
+    except FileNotFoundError as error:
+        raise MapError(f"{path} is not a map: it has no {MANIFEST}.") from error
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise MapError(f"{path / MANIFEST} cannot be read: {' '.join(str(error).split())}.") from error
+    version = manifest.get("format_version") if isinstance(manifest, dict) else None
+    if not isinstance(version, int):
+        raise MapError(f"{path / MANIFEST} is not a map's manifest: it states no format_version.")
+    if version > FORMAT_VERSION:
+        raise MapError(
+            f"The map {path} has format {version}, this freeocc3d reads up to {FORMAT_VERSION}: upgrade freeocc3d."
+        )
+    _check_manifest(manifest, path)
+    loaded = Map(path, manifest)
+    for name in manifest["files"]:
+        loaded._require(name)
+    return loaded
+
+
+def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Write map.yaml with the sizes of all files beside it. Raises OSError."""
+    files = {
+        file.relative_to(folder).as_posix(): file.stat().st_size
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and file.name != MANIFEST
+    }
+    content = {"format_version": FORMAT_VERSION, **manifest, "files": files}
+    (folder / MANIFEST).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def write_occupancy(folder: Path, occupancy: Occupancy, codec: Codec, gaussian_features: NDArray[np.float16]) -> None:
+    """Write occupancy.npz and features.npz. Raises OSError."""
+    np.savez_compressed(
+        folder / OCCUPANCY,
+        keys=occupancy.keys,
+        probability=occupancy.probability.astype(np.float16),
+        free=occupancy.free,
+        hits=occupancy.hits,
+        state=occupancy.state,
+        colors=occupancy.colors,
+        feature_codes=codec.encode(occupancy.features),
+    )
+    tables: dict[str, Any] = {f"codec_{name}": table for name, table in codec.tables().items()}
+    np.savez_compressed(folder / FEATURES, gaussian_codes=codec.encode(gaussian_features), **tables)
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write the posed frames as TUM lines ``timestamp tx ty tz qx qy qz qw``. Raises OSError."""
+    rows = np.flatnonzero(trajectory.has_pose)
+    T = trajectory.T_world_cam[rows]
+    quats_wxyz = rotations_to_quats(T[:, :3, :3])
+    lines = ["# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes, metres, seconds)"]
+    for time, t, (w, x, y, z) in zip(
+        trajectory.timestamps[rows].tolist(), T[:, :3, 3].tolist(), quats_wxyz.tolist(), strict=True
+    ):
+        lines.append(f"{time!r} {t[0]:.9f} {t[1]:.9f} {t[2]:.9f} {x:.9f} {y:.9f} {z:.9f} {w:.9f}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(M,) timestamps and (M, 4, 4) poses of a TUM file. Raises MapError."""
+    try:
+        table = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise MapError(f"Cannot read the trajectory {path}: {error}.") from error
+    if table.size == 0:
+        return np.zeros(0), np.zeros((0, 4, 4))
+    if table.shape[1] != 8 or not np.isfinite(table).all():
+        raise MapError(f"The trajectory {path} is not of TUM's form: 8 finite numbers a line.")
+    T = np.tile(np.eye(4), (len(table), 1, 1))
+    T[:, :3, 3] = table[:, 1:4]
+    quats_wxyz = table[:, [7, 4, 5, 6]]
+    T[:, :3, :3] = quats_to_rotations(quats_wxyz / np.linalg.norm(quats_wxyz, axis=1, keepdims=True))
+    return table[:, 0], T
+
+
+def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]]) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz file; each name in ``expected`` must be there with its kind of number and dimensions.
+
+    Sizes are read from the headers before anything is unpacked. Raises MapError.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            arrays = {
+                info.filename.removesuffix(".npy"): _read_array(archive, info, path) for info in archive.infolist()
+            }
+    except FileNotFoundError as error:
+        raise MapError(f"The map lacks its file {path}: copy the whole folder, or map again.") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        raise MapError(f"{path} is damaged: {error}.") from error
+    for name, (kind, dimensions) in expected.items():
+        if name not in arrays or arrays[name].dtype.kind != kind or arrays[name].ndim != dimensions:
+            raise MapError(f"{path} is damaged: it has no usable array '{name}'.")
+    return arrays
+
+
+def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> NDArray[Any]:
+    with archive.open(info) as stream:
+        version = npy.read_magic(stream)
+        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, _, dtype = read_header(stream)
+        size = math.prod(shape) * dtype.itemsize
+        if dtype.hasobject or size > info.file_size or size > _LARGEST_ARRAY:
+            raise MapError(f"{path} is damaged: its array {info.filename} states a size that its data do not have.")
+    with archive.open(info) as stream:
+        return np.asarray(npy.read_array(stream, allow_pickle=False))
+
+
+def _place(timestamps: NDArray[np.float64], times: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4, 4) with the pose of each timestamp that a trajectory has, NaN elsewhere."""
+    out = np.full((len(timestamps), 4, 4), np.nan)
+    row = np.clip(np.searchsorted(timestamps, times), 0, max(len(timestamps) - 1, 0))
+    out[row[timestamps[row] == times]] = T[timestamps[row] == times]
+    return out
+
+
+def _check_manifest(manifest: dict[str, Any], path: Path) -> None:
+    needed = {"voxel_size_m": float, "origin": list, "up": list, "encoder": dict, "keyframes": list, "files": dict}
+    for key, kind in needed.items():
+        if not isinstance(manifest.get(key), kind):
+            raise MapError(f"{path / MANIFEST} is damaged: '{key}' is missing or not a {kind.__name__}.")
+    for name in manifest["files"]:
+        inside = (path / str(name)).resolve().is_relative_to(path.resolve())
+        if not inside:
+            raise MapError(f"{path / MANIFEST} is damaged: '{name}' lies outside the map's folder.")
+
+
+def counts(occupancy: Occupancy) -> dict[str, int]:
+    """Number of occupied, free and (within the blocks) unknown voxels."""
+    return {
+        name: int(np.count_nonzero(occupancy.state == value))
+        for name, value in (("occupied", OCCUPIED), ("free", FREE), ("unknown", UNKNOWN))
+    }
+
+
+_SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -1,0 +1,155 @@
+"""The folder ``MAP.partial`` of a run in progress: what each stage left, and whether it may be taken up again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import config, store
+from .config import Config
+from .errors import MapError
+from .gaussians.cloud import read_ply, write_ply
+from .types import Gaussians
+
+STAGES = {
+    "tracking": ("capture", "tracking"),
+    "gaussians": ("capture", "tracking", "gaussians", "occupancy"),
+    "language": ("capture", "tracking", "gaussians", "occupancy", "language"),
+}
+"""Stages whose results are saved, and the configuration sections that they depend on."""
+
+_TRACKING, _STAGE_FEATURES, _MARKS = "tracking.npz", "features.stage.npz", "stages.json"
+
+
+class WorkFolder:
+    """The folder ``MAP.partial`` of a run in progress: checkpoints, and the fingerprint of what they depend on."""
+
+    def __init__(self, folder: Path, resumed: bool):
+        self.folder = folder
+        self.resumed = resumed
+        self.seconds: dict[str, float] = {}
+        self.warnings: list[str] = []
+        self.broken: list[str] = []
+        self._fingerprints: dict[str, str] = {}
+        self._valid: set[str] = set()
+
+    @classmethod
+    def open(cls, output: Path, overwrite: bool, resume: bool) -> WorkFolder:
+        """Raises MapError if a map or an interrupted run is in the way."""
+        folder = output.with_name(output.name + ".partial")
+        if not output.name:
+            raise MapError(f"'{output}' cannot be the name of a map folder.")
+        if output.exists() and not overwrite:
+            raise MapError(f"{output} exists: choose another folder, or replace it with --overwrite.")
+        if output.exists() and not (output / store.MANIFEST).is_file():
+            raise MapError(f"{output} is not a map, so it is not overwritten: choose another folder.")
+        if folder.exists() and not (resume or overwrite):
+            raise MapError(
+                f"{folder} holds the work of an interrupted run: go on with --resume, or start again with --overwrite."
+            )
+        if folder.exists() and not resume:
+            shutil.rmtree(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise MapError(f"Cannot create {folder}: {error.strerror}.") from error
+        return cls(folder, resume)
+
+    def begin(self, identity: list[Any], settings: Config) -> None:
+        """Decide which saved stages are still valid for this configuration and what ``identity`` says of the input."""
+        self._fingerprints = {
+            stage: config.fingerprint({**settings, "identity": {"of": identity}}, (*sections, "identity"))
+            for stage, sections in STAGES.items()
+        }
+        saved = {}
+        if self.resumed:
+            with contextlib.suppress(OSError, ValueError):
+                saved = json.loads((self.folder / _MARKS).read_text(encoding="utf-8"))
+        self._valid = {stage for stage, value in self._fingerprints.items() if saved.get(stage) == value}
+        if self.resumed and "tracking" not in self._valid:
+            shutil.rmtree(self.folder)
+            self.folder.mkdir()
+
+    def save_tracking(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Keep layer 1's state, in place of the one before."""
+        temporary = self.folder / "tracking.tmp.npz"
+        log = {"broken": self.broken, "warnings": self.warnings, "seconds": self.seconds}
+        arrays: dict[str, Any] = {**state, "log": np.array(json.dumps(log))}
+        np.savez(temporary, **arrays)
+        temporary.replace(self.folder / _TRACKING)
+        self._mark("tracking")
+
+    def restore_tracking(self) -> dict[str, NDArray[Any]] | None:
+        """The state of the last checkpoint, if there is one and it is still valid."""
+        path = self.folder / _TRACKING
+        if "tracking" not in self._valid or not path.is_file():
+            return None
+        state = store.read_arrays(path, {})
+        log = json.loads(str(state.pop("log")))
+        self.broken, self.warnings = log["broken"], log["warnings"]
+        self.seconds["before the interruption"] = sum(log["seconds"].values())
+        return state
+
+    def gaussians(self, compute: Callable[[], Gaussians]) -> Gaussians:
+        """The saved result of layer 2, or ``compute()``, saved."""
+        path = self.folder / store.GAUSSIANS
+        if "gaussians" in self._valid and path.is_file():
+            return read_ply(path)
+        result = compute()
+        if len(result):
+            write_ply(result, path)
+            self._mark("gaussians")
+        return result
+
+    def features(self, compute: Callable[[], NDArray[np.float16]]) -> NDArray[np.float16]:
+        """The saved result of layer 3, or ``compute()``, saved."""
+        path = self.folder / _STAGE_FEATURES
+        if "language" in self._valid and path.is_file():
+            return np.asarray(store.read_arrays(path, {"features": ("f", 2)})["features"], np.float16)
+        features = compute()
+        np.savez(path, features=features)
+        self._mark("language")
+        return features
+
+    def drop_checkpoints(self) -> None:
+        """Remove what a finished map does not need."""
+        for name in (_TRACKING, _STAGE_FEATURES, _MARKS):
+            (self.folder / name).unlink(missing_ok=True)
+
+    def finish(self, output: Path) -> None:
+        """The work folder takes the map's name; a map that it replaces is gone only when the new one stands."""
+        old = output.with_name(output.name + ".old")
+        if output.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            output.rename(old)
+        self.folder.rename(output)
+        shutil.rmtree(old, ignore_errors=True)
+
+    def drop_if_empty(self) -> None:
+        """Leave nothing behind where nothing was done."""
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+
+    @contextlib.contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the time spent inside to the stage's."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def _mark(self, stage: str) -> None:
+        """Record that a stage's result is saved; later stages' results are out of date."""
+        order = list(STAGES)
+        self._valid = {name for name in self._valid if order.index(name) < order.index(stage)} | {stage}
+        marks = {name: self._fingerprints[name] for name in self._valid}
+        (self.folder / _MARKS).write_text(json.dumps(marks), encoding="utf-8")

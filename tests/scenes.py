@@ -1,0 +1,59 @@
+"""Analytic scenes for tests: Gaussians, depth images and occupancy whose right answers are known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from freeocc3d.types import Frame, Gaussians, Intrinsics, Occupancy
+
+CAMERA = Intrinsics(160, 120, 130.0, 130.0, 79.5, 59.5)
+
+
+def gaussians(means: object, scales: object, quats: object = None, opacities: object = None) -> Gaussians:
+    """Gaussians at (N, 3) means; scales (N, 3) or one number; rotations default to none, opacities to 0.9."""
+    means = np.atleast_2d(np.asarray(means, np.float32))
+    n = len(means)
+    identity = np.tile(np.float32([1, 0, 0, 0]), (n, 1))
+    return Gaussians(
+        means=means,
+        scales=np.broadcast_to(np.asarray(scales, np.float32), (n, 3)).copy(),
+        quats_wxyz=identity if quats is None else np.atleast_2d(np.asarray(quats, np.float32)),
+        opacities=np.full(n, 0.9, np.float32) if opacities is None else np.asarray(opacities, np.float32),
+        colors=np.full((n, 3), 128, np.uint8),
+        anchor_keyframe=np.zeros(n, np.int32),
+        anchor_cam=means.copy(),
+    )
+
+
+def random_gaussians(n: int, seed: int, extent: float = 1.0) -> Gaussians:
+    """Gaussians of random shape, rotation and opacity in a cube around the origin."""
+    rng = np.random.default_rng(seed)
+    quats = rng.normal(size=(n, 4))
+    return gaussians(
+        rng.uniform(-extent / 2, extent / 2, (n, 3)),
+        rng.uniform(0.01, 0.06, (n, 3)),
+        quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        rng.uniform(0.1, 1.0, n),
+    )
+
+
+def wall_frame(distance: float, index: int = 0, camera: Intrinsics = CAMERA, seed: int | None = None) -> Frame:
+    """A camera that looks straight at a textured wall; with a seed, depth has sensor-like noise."""
+    rng = np.random.default_rng(0)
+    color = np.repeat(np.repeat(rng.integers(0, 256, (camera.height // 8, camera.width // 8, 3)), 8, 0), 8, 1)
+    depth = np.full((camera.height, camera.width), distance, np.float32)
+    if seed is not None:
+        depth += np.random.default_rng(seed).normal(0, 0.0019 * distance**2, depth.shape).astype(np.float32)
+    return Frame(index, float(index), color.astype(np.uint8), depth, camera)
+
+
+def dense(occupancy: Occupancy, values: np.ndarray, lo: object, hi: object, fill: object) -> np.ndarray:
+    """Per-voxel values (B, 512) as an array over the voxels [lo, hi)."""
+    lo, hi = np.asarray(lo), np.asarray(hi)
+    out = np.full(hi - lo, fill, values.dtype)
+    local = np.arange(512)
+    offsets = np.stack((local // 64, local // 8 % 8, local % 8), axis=1)
+    index = (occupancy.keys[:, None] * 8 + offsets).reshape(-1, 3) - lo
+    inside = ((index >= 0) & (index < hi - lo)).all(axis=1)
+    out[tuple(index[inside].T)] = values.reshape(-1)[inside]
+    return out

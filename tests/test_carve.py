@@ -1,0 +1,86 @@
+"""Free space from depth: a wall, a thin post, missing depth."""
+
+import numpy as np
+from scenes import CAMERA, wall_frame
+
+from freeocc3d.geometry import project
+from freeocc3d.occupancy import carve, grid
+from freeocc3d.types import Frame
+
+V = 0.08
+ORIGIN = np.array([-2.0, -2.0, 0.0])
+OPTIONS = carve.Options()
+
+
+def evidence_of(frame: Frame, T=None):
+    """Counts of one image over the blocks that it looks into, and the voxel centres in the world."""
+    T = np.eye(4) if T is None else T
+    packed = carve.visible_blocks(frame, T, ORIGIN, V, OPTIONS.ray_step)
+    evidence = carve.Evidence(packed, ORIGIN, V, OPTIONS)
+    evidence.add(frame, T)
+    local = np.stack((np.arange(512) // 64, np.arange(512) // 8 % 8, np.arange(512) % 8), axis=1)
+    centers = ORIGIN + ((evidence.keys[:, None] * 8 + local) + 0.5) * V
+    return evidence.free, evidence.hits, centers
+
+
+def test_a_wall_is_hit_what_lies_before_it_is_free_and_behind_it_nothing_is_known() -> None:
+    free, hits, centers = evidence_of(wall_frame(2.0))
+    z = centers[..., 2]
+    pixels, _ = project(centers, CAMERA)
+    with np.errstate(invalid="ignore"):
+        seen = (pixels > 4).all(axis=-1) & (pixels < (CAMERA.width - 5, CAMERA.height - 5)).all(axis=-1) & (z > 0.2)
+    assert (free[seen & (z < 2.0 - 1.5 * V)] == 1).all()
+    assert (free[z > 2.0 - 0.5 * V] == 0).all()
+    assert (hits[seen & (np.abs(z - 2.0) < 0.4 * V)] == 1).all()
+    assert (hits[np.abs(z - 2.0) > 1.5 * V] == 0).all()
+    assert (free[z < 0] == 0).all()
+
+
+def test_the_camera_may_stand_anywhere() -> None:
+    T = np.array([[0, 0, 1, -1.0], [1, 0, 0, 0.2], [0, 1, 0, 1.1], [0, 0, 0, 1.0]])  # looks along world x
+    free, hits, centers = evidence_of(wall_frame(2.0), T)
+    assert free.sum() > 1000
+    assert centers[free > 0][:, 0].max() < 1.0 - 0.5 * V
+    assert centers[free > 0][:, 0].min() > -1.0
+    assert np.abs(centers[hits > 0][:, 0] - 1.0).max() <= 1.5 * V
+
+
+def test_a_voxel_with_a_thin_post_in_it_is_not_seen_through_beside_the_post() -> None:
+    frame = wall_frame(3.0)
+    post = slice(82, 85)  # 3 pixels at 1.5 m: 3.5 cm, beside the optical axis
+    frame.depth_m[:, post] = 1.5
+    free, _, centers = evidence_of(frame)
+    on_post = (np.abs(centers[..., 2] - 1.5) < 0.5 * V) & (np.abs(centers[..., 1]) < 0.5)
+    x = (83.0 - CAMERA.cx) / CAMERA.fx * 1.5
+    assert (free[on_post & (np.abs(centers[..., 0] - x) < 0.5 * V)] == 0).all()
+    assert (free[on_post & (np.abs(centers[..., 0] - x) > 2 * V) & (np.abs(centers[..., 0]) < 0.6)] == 1).all()
+
+
+def test_missing_depth_says_nothing() -> None:
+    frame = wall_frame(2.0)
+    frame.depth_m[:, :80] = 0
+    free, hits, centers = evidence_of(frame)
+    left = centers[..., 0] < -0.1
+    assert free[left].sum() == hits[left].sum() == 0
+    empty = Frame(0, 0.0, frame.color, np.zeros_like(frame.depth_m), CAMERA)
+    assert len(carve.visible_blocks(empty, np.eye(4), ORIGIN, V, 16)) == 0
+
+
+def test_counts_add_up_over_images() -> None:
+    frame = wall_frame(2.0)
+    packed = carve.visible_blocks(frame, np.eye(4), ORIGIN, V, 16)
+    evidence = carve.Evidence(packed, ORIGIN, V, OPTIONS)
+    for _ in range(3):
+        evidence.add(frame, np.eye(4))
+    assert set(np.unique(evidence.free)) == {0, 3}
+    assert set(np.unique(evidence.hits)) == {0, 3}
+
+
+def test_visible_blocks_cover_every_voxel_that_gets_evidence() -> None:
+    frame = wall_frame(2.0)
+    few = carve.visible_blocks(frame, np.eye(4), ORIGIN, V, 16)
+    wide = np.unique(grid.pack((grid.unpack(few)[:, None] + np.indices((3, 3, 3)).reshape(3, -1).T - 1).reshape(-1, 3)))
+    narrow, broad = (carve.Evidence(keys, ORIGIN, V, OPTIONS) for keys in (few, wide))
+    narrow.add(frame, np.eye(4))
+    broad.add(frame, np.eye(4))
+    assert narrow.free.sum() >= 0.97 * broad.free.sum()  # the rest lies in blocks that the image's border grazes

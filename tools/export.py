@@ -1,0 +1,9 @@
+#!/usr/bin/env python3
+"""`freeocc3d export`; see `python tools/export.py --help`."""
+
+import sys
+
+from freeocc3d.cli import main
+
+if __name__ == "__main__":
+    main(["export", *sys.argv[1:]])
