@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..capture.base import Capture
 from ..errors import TrackingError
-from ..geometry import invert
+from ..geometry import invert, nearest_rigid
 from ..types import Frame, Trajectory
 from .base import Tracked, Tracker
 from .overlap import DepthView, mutual_overlap, sample_points
@@ -44,10 +44,11 @@ class KnownTracker(Tracker):
         self._keyframe: DepthView | None = None
 
     def track(self, frame: Frame) -> Tracked:
-        T_world_cam = self.capture.pose(frame.index)
-        if T_world_cam is None:
+        given = self.capture.pose(frame.index)
+        if given is None:
             self.records.add_lost(frame.index)
             return Tracked("lost", None, 0.0)
+        T_world_cam = nearest_rigid(given)  # files state poses to a few digits
         view = self._view(frame)
         if self._keyframe is not None:
             T_keyframe_cam = invert(self.records.T_world_keyframe[-1]) @ T_world_cam
