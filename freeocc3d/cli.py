@@ -96,7 +96,7 @@ def reconstruct(
     """Turn a captured scan into a map."""
     from . import config, pipeline
 
-    settings = config.load(config_file, [*(overrides or []), f"tracking.device={device}"])
+    settings = config.load(config_file, [*(overrides or []), f"tracking.rgbd.device={device}"])
     progress = ConsoleProgress()
     try:
         made = pipeline.reconstruct(capture, output, settings, overwrite=overwrite, resume=resume, progress=progress)
@@ -194,9 +194,16 @@ def info(map_path: MapPath, as_json: Json = False) -> None:
 
 
 @app.command("list")
-def list_backends(as_json: Json = False) -> None:
+def list_backends(
+    as_json: Json = False,
+    as_yaml: Annotated[bool, typer.Option("--yaml", help="Print a configuration with every key, commented.")] = False,
+) -> None:
     """List readers, trackers, encoders and exporters with their options."""
-    from . import registry
+    from . import config, registry
+
+    if as_yaml:
+        print(config.documented(), end="")
+        return
 
     found = {title: registry.backends(folder) for folder, title in registry.FOLDERS.items()}
     if as_json:

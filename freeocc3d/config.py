@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import textwrap
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,27 @@ def dump(config: Config) -> str:
     """Resolved YAML; ``load`` of it gives the same configuration back."""
     plain = json.loads(json.dumps(config))  # tuples become lists
     return yaml.safe_dump(plain, sort_keys=False)
+
+
+def documented() -> str:
+    """YAML with every key, its default and what it does: what ``configs/default.yaml`` holds."""
+    lines = ["# Every option with its default. A file of your own needs only the keys that it changes."]
+    for section, (module, folder) in SECTIONS.items():
+        lines += ["", f"{section}:"]
+        for option in registry.options_of(module):
+            lines += _documented(option, indent=2)
+        for name, backend in (registry.backends(folder) if folder else {}).items():
+            if backend.options:
+                lines.append(f"  {name}:  # {backend.summary}")
+                for option in backend.options:
+                    lines += _documented(option, indent=4)
+    return "\n".join(lines) + "\n"
+
+
+def _documented(option: Option, indent: int) -> list[str]:
+    value = json.dumps(option.default)
+    comment = textwrap.wrap(option.doc, 118 - indent)
+    return [" " * indent + f"# {line}" for line in comment] + [" " * indent + f"{option.name}: {value}"]
 
 
 def fingerprint(config: Config, sections: Iterable[str]) -> str:

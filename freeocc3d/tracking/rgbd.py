@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture.base import Capture
+from ..errors import ConfigError
 from ..geometry import invert, nearest_rigid
 from ..types import Frame, Intrinsics, Trajectory
 from . import pose_graph
@@ -25,6 +26,8 @@ REQUIRES: tuple[str, ...] = ("open3d",)
 class Options:
     """Odometry and keyframes."""
 
+    device: str = "cpu"
+    """Where the odometry runs: "cpu", or "cuda:0" and so on with an Open3D that has CUDA."""
     width: int = 320
     """Images are tracked at this width (a smaller one is kept)."""
     iterations: tuple[int, int, int] = (10, 6, 4)
@@ -61,7 +64,7 @@ class _Match:
 
 
 def load(options: Options, capture: Capture) -> RgbdTracker:
-    """The tracker; ``capture`` is not read."""
+    """The tracker; ``capture`` is not read. Raises ConfigError for a device that is not there."""
     return RgbdTracker(options)
 
 
@@ -75,6 +78,7 @@ class RgbdTracker(Tracker):
 
     def __init__(self, options: Options):
         self.options = options
+        self.device = _device(options.device)
         self.records = Records()
         self.edges: list[Edge] = []
         self._keyframes: list[_View] = []
@@ -144,14 +148,14 @@ class RgbdTracker(Tracker):
             )  # fmt: skip
         except RuntimeError:  # a singular system: nothing to align
             return failed
-        T = result.transformation.numpy()
+        T = result.transformation.cpu().numpy()
         fitness, residual = result.fitness / valid, result.inlier_rmse
         if not np.isfinite(T).all() or fitness < self.options.min_fitness or residual > self.options.max_residual:
             return failed
         information = odometry.compute_odometry_information_matrix(
             source.rgbd.depth, target.rgbd.depth, K, result.transformation,  # type: ignore[attr-defined]
             self.options.depth_difference, 1.0, 1000.0,
-        ).numpy()  # fmt: skip
+        ).cpu().numpy()  # fmt: skip
         weakest = np.linalg.eigvalsh(information)[0] / max(information[5, 5], 1.0)
         return _Match(nearest_rigid(T), information, fitness, ok=bool(weakest >= self.options.min_information))
 
@@ -208,7 +212,7 @@ class RgbdTracker(Tracker):
         depth = np.ascontiguousarray(depth)
         rgbd = o3d.t.geometry.RGBDImage(
             o3d.t.geometry.Image(np.ascontiguousarray(color)), o3d.t.geometry.Image(depth[..., None])
-        )
+        ).to(self.device)
         return _View(depth, camera, sample_points(depth, camera), rgbd)
 
     def state(self) -> dict[str, NDArray[np.generic]]:
@@ -233,3 +237,16 @@ class RgbdTracker(Tracker):
                 state["edge_nodes"].tolist(), state["edge_T_target_source"], state["edge_information"], strict=True
             )
         ]
+
+
+def _device(name: str) -> object:
+    """The Open3D device of a name such as "cpu" or "cuda:0". Raises ConfigError if there is none."""
+    import open3d as o3d
+
+    kind, _, number = name.lower().partition(":")
+    number = number or "0"
+    if kind not in ("cpu", "cuda") or not number.isdigit():
+        raise ConfigError(f"Unknown device '{name}': use cpu or cuda:0.")
+    if kind == "cuda" and int(number) >= o3d.core.cuda.device_count():
+        raise ConfigError(f"There is no device '{name}': Open3D sees {o3d.core.cuda.device_count()} CUDA devices here.")
+    return o3d.core.Device(kind.upper(), int(number))
