@@ -8,6 +8,7 @@ for region in scan_map.query("red cup").regions:
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from .store import load_map
 
 __version__ = "0.1.0"
+
+# Numba tries an installed TBB first and warns on stderr if it is too old; the wheels bring OpenMP anyway.
+os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
 
 __all__ = ["__version__", "load_map", "reconstruct"]
 

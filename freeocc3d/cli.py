@@ -91,12 +91,13 @@ def reconstruct(
     overrides: Set = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
     overwrite: Overwrite = False,
-    device: Annotated[str, typer.Option("--device", help="cpu or cuda:0.")] = "cpu",
+    device: Annotated[str | None, typer.Option("--device", help="cpu (the default) or cuda:0.")] = None,
 ) -> None:
     """Turn a captured scan into a map."""
     from . import config, pipeline
 
-    settings = config.load(config_file, [*(overrides or []), f"tracking.rgbd.device={device}"])
+    on_device = [f"tracking.rgbd.device={device}"] if device else []
+    settings = config.load(config_file, [*(overrides or []), *on_device])
     progress = ConsoleProgress()
     try:
         made = pipeline.reconstruct(capture, output, settings, overwrite=overwrite, resume=resume, progress=progress)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import FreeOccError
 from .types import Intrinsics
 
-Array = NDArray[np.floating]
+Array = NDArray[Any]
 
 
 def invert(T_a_b: Array) -> Array:

@@ -7,6 +7,7 @@ and one clean pass of layers 2-4. Its work lies in ``MAP.partial`` until it is w
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import resource
@@ -119,6 +120,7 @@ def reconstruct(
     """
     progress = progress or Progress()
     resolved = config.resolve(settings or {})
+    _check_ranges(resolved)
     output = Path(output)
     work = WorkFolder.open(output, overwrite, resume)
     try:
@@ -149,7 +151,7 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
     with work.timed("refinement"):
         progress.stage("refinement")
         mapper.refine()
-    trajectory = mapper.trajectory()
+    trajectory = _with_broken(mapper.trajectory(), work.broken)
     with work.timed("gaussians"):
         gaussians = work.gaussians(lambda: mapper.build_gaussians(progress))
     if len(gaussians) == 0:
@@ -178,9 +180,9 @@ def _track(mapper: Mapper, work: WorkFolder, progress: Progress) -> None:
     stream = read_ahead(capture, frames[first:])
     done = first
     try:
-        for _, frame in stream:
+        for index, frame in stream:
             if isinstance(frame, FrameError):
-                work.broken.append(str(frame))
+                work.broken[index] = str(frame)
                 progress.warn(str(frame))
                 if len(work.broken) > allowed:
                     raise CaptureError(
@@ -202,6 +204,13 @@ def _track(mapper: Mapper, work: WorkFolder, progress: Progress) -> None:
             f"No frame of {capture.path} could be used as a start: their depth is empty. Is it in other units "
             "(capture.depth_scale), or all beyond capture.max_depth?"
         )
+
+
+def _with_broken(trajectory: Trajectory, broken: dict[int, str]) -> Trajectory:
+    """The trajectory with the status of frames that could not be decoded."""
+    status = trajectory.status.copy()
+    status[list(broken)] = "broken"
+    return dataclasses.replace(trajectory, status=status)
 
 
 def _checkpoint(mapper: Mapper, work: WorkFolder, done: int) -> None:
@@ -311,7 +320,7 @@ def _report(
         "seconds": {name: round(value, 3) for name, value in work.seconds.items()},
         "peak_memory_bytes": peak_kib * 1024,
         "frames": {str(s): int(n) for s, n in zip(status, count, strict=True)},
-        "broken": work.broken,
+        "broken": {str(index): text for index, text in work.broken.items()},
         "warnings": work.warnings,
         "bytes_per_gaussian": 67,
         "frame_log": {
@@ -337,6 +346,15 @@ def _load_backend(settings: Config, section: str, key: str, capture: Capture) ->
     if not hasattr(module, "Options"):
         return module.load(capture)
     return module.load(registry.build_options(module, settings[section].get(name, {})), capture)
+
+
+def _check_ranges(settings: Config) -> None:
+    """Build every layer's options once, so that a value out of range is told before any work."""
+    for section, module in (("gaussians", anchors), ("language", lift), ("occupancy", splat), ("carving", carve)):
+        _options(module, config.options(settings, section))
+    for section, key in (("tracking", "backend"), ("language", "encoder")):
+        folder = config.SECTIONS[section][1]
+        registry.load(str(folder), settings[section][key])
 
 
 def _options(module: Any, values: dict[str, Any]) -> Any:

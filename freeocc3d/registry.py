@@ -113,6 +113,14 @@ def check(options: Mapping[str, Option], values: Mapping[str, Any], where: str) 
     }
 
 
+def require_positive(options: Any, *names: str) -> None:
+    """Raise ConfigError unless the named fields of an ``Options`` (or None) are greater than zero."""
+    for name in names:
+        value = getattr(options, name)
+        if value is not None and not value > 0:
+            raise ConfigError(f"'{name}' must be greater than 0, got {value}.")
+
+
 def nearest(word: str, known: Iterable[str]) -> str:
     """``" (did you mean 'x'?)"`` for the closest known word, or an empty string."""
     close = difflib.get_close_matches(str(word), list(known), n=1, cutoff=0.5)

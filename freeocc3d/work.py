@@ -37,7 +37,7 @@ class WorkFolder:
         self.resumed = resumed
         self.seconds: dict[str, float] = {}
         self.warnings: list[str] = []
-        self.broken: list[str] = []
+        self.broken: dict[int, str] = {}  # frame -> what is wrong with it
         self._fingerprints: dict[str, str] = {}
         self._valid: set[str] = set()
 
@@ -94,7 +94,8 @@ class WorkFolder:
             return None
         state = store.read_arrays(path, {})
         log = json.loads(str(state.pop("log")))
-        self.broken, self.warnings = log["broken"], log["warnings"]
+        self.broken = {int(index): text for index, text in log["broken"].items()}
+        self.warnings = log["warnings"]
         self.seconds["before the interruption"] = sum(log["seconds"].values())
         return state
 

@@ -62,7 +62,7 @@ def align_trajectory(
     centers_est, centers_true = _matched_centers(estimated, T_world_cam_true)
     scale, R, t = umeyama(centers_est, centers_true, with_scale)
     error = _rmse(scale * centers_est @ R.T + t, centers_true)
-    return Alignment(scale, R, t, error, len(centers_est))
+    return Alignment(scale, np.asarray(R, np.float64), np.asarray(t, np.float64), error, len(centers_est))
 
 
 def ate_rmse(estimated: Trajectory, T_world_cam_true: NDArray[np.float64], with_scale: bool = False) -> float:
@@ -70,17 +70,8 @@ def ate_rmse(estimated: Trajectory, T_world_cam_true: NDArray[np.float64], with_
     return align_trajectory(estimated, T_world_cam_true, with_scale).ate_rmse_m
 
 
-def trajectory_error(estimated: Trajectory, T_world_cam_true: NDArray[np.float64]) -> float:
-    """Root mean square distance of the camera centres as they are, metres: for an estimate that is already in the true
-    world, such as a map made with known poses. Raises FreeOccError: lengths differ, no frame matches."""
-    centers_est, centers_true = _matched_centers(estimated, T_world_cam_true)
-    if len(centers_est) == 0:
-        raise FreeOccError("No frame has both an estimated and a true pose: check that both are of the same capture.")
-    return _rmse(centers_est, centers_true)
-
-
 def true_poses(capture: Capture) -> NDArray[np.float64]:
-    """(N, 4, 4) the poses that a capture states, NaN where it has none. Raises FreeOccError if it states none at all."""
+    """(N, 4, 4) the poses that a capture states, NaN where it has none. Raises FreeOccError if it has none at all."""
     poses = np.full((len(capture), 4, 4), np.nan)
     for index in range(len(capture)):
         T_world_cam = capture.pose(index)

@@ -69,18 +69,18 @@ def occupancy_iou(labels_true: NDArray[np.uint8], occupied_pred: NDArray[np.bool
     if not mask.any():
         raise FreeOccError("The ground truth observed no voxel at all, so there is nothing to score.")
     truth, pred = labels_true[mask] != FREE, occupied_pred[mask]
-    both = np.count_nonzero(truth & pred)
+    both, either = int((truth & pred).sum()), int((truth | pred).sum())
     return OccupancyScore(
-        iou=_fraction(both, np.count_nonzero(truth | pred)),
-        precision=_fraction(both, np.count_nonzero(pred)),
-        recall=_fraction(both, np.count_nonzero(truth)),
-        voxels=int(np.count_nonzero(mask)),
+        iou=_fraction(both, either),
+        precision=_fraction(both, int(pred.sum())),
+        recall=_fraction(both, int(truth.sum())),
+        voxels=len(truth),
     )
 
 
 def load_ground_truth(path: str | Path) -> GroundTruth:
-    """Read ``ground_truth.npz``; nothing is unpickled. Raises FreeOccError: no such file, damaged, a key is missing or
-    has another shape or type than FORMATS state, a label has no class."""
+    """Read ``ground_truth.npz``; nothing is unpickled. Raises FreeOccError: no such file, damaged, an array is
+    missing or has another shape or type than ``GroundTruth`` states, a label has no class."""
     path = Path(path)
     arrays = _read(path)
     labels = _array(arrays, "labels", path)
@@ -122,4 +122,4 @@ def _array(arrays: dict[str, NDArray[Any]], name: str, path: Path) -> NDArray[An
 
 
 def _fraction(part: int, whole: int) -> float:
-    return float(part / whole) if whole else 0.0
+    return part / whole if whole else 0.0

@@ -9,11 +9,13 @@ the surface, not with the frames.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import back_project, invert, multiply_quats, rotations_to_quats, transform
+from ..registry import require_positive
 from ..types import Frame, Gaussians, Intrinsics
 
 _CELLS_PER_AXIS = 1 << 20  # cells on either side of the world's origin, along each axis
@@ -40,6 +42,9 @@ class Options:
     reports depths that belong to neither side."""
     min_pixels: int = 2
     """Measurements that a cell needs."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "cell_size", "pixel_stride", "coverage", "gamma", "opacity", "edge", "min_pixels")
 
 
 def depth_sigma(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -68,17 +73,13 @@ class _Cells:
     """Sums over the measurements of each cell; rows are cells, ``key`` is ascending."""
 
     key: NDArray[np.int64]
-    weight: NDArray[np.float64]
-    position: NDArray[np.float64]  # (n, 3) weighted sum, world
-    color: NDArray[np.float64]  # (n, 3) weighted sum
+    weight: NDArray[Any]
+    position: NDArray[Any]  # (n, 3) weighted sum, world
+    color: NDArray[Any]  # (n, 3) weighted sum
     pixels: NDArray[np.int64]
-    best_weight: NDArray[np.float64]  # of the keyframe that measured the cell best
+    best_weight: NDArray[Any]  # of the keyframe that measured the cell best
     best_keyframe: NDArray[np.int32]
     best_footprint: NDArray[np.float32]  # spacing of that keyframe's measurements on the surface, metres
-
-    def concatenated(self, other: _Cells) -> _Cells:
-        """Both, one after the other; keys may repeat until ``merged``."""
-        return _Cells(*(np.concatenate((getattr(self, f.name), getattr(other, f.name))) for f in fields(self)))
 
     def merged(self) -> _Cells:
         """Rows of the same cell summed. The result does not depend on the order of rows but to rounding."""

@@ -10,6 +10,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..geometry import back_project, invert, transform
+from ..registry import require_positive
 from ..types import BLOCK, Frame
 from .grid import blocks_along_rays, unpack
 
@@ -27,6 +28,9 @@ class Options:
     """Depth images that must see through a voxel that holds no surface before it counts as free."""
     ray_step: int = 16
     """Every n-th pixel's ray is followed to find the blocks that the camera looked into."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "margin", "min_free", "ray_step")
 
 
 def visible_blocks(

@@ -20,6 +20,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..geometry import quats_to_rotations
+from ..registry import require_positive
 from ..types import BLOCK, Gaussians
 from .grid import build_table, find, packed_key, touched_blocks
 
@@ -39,6 +40,9 @@ class Options:
     seen_through: float = 3.0
     """A voxel above the threshold is free all the same when this many times more depth images saw through it than ended
     in it."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "voxel_size", "cutoff", "threshold", "seen_through")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..capture.base import Capture
 from ..errors import ConfigError
 from ..geometry import invert, nearest_rigid
+from ..registry import require_positive
 from ..types import Frame, Intrinsics, Trajectory
 from . import pose_graph
 from .base import Tracked, Tracker
@@ -46,6 +47,9 @@ class Options:
     """Earlier keyframes that a new one is registered to, beyond the last: those that share most of its view."""
     min_edge_overlap: float = 0.4
     """Share of the view that such a keyframe must have in common."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "width", "depth_difference", "keyframe_overlap", "min_fitness", "max_residual")
 
 
 @dataclass(frozen=True)

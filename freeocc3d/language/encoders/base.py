@@ -23,19 +23,28 @@ class TextFeatures:
 
     features: (W, D) float32 unit rows; a zero row for a word that the encoder cannot express at all.
     understood: for each word the part that was used ("white" of "white sofa"), empty if none was.
+    attainable: (W,) float32 in 0…1, the cosine that a thing which fits the word perfectly reaches; None stands for 1.
+        It is less for a word that covers several kinds: of "table" over coffee, dining and side tables, each an axis of
+        its own, a coffee table reaches 1/√3. A query divides by it, so that general and special words compare.
     """
 
     features: NDArray[np.float32]
     understood: tuple[str, ...]
+    attainable: NDArray[np.float32] | None = None
 
 
 class TextEncoder(ABC):
     """The word side of an encoder, restored from what the map saved."""
 
     threshold: float
-    """Cosine similarity from which a voxel matches a word, for words that beat the contrast words there."""
+    """Score (cosine over the attainable cosine) from which a voxel matches a word that beats the contrast words."""
     temperature: float
-    """Softmax temperature that turns similarities into a confidence against the contrast words."""
+    """Softmax temperature that turns scores into a confidence against the contrast words."""
+    same_word: float = 0.9
+    """A contrast word whose text feature has at least this cosine to the asked word's says the same, or a part of it:
+    it does not compete."""
+    knows: str = "words like those that it was trained on"
+    """What can be asked, in words, for the note about a word that is not understood."""
 
     @abstractmethod
     def encode_words(self, words: list[str]) -> TextFeatures:
@@ -43,7 +52,8 @@ class TextEncoder(ABC):
 
     @abstractmethod
     def contrast_words(self) -> list[str]:
-        """What a voxel could be instead: a word matches only where it scores above these (and is none of them)."""
+        """What a voxel could be instead: a word matches only where it scores at least as high as each of these (but
+        for those that say the same, see ``same_word``)."""
 
 
 class Encoder(ABC):

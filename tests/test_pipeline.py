@@ -1,0 +1,253 @@
+"""From a folder to a map: the whole run on the built-in room and on a piece of a real scan; interruption, resuming,
+bad input."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from helpers import data_folder, truncate, write_scannet, write_seven_scenes
+
+import freeocc3d
+from freeocc3d import pipeline, store
+from freeocc3d.capture import open_capture
+from freeocc3d.errors import CaptureError, ConfigError, FreeOccError, Interrupted, MapError, TrackingError
+from freeocc3d.progress import Progress
+from freeocc3d.types import FREE, OCCUPIED
+
+ROOM = {"capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "stop": 24}}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> store.Map:
+    return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", ROOM)
+
+
+def listing(folder) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_the_room_becomes_a_map_with_every_layer(room) -> None:
+    assert (room.trajectory.has_pose[:24]).all()
+    assert (room.trajectory.status[24:] == "unused").all()
+    assert len(room.gaussians) > 500
+    states = room.occupancy.state
+    assert np.count_nonzero(states == OCCUPIED) > 300
+    assert np.count_nonzero(states == FREE) > np.count_nonzero(states == OCCUPIED)
+    assert len(room.occupancy.features) == len(room.occupancy.occupied_voxels())
+    assert room.gaussian_features.shape == (len(room.gaussians), room.manifest["encoder"]["dimension"])
+    assert len(room.keyframes) == len(room.trajectory.keyframes)
+    assert {p.name for p in room.path.iterdir()} == {
+        "map.yaml", "config.yaml", "report.json", "trajectory.txt", "gaussians.ply", "occupancy.npz", "features.npz",
+        "keyframes",
+    }  # fmt: skip
+
+
+def test_the_rooms_poses_are_right(room) -> None:
+    capture = open_capture("builtin:room", *_synthetic())
+    first = np.linalg.inv(capture.pose(int(room.trajectory.keyframes[0])))
+    for i in range(24):
+        error = np.linalg.inv(first @ capture.pose(i)) @ room.trajectory.T_world_cam[i]
+        assert np.linalg.norm(error[:3, 3]) < 0.03
+
+
+def _synthetic():
+    from freeocc3d import config, registry
+    from freeocc3d.capture import base
+
+    settings = config.resolve(ROOM)
+    return registry.build_options(base, config.options(settings, "capture")), settings["capture"]
+
+
+def test_means_on_file_are_their_anchors_at_the_files_poses(room) -> None:
+    g, T = room.gaussians, room.trajectory.T_world_keyframe
+    world = np.einsum("nij,nj->ni", T[g.anchor_keyframe, :3, :3], g.anchor_cam.astype(float))
+    np.testing.assert_allclose(world + T[g.anchor_keyframe, :3, 3], g.means, atol=1e-4)
+
+
+def test_a_pose_free_run_never_reads_poses_or_class_images(tmp_path, monkeypatch) -> None:
+    from freeocc3d.capture.seven_scenes import Reader
+
+    def forbidden(self, index):
+        raise AssertionError("the truth was read")
+
+    monkeypatch.setattr(Reader, "pose", forbidden)
+    monkeypatch.setattr(Reader, "labels", forbidden)
+    made = freeocc3d.reconstruct(
+        data_folder() / "7scenes-kitchen", tmp_path / "map", {"capture": {"stop": 40, "stride": 4}}
+    )
+    assert made.manifest["counts"]["frames_with_pose"] == 10
+    assert made.manifest["counts"]["voxels"]["occupied"] > 500
+
+
+class Stopper(Progress):
+    """Ctrl-C after some frames of a stage."""
+
+    def __init__(self, stage: str, after: int):
+        self.target, self.after, self.now = stage, after, ""
+
+    def stage(self, name, total=None) -> None:
+        self.now = name
+
+    def advance(self, done) -> None:
+        if self.now == self.target and done == self.after:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(("stage", "after"), [("tracking", 12), ("tracking", 3), ("language", 1)])
+def test_an_interrupted_run_leaves_no_map_and_resumes_to_the_same(tmp_path, room, monkeypatch, stage, after) -> None:
+    monkeypatch.setattr(pipeline, "_CHECKPOINT_FRAMES", 5)
+    output = tmp_path / "map"
+    with pytest.raises(Interrupted, match="--resume"):
+        freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper(stage, after))
+    assert not output.exists()
+    with pytest.raises(MapError, match="--resume"):
+        freeocc3d.reconstruct("builtin:room", output, ROOM)
+    resumed = freeocc3d.reconstruct("builtin:room", output, ROOM, resume=True)
+    assert not (tmp_path / "map.partial").exists()
+    np.testing.assert_allclose(resumed.trajectory.T_world_cam[:24], room.trajectory.T_world_cam[:24], atol=5e-3)
+    assert resumed.manifest["keyframes"] == room.manifest["keyframes"]
+
+
+def test_a_resumed_run_with_another_configuration_starts_over(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(pipeline, "_CHECKPOINT_FRAMES", 5)
+    with pytest.raises(Interrupted):
+        freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, progress=Stopper("tracking", 12))
+    other = {**ROOM, "tracking": {"backend": "known"}}
+    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", other, resume=True)
+    capture = open_capture("builtin:room", *_synthetic())
+    np.testing.assert_allclose(made.trajectory.T_world_cam[5], capture.pose(5), atol=1e-6)
+
+
+def test_an_existing_map_is_not_touched_without_overwrite(tmp_path, room) -> None:
+    output = shutil.copytree(room.path, tmp_path / "map")
+    before = listing(output)
+    with pytest.raises(MapError, match="--overwrite"):
+        freeocc3d.reconstruct("builtin:room", output, ROOM)
+    with pytest.raises(CaptureError):
+        freeocc3d.reconstruct(tmp_path / "nothing", output, overwrite=True)
+    assert listing(output) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+
+
+def test_a_folder_that_is_no_map_is_never_overwritten(tmp_path) -> None:
+    precious = tmp_path / "home"
+    precious.mkdir()
+    (precious / "thesis.txt").write_text("years of work")
+    with pytest.raises(MapError, match="not a map"):
+        freeocc3d.reconstruct("builtin:room", precious, ROOM, overwrite=True)
+    assert (precious / "thesis.txt").read_text() == "years of work"
+
+
+def test_overwrite_replaces_a_map(tmp_path, room) -> None:
+    output = shutil.copytree(room.path, tmp_path / "map")
+    short = {"capture": {**ROOM["capture"], "stop": 6}}
+    made = freeocc3d.reconstruct("builtin:room", output, short, overwrite=True)
+    assert made.manifest["counts"]["frames_with_pose"] == 6
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+
+
+def test_a_full_disk_is_told_and_what_was_done_is_kept(tmp_path, monkeypatch) -> None:
+    from freeocc3d.keyframes import Keyframes
+
+    written = []
+
+    def append(self, frame) -> None:
+        if len(written) == 1:
+            raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path / "x"))
+        written.append(frame.index)
+        original(self, frame)
+
+    original = Keyframes.append
+    monkeypatch.setattr(Keyframes, "append", append)
+    with pytest.raises(MapError, match=r"disk is full.*--resume"):
+        freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM)
+    assert not (tmp_path / "map").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"traking": {}}, "tracking"),
+        ({"tracking": {"rgbd": {"itertions": [1, 1, 1]}}}, "iterations"),
+        ({"occupancy": {"voxel_size": "big"}}, "must be float"),
+        ({"tracking": {"backend": "rgdb"}}, "rgbd"),
+        ({"language": {"encoder": "color"}}, "colour"),
+        ({"occupancy": {"voxel_size": -0.1}}, "voxel_size"),
+    ],
+)
+def test_a_wrong_configuration_is_named_before_any_work_and_leaves_nothing(tmp_path, settings, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_such_capture_leaves_nothing(tmp_path) -> None:
+    with pytest.raises(CaptureError, match="no folder"):
+        freeocc3d.reconstruct(tmp_path / "nothing", tmp_path / "map")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_that_cannot_be_read_are_skipped_and_counted(tmp_path) -> None:
+    scan = tmp_path / "scan"
+    scan.mkdir()
+    for i in range(20):
+        for kind in ("color.jpg", "depth.png"):
+            shutil.copy(data_folder() / "7scenes-kitchen" / f"frame-{i:06d}.{kind}", scan)
+    truncate(scan / "frame-000007.color.jpg")
+    truncate(scan / "frame-000011.depth.png")
+    made = freeocc3d.reconstruct(scan, tmp_path / "map")
+    assert made.report["frames"]["broken"] == 2
+    assert len(made.report["broken"]) == 2
+    assert "frame-000007.color.jpg" in made.report["broken"]["7"]
+    assert made.trajectory.status[7] == made.trajectory.status[11] == "broken"
+    for i in (3, 4, 5):
+        truncate(scan / f"frame-{i:06d}.color.jpg")
+    with pytest.raises(CaptureError, match=r"capture\.max_broken"):
+        freeocc3d.reconstruct(scan, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_scan_without_any_depth_says_so(tmp_path) -> None:
+    scan = write_scannet(tmp_path / "scan", 4)
+    for path in (scan / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+    with pytest.raises(TrackingError, match=r"capture\.depth_scale"):
+        freeocc3d.reconstruct(scan, tmp_path / "map")
+
+
+def test_depth_in_the_wrong_unit_is_warned_about(tmp_path) -> None:
+    scan = write_seven_scenes(tmp_path / "scan", 4)
+    told: list[str] = []
+
+    class Listener(Progress):
+        def warn(self, text: str) -> None:
+            told.append(text)
+
+    with pytest.raises(FreeOccError):
+        freeocc3d.reconstruct(scan, tmp_path / "map", {"capture": {"depth_scale": 1.0}}, progress=Listener())
+    assert any("capture.depth_scale" in text for text in told)
+
+
+def test_labels_of_the_capture_answer_by_class(tmp_path) -> None:
+    made = freeocc3d.reconstruct(
+        data_folder() / "house" / "bedroom",
+        tmp_path / "map",
+        {
+            "capture": {"stop": 60, "stride": 6},
+            "tracking": {"backend": "known"},
+            "language": {"encoder": "labels"},
+        },
+    )
+    found = made.query("bed")
+    assert found.matched
+    truth = np.load(data_folder() / "house" / "bedroom" / "ground_truth.npz")
+    centers = made.occupancy.centers(made.occupancy.occupied_voxels()[found.regions[0].rows])
+    voxel = np.floor((centers - truth["origin"]) / truth["voxel_size"]).astype(int)
+    labels = truth["labels"][tuple(voxel.T)]
+    bed = truth["classes"].tolist().index("bed")
+    assert (labels == bed).sum() > 0.7 * ((labels != 255) & (labels != 0)).sum()
+    assert not made.query("bathtub").matched
