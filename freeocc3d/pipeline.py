@@ -23,6 +23,7 @@ from .capture import base as capture_base
 from .config import Config
 from .errors import CaptureError, FrameError, Interrupted, MapError, TrackingError
 from .gaussians import anchors
+from .gaussians.upright import estimate_up
 from .keyframes import Keyframes
 from .language import lift
 from .language.codec import Codec
@@ -296,7 +297,7 @@ def _manifest(
         "poses": "camera to world",
         "voxel_size_m": occupancy.voxel_size,
         "origin": occupancy.origin.tolist(),
-        "up": estimate_up(trajectory).tolist(),
+        "up": estimate_up(trajectory.T_world_keyframe, gaussians.means).tolist(),
         "T_world_map": np.eye(4).tolist(),
         "encoder": {"name": encoder.name, "dimension": encoder.dimension, "state": encoder.text_state()},
         "codec": "scalar quantisation, 8 bits a dimension",
@@ -329,12 +330,6 @@ def _report(
             "confidence": np.round(trajectory.confidence.astype(np.float64), 3).tolist(),
         },
     }
-
-
-def estimate_up(trajectory: Trajectory) -> NDArray[np.float64]:
-    """(3,) unit vector: the keyframes' mean upward image axis, for people hold cameras level more or less."""
-    up = -trajectory.T_world_keyframe[:, :3, 1].sum(axis=0)
-    return np.asarray(up / max(float(np.linalg.norm(up)), 1e-9))
 
 
 def _load_backend(settings: Config, section: str, key: str, capture: Capture) -> Any:

@@ -1,0 +1,92 @@
+"""NumPy arrays: a dense grid of free, occupied and unknown, or lists of voxels.
+
+Keys of the dense form (`form=dense`), over the box of all known voxels:
+    occupancy (X, Y, Z) uint8: 0 free, 1 occupied, 255 unknown
+    probability (X, Y, Z) float16: alpha of the voxel's centre
+    labels (X, Y, Z) uint8: 0 free, k = classes[k - 1], len(classes) + 1 = occupied by nothing known, 255 unknown
+    classes (C,) names
+    origin (3,) lower corner of voxel (0, 0, 0), metres; voxel_size metres; T_world_map (4, 4)
+Of the sparse form: voxels (V, 3) int32 indices, state (V,) uint8 as above, probability (V,), labels (V,), classes,
+origin, voxel_size, T_world_map; voxel (i, j, k) covers origin + [i, i + 1) * voxel_size in both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError, ExportError
+from ..store import Map
+from ..types import FREE, OCCUPIED, UNKNOWN, Occupancy
+
+REQUIRES: tuple[str, ...] = ()
+
+_LARGEST_DENSE = 2 << 30
+
+
+@dataclass(frozen=True)
+class Options:
+    """Shape of the arrays."""
+
+    form: str = "dense"
+    """"dense" for a grid over the map's box, "sparse" for lists of its known voxels."""
+
+    def __post_init__(self) -> None:
+        if self.form not in ("dense", "sparse"):
+            raise ConfigError(f"'form' must be dense or sparse, got '{self.form}'.")
+
+
+def write(scan_map: Map, path: Path, options: Options) -> None:
+    """Write the arrays. Raises ExportError if the dense grid would not fit into memory."""
+    arrays = (dense if options.form == "dense" else sparse)(scan_map.occupancy, scan_map.labels())
+    arrays |= {
+        "voxel_size": np.float64(scan_map.occupancy.voxel_size),
+        "T_world_map": np.array(scan_map.manifest["T_world_map"], np.float64),
+        "classes": np.array(scan_map.vocabulary),
+    }
+    with path.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+def sparse(occupancy: Occupancy, labels: NDArray[np.uint8]) -> dict[str, Any]:
+    """Known voxels, row by row; ``labels`` (V,) of the occupied ones, 0 = nothing known."""
+    block, local = np.nonzero(occupancy.state != UNKNOWN)
+    state = occupancy.state[block, local]
+    offsets = np.stack((local // 64, local // 8 % 8, local % 8), axis=1)
+    label = np.zeros(len(state), np.uint8)
+    unlabelled = np.uint8(min(int(labels.max(initial=0)) + 1, 254))
+    label[state == OCCUPIED] = np.where(labels > 0, labels, unlabelled)
+    return {
+        "voxels": (occupancy.keys[block] * 8 + offsets).astype(np.int32),
+        "state": state,
+        "probability": occupancy.probability[block, local].astype(np.float16),
+        "labels": label,
+        "origin": occupancy.origin,
+    }
+
+
+def dense(occupancy: Occupancy, labels: NDArray[np.uint8]) -> dict[str, Any]:
+    """The grid over the box of all known voxels; an empty map gives arrays of shape (0, 0, 0)."""
+    known = sparse(occupancy, labels)
+    voxels = known["voxels"]
+    low = voxels.min(axis=0) if len(voxels) else np.zeros(3, np.int32)
+    shape = tuple(int(n) for n in (voxels.max(axis=0) + 1 - low if len(voxels) else np.zeros(3, int)))
+    size = 4 * int(np.prod([float(n) for n in shape]))
+    if size > _LARGEST_DENSE:
+        raise ExportError(
+            f"A dense grid of {' x '.join(map(str, shape))} voxels takes {size / 2**30:.1f} GiB: use --set form=sparse."
+        )
+    at = tuple((voxels - low).T)
+    grid: dict[str, NDArray[Any]] = {
+        "occupancy": np.full(shape, UNKNOWN, np.uint8),
+        "probability": np.zeros(shape, np.float16),
+        "labels": np.full(shape, UNKNOWN, np.uint8),
+    }
+    grid["occupancy"][at] = np.where(known["state"] == FREE, FREE, OCCUPIED)
+    grid["probability"][at] = known["probability"]
+    grid["labels"][at] = known["labels"]
+    return {**grid, "origin": occupancy.origin + low * occupancy.voxel_size}

@@ -1,0 +1,112 @@
+"""Polygon file: the occupied voxels as a mesh of cubes or as points, coloured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError, ExportError
+from ..palette import class_colors, highlighted
+from ..query import QueryResult
+from ..store import Map
+from ..types import Occupancy
+from .base import write_whole
+
+REQUIRES: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Options:
+    """Shape and colour."""
+
+    form: str = "cubes"
+    """"cubes" for a mesh of the faces between occupied and other voxels, "points" for voxel centres."""
+    color: str = "rgb"
+    """"rgb" for the surface's own colour, "class" for the class that fits best."""
+
+    def __post_init__(self) -> None:
+        if self.form not in ("cubes", "points"):
+            raise ConfigError(f"'form' must be cubes or points, got '{self.form}'.")
+        if self.color not in ("rgb", "class"):
+            raise ConfigError(f"'color' must be rgb or class, got '{self.color}'.")
+
+
+def write(scan_map: Map, path: Path, options: Options) -> None:
+    """Write the occupied voxels. Raises ExportError for a map without any."""
+    colors = scan_map.occupancy.colors
+    if options.color == "class":
+        colors = class_colors(scan_map.vocabulary)[scan_map.labels()]
+    _write(scan_map.occupancy, colors, path, options.form)
+
+
+def write_query_ply(occupancy: Occupancy, results: list[QueryResult], path: Path, overwrite: bool = True) -> None:
+    """Write all occupied voxels as cubes, those of the results' regions in one strong colour a word, the others pale.
+    Raises ExportError."""
+    colors = highlighted(occupancy.colors, [result.regions for result in results])
+    write_whole(path, lambda target: _write(occupancy, colors, target, "cubes"), overwrite)
+
+
+def _write(occupancy: Occupancy, colors: NDArray[np.uint8], path: Path, form: str) -> None:
+    if len(colors) == 0:
+        raise ExportError("The map has no occupied voxel to write.")
+    if form == "points":
+        points = occupancy.centers(occupancy.occupied_voxels()).astype(np.float32)
+        _write_ply(path, points, colors, None)
+    else:
+        vertices, quads, rows = exposed_faces(occupancy)
+        _write_ply(path, vertices, np.repeat(colors[rows], 4, axis=0), quads)
+
+
+def exposed_faces(
+    occupancy: Occupancy, chosen: NDArray[np.bool_] | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64]]:
+    """The faces between occupied voxels and all others: (4 F, 3) vertices in metres, (F, 4) quads that index them,
+    counter-clockwise seen from outside, and (F,) the occupied voxel's row that each face belongs to.
+
+    chosen: (V,) the occupied voxels to draw, as if there were no others; all by default.
+    """
+    voxels = occupancy.occupied_voxels()
+    row = np.arange(len(voxels)) if chosen is None else np.flatnonzero(chosen)
+    voxels = voxels[row]
+    index = voxels.astype(np.int64) + (1 << 20)
+    keys = (index[:, 0] << 42) + (index[:, 1] << 21) + index[:, 2]
+    ascending = np.sort(keys)
+    corners, rows = [], []
+    for axis in range(3):
+        for side in (0, 1):
+            neighbour = keys + ((2 * side - 1) << 21 * (2 - axis))
+            at = np.minimum(np.searchsorted(ascending, neighbour), len(ascending) - 1)
+            exposed = np.flatnonzero(ascending[at] != neighbour)
+            b, c = (axis + 1) % 3, (axis + 2) % 3
+            turn = [(0, 0), (1, 0), (1, 1), (0, 1)] if side else [(0, 0), (0, 1), (1, 1), (1, 0)]
+            offset = np.zeros((4, 3), np.int32)
+            offset[:, axis], offset[:, [b, c]] = side, turn
+            corners.append(voxels[exposed][:, None] + offset)
+            rows.append(exposed)
+    lattice = np.concatenate(corners).reshape(-1, 3)
+    vertices = (occupancy.origin + lattice * occupancy.voxel_size).astype(np.float32)
+    return vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 4), row[np.concatenate(rows)]
+
+
+def _write_ply(
+    path: Path, points: NDArray[np.float32], colors: NDArray[np.uint8], quads: NDArray[np.int32] | None
+) -> None:
+    """Binary little-endian PLY with coloured vertices and, if given, quads."""
+    vertex = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    vertex["xyz"], vertex["rgb"] = points, colors
+    header = [
+        "ply", "format binary_little_endian 1.0", "comment freeocc3d, metres", f"element vertex {len(points)}",
+        *(f"property float {name}" for name in "xyz"), *(f"property uchar {name}" for name in ("red", "green", "blue")),
+    ]  # fmt: skip
+    if quads is not None:
+        header += [f"element face {len(quads)}", "property list uchar int vertex_indices"]
+    with path.open("wb") as stream:
+        stream.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        stream.write(vertex.tobytes())
+        if quads is not None:
+            face = np.empty(len(quads), [("count", "u1"), ("corners", "<i4", 4)])
+            face["count"], face["corners"] = 4, quads
+            stream.write(face.tobytes())
