@@ -57,3 +57,27 @@ def dense(occupancy: Occupancy, values: np.ndarray, lo: object, hi: object, fill
     inside = ((index >= 0) & (index < hi - lo)).all(axis=1)
     out[tuple(index[inside].T)] = values.reshape(-1)[inside]
     return out
+
+
+def occupancy_of(
+    voxels: object, features: object = None, colors: object = None, free: object = (), origin: object = (0, 0, 0)
+) -> Occupancy:
+    """An occupancy map with given occupied and free voxels (V, 3) of 0.1 m; features and colours are given in the
+    voxels' order and stored in the map's."""
+    voxels = np.asarray(voxels, np.int32).reshape(-1, 3)
+    free = np.asarray(free, np.int32).reshape(-1, 3)
+    every = np.concatenate((voxels, free))
+    keys = np.unique(every >> 3, axis=0).astype(np.int32)
+    state = np.full((len(keys), 512), 255, np.uint8)
+    row_of = {tuple(key): row for row, key in enumerate(keys.tolist())}
+    for group, value in ((voxels, 1), (free, 0)):
+        for ijk in group:
+            i, j, k = ijk & 7
+            state[row_of[tuple((ijk >> 3).tolist())], (i * 8 + j) * 8 + k] = value
+    probability = np.where(state == 1, 0.9, 0.1).astype(np.float32)
+    free_count, hits = (state == 0).astype(np.uint16), (state == 1).astype(np.uint16)
+    empty = Occupancy(0.1, np.asarray(origin, float), keys, probability, free_count, hits, state)
+    order = [np.flatnonzero((voxels == v).all(axis=1))[0] for v in empty.occupied_voxels()]
+    features = np.zeros((len(voxels), 2)) if features is None else np.asarray(features, float)
+    colors = np.full((len(voxels), 3), 100) if colors is None else np.asarray(colors)
+    return empty.replace(features=features[order].astype(np.float16), colors=colors[order].astype(np.uint8))

@@ -52,7 +52,7 @@ INCLUDES: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """A wider word and the narrower ones that it includes."""
 
-_IRREGULAR = {"shelves": "shelf", "knives": "knife", "people": "person", "men": "man", "women": "woman"}
+_IRREGULAR = {"tvs": "tv", "shelves": "shelf", "knives": "knife", "people": "person", "men": "man", "women": "woman"}
 _UNCHANGED = {"glasses", "glass", "dress", "mattress", "tableware", "utensils", "stairs", "bus", "canvas"}
 _ARTICLES = {"a", "an", "the", "my", "your", "this", "that", "some", "any", "all", "of", "every"}
 

@@ -1,0 +1,160 @@
+"""The command line: exit codes, one sentence for each mistake, JSON and nothing else on stdout."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers import data_folder, write_scannet, write_seven_scenes
+
+ROOT = Path(__file__).parents[1]
+SMALL = ["--set", "capture.stop=8", "--set", "capture.synthetic.width=160", "--set", "capture.synthetic.height=120"]
+
+
+def run(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "freeocc3d.cli", *map(str, arguments)], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def refused(*arguments: object) -> str:
+    """The one line on stderr with which a command is refused."""
+    done = run(*arguments, code=1)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("freeocc3d: ")]
+    assert len(lines) == 1, done.stderr
+    assert done.stdout == ""
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("cli") / "room"
+    done = run("reconstruct", "builtin:room", "-o", path, *SMALL)
+    assert "8 with a pose" in done.stdout
+    return path
+
+
+def test_query_json(room) -> None:
+    document = json.loads(run("query", room, "red cup", "unicorn", "--json").stdout)
+    assert document["results"][0]["matched"]
+    assert document["results"][0]["understood"] == "red"
+    assert document["results"][1] == {
+        "word": "unicorn", "matched": False, "understood": "", "regions": [],
+        "note": document["results"][1]["note"],
+    }  # fmt: skip
+
+
+def test_query_text_ply_and_picture(room, tmp_path) -> None:
+    done = run("query", room, "yellow", "--top", 1, "--ply", tmp_path / "q.ply", "--picture", tmp_path / "q.png")
+    assert "yellow: 1 region" in done.stdout
+    assert (tmp_path / "q.ply").read_bytes().startswith(b"ply\n")
+    assert (tmp_path / "q.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_info_json_has_the_documented_keys(room) -> None:
+    facts = json.loads(run("info", room, "--json").stdout)
+    assert set(facts) >= {
+        "version", "frames", "frames_with_pose", "submaps", "gaussians", "voxels", "voxel_size_m", "encoder", "bytes",
+        "seconds", "peak_memory_bytes",
+    }  # fmt: skip
+    assert set(facts["voxels"]) >= {"occupied", "free"}
+    assert facts["frames_with_pose"] == 8
+
+
+def test_export_and_view(room, tmp_path) -> None:
+    run("export", room, "--format", "npz", "-o", tmp_path / "m.npz")
+    run("export", room, "--format", "ply", "-o", tmp_path / "m.ply", "--set", "form=points")
+    run("view", room, "--picture", tmp_path / "m.png", "--by", "class")
+    assert {p.name for p in tmp_path.iterdir()} == {"m.npz", "m.ply", "m.png"}
+    assert "--overwrite" in refused("export", room, "--format", "npz", "-o", tmp_path / "m.npz")
+    assert "did you mean 'npz'" in refused("export", room, "--format", "npzz", "-o", tmp_path / "x")
+
+
+def test_list_names_every_backend_without_importing_them() -> None:
+    text = run("list").stdout
+    for name in ("seven_scenes", "replica", "scannet", "synthetic", "rgbd", "known", "colour", "labels", "npz", "ply"):
+        assert f"  {name} " in text
+    assert "encoder" in json.loads(run("list", "--json").stdout)
+
+
+def test_the_tools_are_the_same_commands(room) -> None:
+    for tool, arguments in (("query", [room, "red", "--json"]), ("reconstruct", ["--help"]), ("export", ["--help"])):
+        done = subprocess.run(
+            [sys.executable, ROOT / "tools" / f"{tool}.py", *map(str, arguments)], capture_output=True, timeout=120
+        )
+        assert done.returncode == 0
+
+
+def test_mistakes_with_captures(tmp_path) -> None:
+    out = tmp_path / "map"
+    assert "There is no folder" in refused("reconstruct", tmp_path / "nothing", "-o", out)
+    (tmp_path / "empty").mkdir()
+    message = refused("reconstruct", tmp_path / "empty", "-o", out)
+    assert "frame-" in message
+    assert "traj.txt" in message or "results/" in message
+    scan = write_scannet(tmp_path / "scan", 4)
+    (scan / "intrinsic" / "intrinsic_depth.txt").write_text("nan 0 16 0\n0 500 12 0\n0 0 1 0\n0 0 0 1\n")
+    assert "intrinsic_depth.txt" in refused("reconstruct", scan, "-o", out)
+    nodepth = write_seven_scenes(tmp_path / "nodepth", 3)
+    for path in nodepth.glob("*.depth.png"):
+        path.unlink()
+    assert "depth" in refused("reconstruct", nodepth, "-o", out)
+    assert not out.exists()
+    assert not Path(f"{out}.partial").exists()
+
+
+def test_mistakes_with_configurations_and_outputs(tmp_path, room) -> None:
+    out = tmp_path / "map"
+    assert "did you mean 'voxel_size'" in refused(
+        "reconstruct", "builtin:room", "-o", out, "--set", "occupancy.voxelsize=0.1"
+    )
+    assert "must be float" in refused("reconstruct", "builtin:room", "-o", out, "--set", "occupancy.voxel_size=big")
+    (tmp_path / "c.yaml").write_text("tracking: {backend: rgbd\n")
+    assert "not valid YAML" in refused("reconstruct", "builtin:room", "-o", out, "--config", tmp_path / "c.yaml")
+    assert "--overwrite" in refused("reconstruct", "builtin:room", "-o", room)
+    assert "cuda" in refused("reconstruct", "builtin:room", "-o", out, *SMALL, "--device", "cuda:7").lower()
+    assert list(tmp_path.iterdir()) == [tmp_path / "c.yaml"]
+
+
+def test_mistakes_with_maps(tmp_path) -> None:
+    assert "There is no map folder" in refused("query", tmp_path / "nothing", "red")
+    assert "not a map" in refused("info", tmp_path)
+    assert run("query", code=2).stdout == ""
+
+
+def test_debug_shows_the_traceback(tmp_path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "freeocc3d.cli", "--debug", "info", tmp_path], capture_output=True, text=True, timeout=60
+    )
+    assert "Traceback" in done.stderr
+
+
+def test_ctrl_c_ends_cleanly_and_resumes(tmp_path) -> None:
+    out = tmp_path / "map"
+    command = [
+        sys.executable,
+        "-m",
+        "freeocc3d.cli",
+        "reconstruct",
+        str(data_folder() / "7scenes-kitchen"),
+        "-o",
+        str(out),
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    keyframes = Path(f"{out}.partial") / "keyframes"
+    while not (keyframes / "keyframes.json").exists():  # the first checkpoint
+        assert process.poll() is None
+        os.sched_yield()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "--resume" in errors
+    assert "Traceback" not in errors
+    assert not out.exists()
+    assert "--resume" in refused("reconstruct", data_folder() / "7scenes-kitchen", "-o", out)

@@ -1,0 +1,90 @@
+"""Pictures: written, of the promised size, showing what they should."""
+
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scenes import occupancy_of
+
+from freeocc3d.errors import ExportError
+from freeocc3d.palette import HIGHLIGHTS, class_colors
+from freeocc3d.query import Region
+from freeocc3d.types import Trajectory
+from freeocc3d.viewer import pictures
+
+
+def room_map(tmp_path):
+    """A floor, two walls, a ceiling and a red block; up is -y."""
+    floor = [(x, 20, z) for x in range(24) for z in range(16)]
+    ceiling = [(x, 0, z) for x in range(24) for z in range(16)]
+    walls = [(0, y, z) for y in range(1, 20) for z in range(16)] + [
+        (x, y, 15) for x in range(1, 24) for y in range(1, 20)
+    ]
+    red = [(x, y, z) for x in (10, 11, 12) for y in (17, 18, 19) for z in (6, 7, 8)]
+    voxels = [*floor, *ceiling, *walls, *red]
+    colors = [(150, 120, 90)] * len(floor) + [(20, 220, 220)] * len(ceiling) + [(200, 200, 205)] * len(walls)
+    occupancy = occupancy_of(voxels, colors=[*colors, *[(215, 20, 20)] * len(red)])
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[:, :3, 3] = [(1.0, 1.0, 0.5), (1.5, 1.0, 0.5)]
+    labels = np.where((occupancy.colors == (215, 20, 20)).all(axis=1), 2, 1).astype(np.uint8)
+    return SimpleNamespace(
+        path=tmp_path, occupancy=occupancy, up=np.array((0.0, -1.0, 0.0)), vocabulary=["wall", "red"],
+        labels=lambda: labels,
+        trajectory=Trajectory(np.arange(2.0), T, np.array([0, 1], np.int32), np.array(["keyframe"] * 2), np.ones(2)),
+        manifest={
+            "capture": {"path": "room"},
+            "counts": {"voxels": {"occupied": len(voxels)}, "frames_with_pose": 2, "frames": 2},
+        },
+    )  # fmt: skip
+
+
+def shown(path, color, tolerance=30) -> int:
+    image = cv2.imread(str(path))[..., ::-1].astype(int)
+    assert image.shape == (900, 1600, 3)
+    return int((np.abs(image - color).max(axis=-1) < tolerance).sum())
+
+
+def test_a_map_picture_looks_into_the_room_from_both_sides(tmp_path) -> None:
+    room = room_map(tmp_path)
+    pictures.map_picture(room, tmp_path / "map.png")
+    assert shown(tmp_path / "map.png", (215, 20, 20), 60) > 500  # the block on the floor
+    assert shown(tmp_path / "map.png", (150, 120, 90)) > 20_000  # the floor
+    assert shown(tmp_path / "map.png", (20, 220, 220)) == 0  # the ceiling is cut away
+    first = (tmp_path / "map.png").read_bytes()
+    pictures.map_picture(room, tmp_path / "again.png")
+    assert (tmp_path / "again.png").read_bytes() == first
+
+
+def test_by_class_and_height(tmp_path) -> None:
+    room = room_map(tmp_path)
+    pictures.map_picture(room, tmp_path / "class.png", by="class")
+    assert shown(tmp_path / "class.png", class_colors(["red"])[1], 45) > 500
+    pictures.map_picture(room, tmp_path / "height.png", by="height")
+    assert shown(tmp_path / "height.png", (68, 1, 84), 40) > 10_000  # the floor has viridis' darkest colour
+    with pytest.raises(ExportError, match="rgb, class or height"):
+        pictures.map_picture(room, tmp_path / "x.png", by="colour")
+
+
+def test_a_query_picture_shows_matches_strongly_and_nothing_else(tmp_path) -> None:
+    room = room_map(tmp_path)
+    rows = np.flatnonzero(room.labels() == 2)
+    box = np.array((1.0, 1.7, 0.6))
+    region = Region(0.9, 0.9, box + 0.15, box, box + 0.3, 0.027, rows)
+    found = SimpleNamespace(word="red", regions=[region])
+    nothing = SimpleNamespace(word="unicorn", regions=[])
+    pictures.query_picture(room, [found], tmp_path / "found.png")
+    pictures.query_picture(room, [nothing], tmp_path / "nothing.png")
+    legend = 16 * 17
+    assert shown(tmp_path / "found.png", HIGHLIGHTS[0], 40) > legend + 500
+    assert shown(tmp_path / "nothing.png", HIGHLIGHTS[0], 40) <= 1.2 * legend
+
+
+def test_an_empty_map_and_an_unwritable_place_are_told(tmp_path) -> None:
+    room = room_map(tmp_path)
+    with pytest.raises(ExportError, match="Cannot write"):
+        pictures.map_picture(room, tmp_path / "missing" / "map.png")
+    room.occupancy = occupancy_of([])
+    with pytest.raises(ExportError, match="no occupied voxel"):
+        pictures.map_picture(room, tmp_path / "map.png")
+    assert list(tmp_path.iterdir()) == []
