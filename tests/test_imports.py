@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1] / "freeocc3d"
 
 FLOORS = (
     ("errors", "types"),
-    ("geometry", "registry", "progress"),
+    ("geometry", "registry", "progress", "files"),
     ("config", "keyframes"),
     ("capture",),
     ("tracking",),
@@ -19,7 +19,7 @@ FLOORS = (
     ("language",),
     ("occupancy",),
     ("query",),
-    ("store",),
+    ("store", "palette"),
     ("export", "evaluation", "viewer", "work"),
     ("pipeline",),
     ("cli", "__init__"),

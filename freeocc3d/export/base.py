@@ -6,14 +6,12 @@ and may raise OSError or ExportError.
 
 from __future__ import annotations
 
-import errno
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from .. import registry
-from ..errors import ExportError
+from ..files import write_whole
 from ..store import Map
 
 
@@ -28,18 +26,3 @@ def export_map(
     exporter = registry.load("export", format_name)
     checked = registry.build_options(exporter, options or {})
     write_whole(Path(path), lambda target: exporter.write(scan_map, target, checked), overwrite)
-
-
-def write_whole(path: Path, write: Callable[[Path], None], overwrite: bool = False) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then give it the name. Raises ExportError."""
-    if path.exists() and not overwrite:
-        raise ExportError(f"{path} exists: choose another name, or replace it with --overwrite.")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        write(temporary)
-        temporary.replace(path)
-    except OSError as error:
-        reason = "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error)).lower()
-        raise ExportError(f"Cannot write {path}: {reason}.") from error
-    finally:
-        temporary.unlink(missing_ok=True)

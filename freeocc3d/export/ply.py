@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigError, ExportError
+from ..files import write_whole
+from ..occupancy.faces import exposed_faces
 from ..palette import class_colors, highlighted
 from ..query import QueryResult
 from ..store import Map
 from ..types import Occupancy
-from .base import write_whole
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -58,37 +59,6 @@ def _write(occupancy: Occupancy, colors: NDArray[np.uint8], path: Path, form: st
     else:
         vertices, quads, rows = exposed_faces(occupancy)
         _write_ply(path, vertices, np.repeat(colors[rows], 4, axis=0), quads)
-
-
-def exposed_faces(
-    occupancy: Occupancy, chosen: NDArray[np.bool_] | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64]]:
-    """The faces between occupied voxels and all others: (4 F, 3) vertices in metres, (F, 4) quads that index them,
-    counter-clockwise seen from outside, and (F,) the occupied voxel's row that each face belongs to.
-
-    chosen: (V,) the occupied voxels to draw, as if there were no others; all by default.
-    """
-    voxels = occupancy.occupied_voxels()
-    row = np.arange(len(voxels)) if chosen is None else np.flatnonzero(chosen)
-    voxels = voxels[row]
-    index = voxels.astype(np.int64) + (1 << 20)
-    keys = (index[:, 0] << 42) + (index[:, 1] << 21) + index[:, 2]
-    ascending = np.sort(keys)
-    corners, rows = [], []
-    for axis in range(3):
-        for side in (0, 1):
-            neighbour = keys + ((2 * side - 1) << 21 * (2 - axis))
-            at = np.minimum(np.searchsorted(ascending, neighbour), len(ascending) - 1)
-            exposed = np.flatnonzero(ascending[at] != neighbour)
-            b, c = (axis + 1) % 3, (axis + 2) % 3
-            turn = [(0, 0), (1, 0), (1, 1), (0, 1)] if side else [(0, 0), (0, 1), (1, 1), (1, 0)]
-            offset = np.zeros((4, 3), np.int32)
-            offset[:, axis], offset[:, [b, c]] = side, turn
-            corners.append(voxels[exposed][:, None] + offset)
-            rows.append(exposed)
-    lattice = np.concatenate(corners).reshape(-1, 3)
-    vertices = (occupancy.origin + lattice * occupancy.voxel_size).astype(np.float32)
-    return vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 4), row[np.concatenate(rows)]
 
 
 def _write_ply(

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DependencyError, ExportError, FreeOccError
-from ..export.base import write_whole
-from ..export.ply import exposed_faces
+from ..files import write_whole
+from ..occupancy.faces import exposed_faces
 from ..palette import HIGHLIGHTS, class_colors, highlighted
 from ..query import QueryResult, Region
 from ..store import Map

@@ -1,0 +1,25 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from .errors import ExportError
+
+
+def write_whole(path: Path, write: Callable[[Path], None], overwrite: bool = False) -> None:
+    """Let ``write`` fill a temporary file beside ``path``, then give it the name. Raises ExportError."""
+    if path.exists() and not overwrite:
+        raise ExportError(f"{path} exists: choose another name, or replace it with --overwrite.")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        write(temporary)
+        temporary.replace(path)
+    except OSError as error:
+        reason = "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error)).lower()
+        raise ExportError(f"Cannot write {path}: {reason}.") from error
+    finally:
+        temporary.unlink(missing_ok=True)
