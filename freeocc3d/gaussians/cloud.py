@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,8 @@ _ATTRIBUTES = {
     "anchor": ("anchor_cam", 3, np.float32),
 }
 """Point attribute -> (field, columns, type); besides ``positions`` and ``colors``."""
+
+_BYTES = 67  # of one Gaussian: 14 float32, 2 int32, 3 uint8
 
 
 def to_point_cloud(gaussians: Gaussians) -> o3d.t.geometry.PointCloud:
@@ -47,13 +50,16 @@ def from_point_cloud(cloud: o3d.t.geometry.PointCloud) -> Gaussians:
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
-    """Write the point cloud as binary PLY. Raises MapError if it could not be written whole."""
+    """Write the point cloud as binary PLY. Raises OSError, or MapError if it could not be written whole."""
     import open3d as o3d
 
-    written = o3d.t.io.write_point_cloud(str(path), to_point_cloud(gaussians)) if len(gaussians) else False
-    smallest = 67 * len(gaussians)  # bytes of one vertex: 15 float32, 2 int32, 3 uint8
-    if not written or path.stat().st_size < smallest:
-        raise MapError(f"Cannot write {path}: is the disk full?")
+    size = _BYTES * len(gaussians)
+    with path.open("wb") as stream:
+        # Open3D reports a full disk as a line per property that it could not write: find out first.
+        os.posix_fallocate(stream.fileno(), 0, size + 4096)
+    written = len(gaussians) > 0 and o3d.t.io.write_point_cloud(str(path), to_point_cloud(gaussians))
+    if not written or path.stat().st_size < size:
+        raise MapError(f"Cannot write {path}: there are no Gaussians, or the disk is full.")
 
 
 def read_ply(path: Path) -> Gaussians:
