@@ -1,12 +1,14 @@
 """Words to voxels to regions: what ``freeocc3d query`` and ``Map.query`` do. Imports little, to start fast.
 
-A voxel's score for a word is the paper's s(x, c) = f(x)^T t_c, the cosine of its feature and the word's. It matches
-when the score reaches the encoder's threshold and no contrast word (what the voxel could be instead) scores higher
-there: similarities alone do not tell "is" from "is a little like". Matching voxels that touch form a region.
+A voxel's score for a word is the paper's s(x, c) = f(x)^T t_c, the cosine of its feature and the word's, over the
+cosine that the word allows (see ``TextFeatures.attainable``). It matches when the score reaches the encoder's threshold
+and no contrast word (what the voxel could be instead) scores higher there: similarities alone do not tell "is" from
+"is a little like". Matching voxels that touch form a region.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,16 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import __version__
-from .errors import FreeOccError
+from .errors import ConfigError, FreeOccError, MapError
 from .registry import require_positive
 from .types import Occupancy
 
 if TYPE_CHECKING:
-    from .language.encoders.base import TextEncoder
+    from .language.encoders.base import TextEncoder, TextFeatures
 
-_SAME_WORD = 0.8
 _LONGEST_WORD = 200
 _AXIS_BITS = 21
+_ROWS = 16384  # voxels worked on at once, so that float32 copies of all features never exist
+_DOUBT_M3 = 0.001
+"""Volume of non-matching matter that is added to each region when it is scored: a speck of a voxel or two does not
+outrank a large object, and the size of the voxels has no part in it."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,7 @@ class Options:
     """What counts as a match, and which regions are reported."""
 
     threshold: float | None = None
-    """Least cosine similarity, 0…1; null = the encoder's own."""
+    """Least score of a matching voxel, 0…1; null = the encoder's own."""
     top_k: int = 20
     """At most so many regions a word."""
     min_voxels: int = 2
@@ -40,16 +45,19 @@ class Options:
 
     def __post_init__(self) -> None:
         require_positive(self, "top_k", "min_voxels")
+        if self.threshold is not None and not -1 <= self.threshold <= 1:
+            raise ConfigError(f"'threshold' must lie between 0 and 1, got {self.threshold:g}.")
 
 
 @dataclass(frozen=True)
 class Region:
     """A connected set of matching voxels.
 
-    score: mean cosine similarity of its voxels with the word.  confidence: 0…1, mean softmax probability of the word
-    against the contrast words, at the encoder's temperature.  centroid: (3,) mean of the voxels' centres, map frame,
-    metres.  box_min, box_max: (3,) corners of the axis-aligned box around the voxels, faces included, metres.
-    rows: (n,) rows of ``Occupancy.occupied_voxels()``.
+    score: 0…1, by which regions are ranked: the mean score of its voxels times V / (V + 1 litre), V being its volume,
+    as if a litre that does not match belonged to it.  confidence: 0…1, mean softmax probability of the word against
+    the contrast words, at the encoder's temperature.  centroid: (3,) mean of the voxels' centres, map frame, metres.
+    box_min, box_max: (3,) corners of the axis-aligned box around the voxels, faces included, metres.  rows: (n,) rows
+    of ``Occupancy.occupied_voxels()``.
     """
 
     score: float
@@ -71,8 +79,8 @@ class QueryResult:
     """The answer to one word.
 
     understood: the part of the word that was used.  note: one sentence if nothing matched, or only a part of the word
-    was understood; else empty.  regions: largest evidence (confidence times volume) first.  scores: (V,) cosine
-    similarity of every occupied voxel.
+    was understood; else empty.  regions: best score first.  scores: (V,) score of every occupied voxel, 0 where nothing
+    is known of it.
     """
 
     word: str
@@ -90,7 +98,8 @@ class QueryResult:
 def query(
     occupancy: Occupancy, text_encoder: TextEncoder, words: list[str], options: Options | None = None
 ) -> list[QueryResult]:
-    """Ask for several words; one that nothing matches gives no regions. FreeOccError for an empty or endless word."""
+    """Ask for several words; one that nothing matches gives no regions. Raises FreeOccError for an empty or endless
+    word, MapError if the map's features are not the encoder's."""
     options = options or Options()
     for word in words:
         if not word.strip():
@@ -98,61 +107,109 @@ def query(
         if len(word) > _LONGEST_WORD:
             raise FreeOccError(f"'{word[:30]}…' has {len(word)} characters; a query may have up to {_LONGEST_WORD}.")
     text = text_encoder.encode_words(words)
-    contrasts = text_encoder.encode_words(text_encoder.contrast_words()).features
-    features = occupancy.features.astype(np.float32)
-    contrast_scores = features @ contrasts.T
-    voxels = occupancy.occupied_voxels()
-    return [
-        _answer(
-            occupancy, voxels, features, contrast_scores, contrasts, text_encoder, word, feature, understood, options
+    contrast = text_encoder.encode_words(text_encoder.contrast_words())
+    if len(occupancy.features) and occupancy.features.shape[1] != text.features.shape[1]:
+        raise MapError(
+            f"The map's features have {occupancy.features.shape[1]} dimensions, its encoder's words "
+            f"{text.features.shape[1]}: make the map again with this version."
         )
-        for word, feature, understood in zip(words, text.features, text.understood, strict=True)
-    ]
+    competes = text.features @ contrast.features.T < text_encoder.same_word
+    competes &= contrast.features.any(axis=1)
+    scores = _in_chunks(occupancy.features, text)
+    voxels = occupancy.occupied_voxels()
+    threshold = text_encoder.threshold if options.threshold is None else options.threshold
+    results = []
+    for w, (word, understood) in enumerate(zip(words, text.understood, strict=True)):
+        rows = np.flatnonzero(scores[:, w] >= threshold) if understood else np.zeros(0, np.int64)
+        rows, confidence = _against_contrasts(
+            occupancy.features, rows, scores[rows, w], _some(contrast, competes[w]), text_encoder.temperature
+        )
+        regions = _regions(occupancy, voxels, rows, scores[rows, w], confidence, options)
+        note = _note(word, understood, text_encoder, scores[:, w], threshold, bool(regions))
+        results.append(QueryResult(word, understood, note, regions, np.ascontiguousarray(scores[:, w])))
+    return results
 
 
-def _answer(
+def similarity(features: NDArray[np.floating], text: TextFeatures) -> NDArray[np.float32]:
+    """(V, W) scores of (V, D) unit features for W words: cosine over attainable cosine, at most 1."""
+    cosine = features.astype(np.float32, copy=False) @ text.features.T
+    return np.minimum(cosine if text.attainable is None else cosine / text.attainable, np.float32(1))
+
+
+def _in_chunks(features: NDArray[np.float16], text: TextFeatures) -> NDArray[np.float32]:
+    """``similarity``, some rows at a time."""
+    scores = np.zeros((len(features), len(text.understood)), np.float32)
+    for start in range(0, len(features), _ROWS):
+        scores[start : start + _ROWS] = similarity(features[start : start + _ROWS], text)
+    return scores
+
+
+def _some(text: TextFeatures, words: NDArray[np.bool_]) -> TextFeatures:
+    """Those of the words that a mask (W,) names."""
+    understood = tuple(word for word, chosen in zip(text.understood, words, strict=True) if chosen)
+    attainable = None if text.attainable is None else text.attainable[words]
+    return type(text)(text.features[words], understood, attainable)
+
+
+def _against_contrasts(
+    features: NDArray[np.float16],
+    rows: NDArray[np.int64],
+    scores: NDArray[np.float32],
+    contrast: TextFeatures,
+    temperature: float,
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Of the voxels in ``rows``, whose scores for a word are given, those where no contrast word scores higher and
+    something is known; and their confidences."""
+    kept, confidences = [rows[:0]], [scores[:0]]
+    for start in range(0, len(rows), _ROWS):
+        chunk = rows[start : start + _ROWS]
+        feature = features[chunk]
+        margin = similarity(feature, contrast) - scores[start : start + _ROWS, None]
+        best = feature.any(axis=1) & (margin.max(axis=1, initial=-1.0) <= 0)
+        odds = np.exp(margin[best] / np.float32(temperature)).sum(axis=1)
+        kept.append(chunk[best])
+        confidences.append(1.0 / (1.0 + odds))
+    return np.concatenate(kept), np.concatenate(confidences)
+
+
+def _regions(
     occupancy: Occupancy,
     voxels: NDArray[np.int32],
-    features: NDArray[np.float32],
-    contrast_scores: NDArray[np.float32],
-    contrasts: NDArray[np.float32],
-    text_encoder: TextEncoder,
-    word: str,
-    feature: NDArray[np.float32],
-    understood: str,
+    rows: NDArray[np.int64],
+    scores: NDArray[np.float32],
+    confidence: NDArray[np.float32],
     options: Options,
-) -> QueryResult:
-    scores = features @ feature if len(features) else np.zeros(0, np.float32)
-    if not understood:
-        return QueryResult(word, "", _note(word, "", text_encoder, matched=False), [], scores)
-    others = contrast_scores[:, contrasts @ feature < _SAME_WORD]
-    best_other = others.max(axis=1, initial=-1.0)
-    threshold = text_encoder.threshold if options.threshold is None else options.threshold
-    rows = np.flatnonzero((scores >= threshold) & (scores >= best_other))
-    logits = (others[rows] - scores[rows, None]) / text_encoder.temperature
-    confidence = 1.0 / (1.0 + np.exp(logits).sum(axis=1))
-    regions = [
-        _region(occupancy, voxels, rows[members], scores, confidence[members])
-        for members in _groups(connected(voxels[rows]))
+) -> list[Region]:
+    """The best regions among matching voxels, given by their rows with their scores and confidences."""
+    if len(rows) == 0:
+        return []
+    component = connected(voxels[rows])
+    size = np.bincount(component)
+    volume = size * occupancy.voxel_size**3
+    score = np.bincount(component, scores) / size * volume / (volume + _DOUBT_M3)
+    large = np.flatnonzero(size >= options.min_voxels)
+    chosen = large if len(large) else np.arange(len(size))
+    chosen = chosen[np.argsort(-score[chosen], kind="stable")][: options.top_k]
+    order, end = np.argsort(component, kind="stable"), np.cumsum(size)
+    members = [order[end[c] - size[c] : end[c]] for c in chosen]
+    return [
+        _region(occupancy, voxels, rows[own], score[c], confidence[own].mean())
+        for c, own in zip(chosen, members, strict=True)
     ]
-    large = [region for region in regions if region.voxels >= options.min_voxels] or regions
-    large.sort(key=lambda region: -region.confidence * region.voxels)
-    note = _note(word, understood, text_encoder, matched=bool(large))
-    return QueryResult(word, understood, note, large[: options.top_k], scores)
 
 
 def _region(
     occupancy: Occupancy,
     voxels: NDArray[np.int32],
     rows: NDArray[np.int64],
-    scores: NDArray[np.float32],
-    confidence: NDArray[np.float32],
+    score: float,
+    confidence: float,
 ) -> Region:
     own = voxels[rows]
     size = occupancy.voxel_size
     return Region(
-        score=float(scores[rows].mean()),
-        confidence=float(confidence.mean()),
+        score=float(score),
+        confidence=float(confidence),
         centroid=occupancy.centers(own).mean(axis=0),
         box_min=occupancy.origin + own.min(axis=0) * size,
         box_max=occupancy.origin + (own.max(axis=0) + 1) * size,
@@ -164,7 +221,8 @@ def _region(
 def connected(voxels: NDArray[np.int32]) -> NDArray[np.int32]:
     """(V,) component number of each of (V, 3) distinct voxels; voxels that share a face, edge or corner are connected.
 
-    Each voxel looks for 13 of its 26 neighbours among the sorted keys; the dense box is never made.
+    The dense box is never made: among sorted keys, a voxel's three neighbours in a column along k are successive, so
+    that one search serves each of the four columns that hold half of the 26 neighbours but for the one above.
     """
     n = len(voxels)
     if n == 0:
@@ -174,37 +232,46 @@ def connected(voxels: NDArray[np.int32]) -> NDArray[np.int32]:
 
     keys = _keys(voxels)
     order = np.argsort(keys)
-    ascending = keys[order]
-    steps = np.indices((3, 3, 3)).reshape(3, -1).T[14:] - 1
-    edges = []
-    for step in (steps[:, 0] << 2 * _AXIS_BITS) + (steps[:, 1] << _AXIS_BITS) + steps[:, 2]:
-        at = np.minimum(np.searchsorted(ascending, ascending + step), n - 1)
-        here = np.flatnonzero(ascending[at] == ascending + step)
-        edges.append(np.stack((order[here], order[at[here]])))
-    pairs = np.concatenate(edges, axis=1)
-    graph = coo_array((np.ones(pairs.shape[1], bool), pairs), shape=(n, n))
+    ascending = np.append(keys[order], np.full(3, np.iinfo(np.int64).max))
+    here = np.arange(n)
+    above = ascending[1 : n + 1] == ascending[:n] + 1
+    pairs = [np.stack((here[above], here[above] + 1))]
+    for i, j in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        first = ascending[:n] + (i << 2 * _AXIS_BITS) + (j << _AXIS_BITS) - 1
+        at = np.searchsorted(ascending[:n], first)
+        for step in range(3):
+            touches = ascending[at + step] <= first + 2
+            pairs.append(np.stack((here[touches], at[touches] + step)))
+    edges = order[np.concatenate(pairs, axis=1)]
+    graph = coo_array((np.ones(edges.shape[1], bool), tuple(edges)), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def _keys(voxels: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(V,) one integer a voxel, in the order of (i, j, k)."""
     index = voxels.astype(np.int64) + (1 << _AXIS_BITS - 1)
     return (index[:, 0] << 2 * _AXIS_BITS) + (index[:, 1] << _AXIS_BITS) + index[:, 2]
 
 
-def _groups(component: NDArray[np.int32]) -> list[NDArray[np.int64]]:
-    """Members of each component."""
-    order = np.argsort(component, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(component[order])) + 1) if len(order) else []
-
-
-def _note(word: str, understood: str, text_encoder: TextEncoder, matched: bool) -> str:
+def _note(
+    word: str,
+    understood: str,
+    text_encoder: TextEncoder,
+    scores: NDArray[np.float32],
+    threshold: float,
+    matched: bool,
+) -> str:
     if not understood:
-        known = ", ".join(text_encoder.contrast_words()[:12])
-        return f"Nothing is known of '{word}': this map's encoder knows words such as {known}."
+        return f"'{word}' is not understood: this map knows only {text_encoder.knows}."
+    if len(scores) == 0:
+        return "The map has no occupied voxels."
     if not matched:
-        return f"Nothing in this map looks like '{understood}'."
-    if len(understood.split()) < len(word.split()):
-        return f"Only '{understood}' of '{word}' could be used."
+        highest = float(scores.max())
+        why = f"the best score is {highest:.2f}" + (f", below {threshold:.2f}" if highest < threshold else "")
+        return f"Nothing in this map looks like '{understood}': {why}."
+    asked = [token for token in re.findall(r"\w+", word.lower()) if token not in ("a", "an", "the")]
+    if len(asked) > len(re.findall(r"\w+", understood)):
+        return f"Only '{understood}' of '{word}' was understood."
     return ""
 
 

@@ -145,11 +145,13 @@ class Map:
 
     @functools.cached_property
     def _class_labels(self) -> NDArray[np.uint8]:
+        from . import query
+
         words = self.vocabulary[:254]
-        features = self.occupancy.features.astype(np.float32)
+        features = self.occupancy.features
         if not words or not len(features):
             return np.zeros(len(features), np.uint8)
-        scores = features @ self.text_encoder.encode_words(words).features.T
+        scores = query.similarity(features, self.text_encoder.encode_words(words))
         return np.where(features.any(axis=1), scores.argmax(axis=1) + 1, 0).astype(np.uint8)
 
     def labels(self) -> NDArray[np.uint8]:

@@ -1,125 +1,283 @@
-"""Words to voxels to regions."""
+"""Queries on tiny synthetic maps whose voxels' features are put in by hand."""
+
+from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from itertools import product
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
-from scenes import occupancy_of
+from numpy.typing import NDArray
 
-from freeocc3d import query
-from freeocc3d.errors import ConfigError, FreeOccError
-from freeocc3d.language.encoders.labels import load_text
+from freeocc3d import query as asking
+from freeocc3d.errors import ConfigError, FreeOccError, MapError
+from freeocc3d.language.encoders.base import TextEncoder, TextFeatures
+from freeocc3d.language.encoders.labels import LabelWords
+from freeocc3d.query import Options, connected, query, similarity, to_json, to_text
+from freeocc3d.types import BLOCK, FREE, OCCUPIED, Occupancy
 
-WORDS = load_text({"classes": ["nothing", "cup", "table"]})
-
-
-def block(low, high) -> list[tuple[int, int, int]]:
-    return [tuple(v) for v in np.indices(np.subtract(high, low)).reshape(3, -1).T + low]
-
-
-def two_cups_and_a_table():
-    """Cups of 8 and 3 voxels, apart, one at negative indices across a block's border; a table of 12."""
-    first, second, table = block((-1, 7, 3), (1, 9, 5)), block((20, 0, 0), (23, 1, 1)), block((10, 0, 0), (14, 3, 1))
-    features = [[1, 0]] * 8 + [[1, 0]] * 3 + [[0, 1]] * 12
-    return occupancy_of([*first, *second, *table], features, origin=(1.0, 0, 0))
+SIZE = 0.1
+CLASSES = ["nothing", "cup", "sofa", "coffee table", "dining table", "wall"]
+CUP, SOFA, COFFEE, DINING, WALL = range(5)
+WORDS = LabelWords(CLASSES)
 
 
-def ask(occupancy, word: str, **options) -> query.QueryResult:
-    return query.query(occupancy, WORDS, [word], query.Options(**options))[0]
+def occupancy(things: dict[tuple[int, int, int], NDArray[np.floating]], origin: object = (0.0, 0.0, 0.0)) -> Occupancy:
+    """A map with exactly these occupied voxels and their features."""
+    voxels = np.array(list(things), np.int64).reshape(-1, 3)
+    keys = np.unique(voxels // BLOCK, axis=0).astype(np.int32)
+    state = np.full((len(keys), BLOCK**3), FREE, np.uint8)
+    for voxel in voxels:
+        block = np.flatnonzero((keys == voxel // BLOCK).all(axis=1))[0]
+        i, j, k = voxel % BLOCK
+        state[block, (i * BLOCK + j) * BLOCK + k] = OCCUPIED
+    counts = np.zeros(state.shape, np.uint16)
+    made = Occupancy(SIZE, np.array(origin, float), keys, np.ones(state.shape, np.float32), counts, counts, state)
+    features = [things[tuple(voxel)] for voxel in made.occupied_voxels().tolist()]
+    dimension = len(CLASSES) - 1
+    return made.replace(features=np.array(features, np.float16).reshape(len(features), dimension))
 
 
-def test_regions_have_the_right_voxels_boxes_centroids_and_volumes() -> None:
-    occupancy = two_cups_and_a_table()
-    result = ask(occupancy, "cup")
-    assert [region.voxels for region in result.regions] == [8, 3]
-    large, small = result.regions
-    np.testing.assert_allclose(large.box_min, (0.9, 0.7, 0.3))
-    np.testing.assert_allclose(large.box_max, (1.1, 0.9, 0.5))
-    np.testing.assert_allclose(large.centroid, (1.0, 0.8, 0.4))
-    assert large.volume_m3 == pytest.approx(8e-3)
-    np.testing.assert_allclose(small.box_min, (3.0, 0.0, 0.0))
-    np.testing.assert_allclose(small.box_max, (3.3, 0.1, 0.1))
-    assert large.score == pytest.approx(1.0, abs=1e-3)
-    assert large.confidence > 0.99
+def feature(**shares: float) -> NDArray[np.floating]:
+    """Unit feature with shares of classes, which are named as the constants above."""
+    f = np.zeros(len(CLASSES) - 1)
+    for name, share in shares.items():
+        f[globals()[name]] = share
+    return f / max(float(np.linalg.norm(f)), 1e-9)
+
+
+def box(lo: tuple[int, int, int], hi: tuple[int, int, int], f: NDArray[np.floating]) -> dict:
+    return dict.fromkeys(product(*(range(a, b) for a, b in zip(lo, hi, strict=True))), f)
+
+
+def components_by_flooding(voxels: NDArray[np.int32]) -> set[frozenset[int]]:
+    """Voxels that touch, found one neighbour at a time."""
+    row = {tuple(v): n for n, v in enumerate(voxels.tolist())}
+    found, seen = set(), set()
+    for start in row:
+        stack, members = [start], set()
+        while stack:
+            voxel = stack.pop()
+            if voxel in seen or voxel not in row:
+                continue
+            seen.add(voxel)
+            members.add(row[voxel])
+            stack += [tuple(np.add(voxel, step)) for step in product((-1, 0, 1), repeat=3)]
+        if members:
+            found.add(frozenset(members))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_components_are_those_of_flooding(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    voxels = np.unique(rng.integers(-12, 12, (400, 3)), axis=0).astype(np.int32)
+    rng.shuffle(voxels)
+    component = connected(voxels)
+    assert {frozenset(np.flatnonzero(component == c)) for c in np.unique(component)} == components_by_flooding(voxels)
+
+
+def test_each_of_26_neighbours_connects_and_no_other_does() -> None:
+    for step in product((-2, -1, 0, 1, 2), repeat=3):
+        if any(step):
+            touching = max(map(abs, step)) == 1
+            component = connected(np.array([(0, 0, 0), step], np.int32))
+            assert (component[0] == component[1]) == touching, step
+
+
+def test_components_far_from_the_origin() -> None:
+    voxels = np.array([(-500_000, 400_000, -3), (-499_999, 399_999, -4), (500_000, 0, 0)], np.int32)
+    component = connected(voxels)
+    assert component[0] == component[1] != component[2]
+
+
+def test_region_has_faces_centroid_and_volume_in_metres() -> None:
+    room = occupancy(box((-3, 8, 1), (-1, 12, 2), feature(SOFA=1)), origin=(10.0, 20.0, -5.0))
+    (result,) = query(room, WORDS, ["couch"])
+    (region,) = result.regions
     assert result.matched
-    assert result.note == ""
+    np.testing.assert_allclose(region.box_min, (9.7, 20.8, -4.9))
+    np.testing.assert_allclose(region.box_max, (9.9, 21.2, -4.8))
+    np.testing.assert_allclose(region.centroid, (9.8, 21.0, -4.85))
+    assert region.voxels == 8
+    assert region.volume_m3 == pytest.approx(0.008)
+    assert region.score == pytest.approx(8 / 9, abs=1e-3)  # 8 litres that match, 1 of doubt
+    assert region.confidence > 0.99
+    np.testing.assert_allclose(result.scores, 1, atol=1e-3)
 
 
-def test_voxels_touching_at_a_corner_belong_together_and_components_equal_a_dense_labelling() -> None:
-    from scipy import ndimage
+def test_things_apart_are_regions_of_their_own_largest_first() -> None:
+    room = occupancy(
+        box((0, 0, 0), (2, 2, 2), feature(CUP=1))
+        | box((5, 0, 0), (9, 4, 4), feature(CUP=1))
+        | box((9, 0, 0), (12, 4, 4), feature(WALL=1))
+    )
+    regions = query(room, WORDS, ["cup"])[0].regions
+    assert [region.voxels for region in regions] == [64, 8]
+    assert regions[0].score > regions[1].score
+    rows = {tuple(v) for v in room.occupied_voxels()[regions[1].rows].tolist()}
+    assert rows == set(box((0, 0, 0), (2, 2, 2), feature(CUP=1)))
 
-    rng = np.random.default_rng(0)
-    grid = rng.random((14, 13, 12)) < 0.12
-    voxels = np.argwhere(grid).astype(np.int32) - 6
-    component = query.connected(voxels)
-    expected, n = ndimage.label(grid, np.ones((3, 3, 3)))
-    assert component.max() + 1 == n
-    pairs = {(a, b) for a, b in zip(component.tolist(), expected[grid].tolist(), strict=True)}
-    assert len(pairs) == n
+
+def test_a_speck_does_not_outrank_a_large_object_that_is_less_similar() -> None:
+    room = occupancy(
+        box((0, 0, 0), (4, 4, 4), feature(CUP=0.8, SOFA=0.4)) | box((20, 0, 0), (20 + 1, 1, 2), feature(CUP=1))
+    )
+    result = query(room, WORDS, ["cup"])[0]
+    large, speck = result.regions
+    assert (large.voxels, speck.voxels) == (64, 2)
+    assert result.scores[speck.rows].mean() > result.scores[large.rows].mean()
+    assert large.score > speck.score
 
 
-def test_what_nothing_matches_says_so() -> None:
-    occupancy = two_cups_and_a_table()
-    for word, part in (("unicorn", "Nothing is known of 'unicorn'"), ("white cupboard", "Nothing is known")):
-        result = ask(occupancy, word)
-        assert not result.matched
-        assert result.regions == []
-        assert part in result.note
-    only_table = occupancy_of(block((0, 0, 0), (2, 2, 2)), [[0, 1]] * 8)
-    result = ask(only_table, "cup")
+def test_specks_are_left_out_unless_they_are_all_there_is() -> None:
+    speck = {(20, 0, 0): feature(CUP=1)}
+    both = occupancy(box((0, 0, 0), (2, 2, 2), feature(CUP=1)) | speck)
+    assert [r.voxels for r in query(both, WORDS, ["cup"])[0].regions] == [8]
+    assert [r.voxels for r in query(both, WORDS, ["cup"], Options(min_voxels=1))[0].regions] == [8, 1]
+    assert [r.voxels for r in query(occupancy(speck), WORDS, ["cup"])[0].regions] == [1]
+
+
+def test_a_voxel_that_is_rather_something_else_does_not_match() -> None:
+    room = occupancy({(0, 0, 0): feature(CUP=0.6, WALL=0.8)})
+    assert not query(room, WORDS, ["cup"])[0].matched
+    assert query(room, WORDS, ["wall"])[0].matched
+
+
+def test_a_wider_word_finds_what_it_includes_and_its_members_do_not_compete() -> None:
+    room = occupancy(
+        box((0, 0, 0), (2, 2, 2), feature(COFFEE=1))
+        | box((5, 0, 0), (7, 2, 2), feature(COFFEE=1, DINING=1))
+        | box((10, 0, 0), (12, 2, 2), feature(COFFEE=0.6, WALL=0.4))
+        | box((15, 0, 0), (17, 2, 2), feature(COFFEE=0.4, WALL=0.6))
+    )
+    tables = query(room, WORDS, ["table"])[0]
+    assert sorted(region.box_min[0] for region in tables.regions) == pytest.approx([0.0, 0.5, 1.0])
+    assert tables.scores.max() <= 1
+
+
+def test_threshold_option_replaces_the_encoders() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(CUP=0.8, SOFA=0.6)))
+    assert query(room, WORDS, ["cup"])[0].matched
+    assert not query(room, WORDS, ["cup"], Options(threshold=0.9))[0].matched
+
+
+def test_voxels_of_which_nothing_is_known_match_nothing() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature()))
+    result = query(room, WORDS, ["cup"], Options(threshold=0.0))[0]
     assert not result.matched
-    assert "Nothing in this map looks like 'cup'" in result.note
-    assert "Only 'cup'" in ask(occupancy, "red cup").note
+    assert not result.scores.any()
 
 
-def test_a_voxel_that_is_more_something_else_does_not_match() -> None:
-    mixed = occupancy_of(block((0, 0, 0), (2, 2, 2)), [[0.6, 0.8]] * 8)  # 0.6 reaches the threshold of 0.5
-    assert not ask(mixed, "cup").matched
-    assert ask(mixed, "table").matched
+def test_top_k_regions_are_the_best() -> None:
+    cubes = [box((6 * n, 0, 0), (6 * n + 1 + n, 2, 2), feature(CUP=1)) for n in range(4)]
+    room = occupancy({voxel: f for cube in cubes for voxel, f in cube.items()})
+    assert [r.voxels for r in query(room, WORDS, ["cup"], Options(top_k=2))[0].regions] == [16, 12]
 
 
-def test_specks_are_left_out_unless_there_is_nothing_else() -> None:
-    speck = block((40, 0, 0), (41, 1, 1))
-    features = [[1, 0]] * 9
-    assert [r.voxels for r in ask(occupancy_of([*block((0, 0, 0), (2, 2, 2)), *speck], features), "cup").regions] == [8]
-    assert [r.voxels for r in ask(occupancy_of(speck, [[1, 0]]), "cup").regions] == [1]
+def test_notes_say_why_nothing_or_only_a_part_was_found() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1)))
+    unknown, absent, part, whole = query(room, WORDS, ["unicorn", "cup", "red couch", "the couches"])
+    assert (unknown.matched, unknown.understood, unknown.regions) == (False, "", [])
+    assert "not understood" in unknown.note
+    assert "cup, sofa" in unknown.note
+    assert not absent.matched
+    assert absent.note.startswith("Nothing in this map looks like 'cup'")
+    assert part.matched
+    assert part.note == "Only 'couch' of 'red couch' was understood."
+    assert whole.matched
+    assert whole.note == ""
 
 
-def test_options_threshold_and_top_k() -> None:
-    occupancy = two_cups_and_a_table()
-    assert len(ask(occupancy, "cup", top_k=1).regions) == 1
-    weak = occupancy_of(block((0, 0, 0), (2, 2, 2)), [[0.4, 0.0]] * 8)
-    assert not ask(weak, "cup").matched
-    assert ask(weak, "cup", threshold=0.3).matched
+def test_an_empty_map_answers() -> None:
+    empty = occupancy({})
+    (result,) = query(empty, WORDS, ["cup"])
+    assert not result.matched
+    assert result.note == "The map has no occupied voxels."
+    assert result.scores.shape == (0,)
+
+
+@pytest.mark.parametrize("word", ["", "   ", "cup " * 2500])
+def test_empty_and_endless_words_are_refused_in_a_sentence(word: str) -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1)))
+    with pytest.raises(FreeOccError) as refused:
+        query(room, WORDS, ["sofa", word])
+    assert len(str(refused.value)) < 120
+
+
+def test_features_of_another_encoder_are_refused() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1)))
+    with pytest.raises(MapError, match="5 dimensions"):
+        query(room, LabelWords(["nothing", "cup"]), ["cup"])
+
+
+@pytest.mark.parametrize("bad", [{"top_k": 0}, {"min_voxels": 0}, {"threshold": 1.5}])
+def test_options_out_of_range_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
-        query.Options(top_k=0)
+        Options(**bad)
 
 
-def test_unknown_features_match_nothing() -> None:
-    assert not ask(occupancy_of(block((0, 0, 0), (2, 2, 2))), "cup", threshold=0.0001).matched
+class CloseWords(TextEncoder):
+    """An encoder as CLIP: all words are similar, and the temperature is low."""
+
+    threshold, temperature, same_word = 0.2, 0.01, 0.95
+    rows: ClassVar = {"cup": (1.0, 0.0, 2.0, 0, 0), "sofa": (0.0, 1.0, 2.0, 0, 0), "mug": (1.0, 0.05, 2.0, 0, 0)}
+
+    def encode_words(self, words: list[str]) -> TextFeatures:
+        features = np.array([self.rows[word] for word in words], np.float32)
+        return TextFeatures(features / np.linalg.norm(features, axis=1, keepdims=True), tuple(words))
+
+    def contrast_words(self) -> list[str]:
+        return ["sofa", "mug"]
 
 
-def test_an_empty_map_answers_and_bad_words_are_refused() -> None:
-    empty = occupancy_of([])
-    assert not ask(empty, "cup").matched
-    with pytest.raises(FreeOccError, match="empty word"):
-        ask(empty, "  ")
-    with pytest.raises(FreeOccError, match="10000 characters"):
-        ask(empty, "a" * 10_000)
-    assert not ask(empty, "чашка 杯子").matched
+def test_contrast_decides_where_all_similarities_are_high() -> None:
+    encoder = CloseWords()
+    cup, sofa = encoder.encode_words(["cup", "sofa"]).features
+    room = occupancy(box((0, 0, 0), (2, 2, 2), cup) | box((5, 0, 0), (7, 2, 2), sofa))
+    (region,) = query(room, encoder, ["cup"])[0].regions
+    assert region.box_min[0] == 0
+    assert region.confidence > 0.99
+    assert similarity(room.features, encoder.encode_words(["cup"])).min() > 0.7
 
 
-def test_json_has_the_documented_keys_and_text_names_every_word() -> None:
-    results = query.query(two_cups_and_a_table(), WORDS, ["cup", "unicorn"])
-    document = json.loads(json.dumps(query.to_json(Path("maps/x"), results)))
-    assert set(document) >= {"version", "map", "results"}
-    assert [r["word"] for r in document["results"]] == ["cup", "unicorn"]
-    assert [r["matched"] for r in document["results"]] == [True, False]
-    assert document["results"][1]["regions"] == []
-    assert set(document["results"][0]["regions"][0]) >= {
-        "score", "confidence", "centroid", "box_min", "box_max", "volume_m3", "voxels",
-    }  # fmt: skip
-    text = query.to_text(results)
-    assert "cup: 2 regions" in text
+def test_results_do_not_depend_on_the_size_of_the_work_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    room = occupancy({voxel: rng.random(5) for voxel in box((0, 0, 0), (9, 9, 9), feature())})
+    whole = query(room, WORDS, ["table", "cup"])
+    monkeypatch.setattr(asking, "_ROWS", 50)
+    parts = query(room, WORDS, ["table", "cup"])
+    for a, b in zip(whole, parts, strict=True):
+        np.testing.assert_allclose(a.scores, b.scores, atol=1e-6)
+        assert [r.voxels for r in a.regions] == [r.voxels for r in b.regions]
+
+
+def test_json_has_the_documented_keys_and_is_json() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1)))
+    document = json.loads(json.dumps(to_json(Path("maps/room"), query(room, WORDS, ["sofa", "unicorn"]))))
+    assert document["map"] == "maps/room"
+    sofa, unicorn = document["results"]
+    documented = {"score", "confidence", "centroid", "box_min", "box_max", "volume_m3", "voxels"}
+    assert documented <= set(sofa["regions"][0])
+    assert sofa["regions"][0]["box_max"] == [0.2, 0.2, 0.2]
+    assert (unicorn["matched"], unicorn["regions"], unicorn["understood"]) == (False, [], "")
+
+
+def test_text_names_each_word_and_region() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1)))
+    text = to_text(query(room, WORDS, ["sofa", "unicorn"]))
+    assert "sofa: 1 region" in text
     assert "unicorn: no match" in text
+
+
+def test_importing_the_query_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, freeocc3d.query, freeocc3d.language.encoders.colour, freeocc3d.language.encoders.labels; "
+        "print([m for m in ('scipy', 'numba', 'torch', 'open3d', 'cv2', 'typer') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

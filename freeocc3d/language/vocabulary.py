@@ -1,4 +1,8 @@
-"""What people call things in rooms: normal forms, synonyms, and which words include which others."""
+"""What people call things in rooms: normal forms, synonyms, and which words include which others.
+
+The lists are small on purpose, written for this project, and hold only what indoor data sets name and people ask for.
+A word that they do not know still finds a class of its own name, and a class that is a kind of it by its last word.
+"""
 
 from __future__ import annotations
 
@@ -7,105 +11,179 @@ import re
 
 SYNONYMS: tuple[tuple[str, ...], ...] = (
     ("sofa", "couch", "settee", "loveseat"),
-    ("television", "tv", "tvs", "telly", "television set", "tv monitor"),
-    ("trash can", "bin", "trash bin", "trashcan", "garbage can", "garbage bin", "waste bin", "wastebasket", "dustbin"),
-    ("refrigerator", "fridge"),
+    ("television", "tv", "telly", "television set", "tv screen", "tv monitor", "television screen"),
+    (
+        "trash can", "trash bin", "bin", "rubbish bin", "garbage can", "garbage bin", "waste bin", "dustbin",
+        "wastebasket", "waste paper basket",
+    ),
+    ("refrigerator", "fridge", "freezer"),
     ("wardrobe", "closet", "armoire"),
-    ("rug", "carpet", "mat"),
-    ("plant", "potted plant", "house plant", "houseplant", "indoor plant"),
-    ("lamp", "light", "floor lamp", "table lamp", "desk lamp"),
-    ("picture", "painting", "picture frame", "photo frame", "photograph", "photo", "poster", "wall art"),
-    ("cup", "mug", "paper cup", "coffee cup"),
-    ("bookshelf", "bookcase", "book shelf"),
-    ("shelf", "shelf board", "shelves", "rack", "shelving"),
+    ("rug", "carpet", "mat", "floor mat"),
+    ("plant", "potted plant", "house plant", "indoor plant", "pot plant"),
+    ("lamp", "light"),
+    ("ceiling light", "ceiling lamp"),
+    ("picture", "painting", "photograph", "photo", "poster", "wall art", "picture frame", "photo frame"),
+    ("cup", "mug"),
+    ("bookshelf", "bookcase"),
+    ("shelf", "shelf board", "shelving", "rack"),
     ("cabinet", "cupboard"),
-    ("stove", "cooker", "hob", "oven"),
-    ("desk", "writing desk", "office table"),
-    ("nightstand", "bedside table", "night table"),
-    ("curtain", "drape", "blind"),
-    ("computer", "laptop", "notebook computer"),
-    ("tablet", "ipad"),
-    ("monitor", "computer screen", "display"),
-    ("ceiling", "roof"),
+    ("stove", "cooker", "hob", "cooktop", "oven"),
+    ("desk", "writing desk", "office desk", "work desk"),
+    ("nightstand", "bedside table", "night table", "bedside cabinet"),
+    ("side table", "end table"),
+    ("dining table", "kitchen table", "dinner table"),
+    ("chest of drawers", "dresser", "drawers", "commode", "bureau"),
+    ("curtain", "drape", "drapery"),
+    ("blind", "window blind", "roller blind", "venetian blind"),
+    ("laptop", "notebook computer"),
+    ("monitor", "computer screen", "computer monitor", "display"),
     ("floor", "ground", "flooring"),
+    ("wall", "wall panel"),
     ("pillow", "cushion"),
+    ("blanket", "throw", "duvet", "comforter", "quilt", "bedspread"),
     ("bathtub", "bath", "tub"),
     ("toilet", "wc", "lavatory"),
-    ("chair", "seat", "office chair", "armchair", "stool"),
-    ("range hood", "cooker hood", "extractor hood"),
-    ("air conditioner", "ac", "air conditioning"),
-    ("tv cabinet", "tv stand", "tv bench"),
-)
+    ("sink", "washbasin", "basin"),
+    ("tap", "faucet"),
+    ("counter", "countertop", "worktop", "kitchen counter"),
+    ("seat", "chair"),
+    ("armchair", "easy chair", "lounge chair"),
+    ("office chair", "desk chair", "swivel chair"),
+    ("stool", "bar stool"),
+    ("range hood", "cooker hood", "extractor hood", "kitchen hood"),
+    ("air conditioner", "ac", "air conditioning", "air con"),
+    ("tv cabinet", "tv stand", "tv bench", "tv unit", "media console"),
+    ("tableware", "dishes", "crockery"),
+    ("person", "human", "man", "woman"),
+    ("dumbbell", "barbell", "weights"),
+    ("exercise bench", "weight bench"),
+    ("kitchen utensils", "utensils", "cutlery"),
+    ("heater", "radiator"),
+    ("shoe rack", "shoe shelf", "shoe cabinet"),
+)  # fmt: skip
 """Words that people use for the same kind of thing indoors."""
 
 INCLUDES: dict[str, tuple[str, ...]] = {
-    "table": ("coffee table", "dining table", "side table", "desk", "nightstand", "end table"),
-    "door": ("sliding door", "doorframe"),
-    "cabinet": ("kitchen cabinet", "tv cabinet", "filing cabinet"),
-    "lamp": ("chandelier",),
-    "shelf": ("bookshelf", "shoe rack"),
+    "chair": ("armchair", "stool"),
+    "lamp": ("chandelier", "ceiling light"),
+    "shelf": ("bookshelf",),
+    "tableware": ("cup", "plate", "bowl", "glass", "saucer", "teapot"),
+    "computer": ("laptop", "tablet", "monitor"),
+    "screen": ("monitor", "television", "laptop", "tablet"),
+    "bedding": ("pillow", "blanket", "sheet"),
+    "seating": ("chair", "sofa", "armchair", "stool", "bench"),
+    "appliance": ("refrigerator", "stove", "range hood", "microwave", "dishwasher", "washing machine"),
     "furniture": (
-        "sofa", "chair", "bed", "wardrobe", "cabinet", "desk", "dining table", "coffee table", "side table",
-        "nightstand", "bookshelf", "shelf", "kitchen cabinet", "tv cabinet", "table",
+        "sofa", "chair", "armchair", "stool", "bed", "table", "desk", "nightstand", "cabinet", "wardrobe", "bookshelf",
+        "shelf", "chest of drawers",
     ),
-    "seating": ("sofa", "chair"),
 }  # fmt: skip
-"""A wider word and the narrower ones that it includes."""
+"""A wider word and narrower ones that it includes beyond those that end with it ("dining table" is a table)."""
 
-_IRREGULAR = {"tvs": "tv", "shelves": "shelf", "knives": "knife", "people": "person", "men": "man", "women": "woman"}
-_UNCHANGED = {"glasses", "glass", "dress", "mattress", "tableware", "utensils", "stairs", "bus", "canvas"}
-_ARTICLES = {"a", "an", "the", "my", "your", "this", "that", "some", "any", "all", "of", "every"}
+_IRREGULAR = {
+    "shelves": "shelf", "bookshelves": "bookshelf", "knives": "knife", "people": "person", "men": "man",
+    "women": "woman", "children": "child",
+}  # fmt: skip
+_ARTICLES = {"a", "an", "the", "my", "your", "our", "this", "that", "these", "those", "some", "any", "all", "every"}
+_PREPOSITIONS = {
+    "of", "on", "in", "at", "by", "with", "without", "near", "under", "above", "behind", "beside", "between", "next",
+    "from", "for", "to", "against", "that", "which",
+}  # fmt: skip
+_LONGEST_PHRASE = 16
 
 
 def normal(phrase: str) -> str:
     """Lower case, no articles or punctuation, each word in the singular: "The Coffee-Tables" to "coffee table"."""
-    words = [word for word in re.findall(r"[^\W_]+", phrase.lower()) if word not in _ARTICLES]
-    return " ".join(_singular(word) for word in words)
+    words = re.findall(r"[^\W_]+", phrase.lower())
+    return " ".join(_singular(word) for word in words if word not in _ARTICLES)
+
+
+def matching_names(phrase: str, names: list[str]) -> tuple[list[int], str]:
+    """Which of some class names a phrase means, and the part of the phrase that was used; no match: ([], "").
+
+    The whole phrase is tried first, then the ends of what stands before a preposition ("red chair by the window":
+    "red chair", "chair"), since the last word of an English noun phrase says what the thing is. A part means the names
+    that are equal to it or a kind of it ("table": "coffee table" and "side table"), failing those its synonyms', and
+    failing all that, the names of a wider word that includes it ("mug": "tableware").
+    """
+    known = [_key(name) for name in names]
+    kinds = [_tail_keys(name) for name in names]
+    parts = _parts(phrase)
+    for part in parts:
+        for words in (frozenset((part,)), synonyms(part)):
+            if found := _named(words, known, kinds):
+                return found, part
+    for part in parts:
+        if found := _exactly({wide for word in synonyms(part) for wide in wider(word)}, known):
+            return found, part
+    return [], ""
+
+
+@functools.cache
+def synonyms(word: str) -> frozenset[str]:
+    """The normal forms that mean the same as ``word``, itself included."""
+    same = {normal(word)}
+    for group in SYNONYMS:
+        if _key(word) in {_key(member) for member in group}:
+            same |= {normal(member) for member in group}
+    return frozenset(same)
+
+
+@functools.cache
+def narrower(word: str) -> frozenset[str]:
+    """The normal forms of what ``word`` includes, at any remove, with their synonyms."""
+    found: set[str] = set()
+    for inner in INCLUDES.get(normal(word), ()):
+        found |= synonyms(inner) | narrower(inner)
+    return frozenset(found)
+
+
+@functools.cache
+def wider(word: str) -> frozenset[str]:
+    """The normal forms of what includes ``word``."""
+    key = _key(word)
+    return frozenset(normal(wide) for wide in INCLUDES if key in {_key(inner) for inner in INCLUDES[wide]})
+
+
+def _parts(phrase: str) -> list[str]:
+    """Normal forms to look up, most specific first."""
+    tokens = re.findall(r"[^\W_]+", phrase.lower())[:_LONGEST_PHRASE]
+    cut = next((at for at, token in enumerate(tokens) if at > 0 and token in _PREPOSITIONS), len(tokens))
+    head = normal(" ".join(tokens[:cut])).split()
+    ends = [" ".join(head[start:]) for start in range(len(head))]
+    return list(dict.fromkeys(part for part in (normal(" ".join(tokens)), *ends) if part))
+
+
+def _named(words: frozenset[str], known: list[str], kinds: list[set[str]]) -> list[int]:
+    """Rows of the names that are one of ``words``, or a kind of one."""
+    keys = {_key(word) for word in words}
+    keys |= {_key(name) for word in words for name in narrower(word)}
+    return [row for row, name in enumerate(known) if name in keys or kinds[row] & keys]
+
+
+def _exactly(words: set[str], known: list[str]) -> list[int]:
+    keys = {_key(word) for word in words}
+    return [row for row, name in enumerate(known) if name in keys]
+
+
+def _key(name: str) -> str:
+    """Equal for "night stand", "Nightstand" and "nightstands"."""
+    return normal(name).replace(" ", "")
+
+
+def _tail_keys(name: str) -> set[str]:
+    """Keys of what a name of several words is a kind of: of "small office chair", "office chair" and "chair"."""
+    words = normal(name).split()
+    return {"".join(words[start:]) for start in range(1, len(words))}
 
 
 def _singular(word: str) -> str:
     if word in _IRREGULAR:
         return _IRREGULAR[word]
-    if word in _UNCHANGED or len(word) < 4 or not word.endswith("s") or word.endswith(("ss", "us", "is")):
+    if len(word) < 3 or not word.endswith("s") or word.endswith(("ss", "us", "is")):
         return word
     if word.endswith("ies"):
         return word[:-3] + "y"
     if word.endswith(("ches", "shes", "xes", "sses")):
         return word[:-2]
     return word[:-1]
-
-
-@functools.cache
-def synonyms(word: str) -> frozenset[str]:
-    """The normal forms that mean the same as ``word``, itself included."""
-    word = normal(word)
-    same = {word}
-    for group in SYNONYMS:
-        members = {normal(member) for member in group}
-        if word in members:
-            same |= members
-    return frozenset(same)
-
-
-def matching_names(phrase: str, names: list[str]) -> tuple[list[int], str]:
-    """Which of some class names a phrase means, and the part of the phrase that was used.
-
-    The whole phrase is tried first, then its ends ("red office chair", "office chair", "chair"), since the last word
-    of an English phrase says what the thing is. A name matches if it is the phrase, a synonym, included in it, or a
-    kind of it by its own last word ("table" means "coffee table" and "side table"). No match: ([], "").
-    """
-    words = normal(phrase).split()[:16]
-    known = [normal(name) for name in names]
-    for start in range(len(words)):
-        part = " ".join(words[start:])
-        same = synonyms(part)
-        exact = [k for k, name in enumerate(known) if name == part] or [k for k, n in enumerate(known) if n in same]
-        included = {normal(inner) for word in same for inner in INCLUDES.get(word, ())}
-        kinds = [
-            k
-            for k, name in enumerate(known)
-            if name in included or (len(name.split()) > 1 and name.split()[-1] in same and name not in same)
-        ]
-        if exact or kinds:
-            return sorted({*exact, *kinds}), part
-    return [], ""

@@ -1,169 +1,354 @@
-"""Colour names, no network: a small perceptual space in which "red", "dark blue" and "white sofa" have a meaning."""
+"""Colour names, no network: "red", "dark blue" and "white sofa" (as white) have a meaning.
+
+A pixel belongs softly to named colours: its membership in colour c is m_c = exp(-d_c^2 / 2 sigma^2), normalised to sum
+1, where d_c is the CIE94 difference to the nearest of c's centroids, with lightness at half weight because shading
+changes it within an object. Colours gather in basic terms ("dark blue" is blue), mu = M m, and the feature is
+
+    f = (sqrt(mu / 2), sqrt(m / 2)),   of unit length because mu and m each sum to 1.
+
+A term's text feature is its axis in the first half; that of another name, with its distribution q over the colours, is
+(sqrt(M q / 5), sqrt(4 q / 5)), so that "dark blue" is a little like any blue. Each half of a cosine is a Bhattacharyya
+coefficient.
+
+Source: the names are the eleven basic terms of B. Berlin and P. Kay (Basic Color Terms, 1969) with light and dark
+variants and a few more that people say of rooms; the centroids are our own choice in CIELAB; nothing is trained.
+CIE94: CIE publication 116-1995.
+"""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
+from ...errors import ConfigError, MapError
 from ...types import Frame
 from .base import Encoder, TextEncoder, TextFeatures
 
 REQUIRES: tuple[str, ...] = ()
 
-PROTOTYPES: tuple[tuple[str, str], ...] = (
-    ("black", "101010"), ("black", "282828"), ("grey", "484848"), ("grey", "707070"), ("grey", "989898"),
-    ("white", "c8c8c8"), ("white", "e0e0e0"), ("white", "fcfcfc"),
-    ("red", "5e1014"), ("red", "a01820"), ("red", "e02028"), ("red", "d8504c"),
-    ("orange", "c85a10"), ("orange", "f08020"), ("orange", "f6a050"),
-    ("yellow", "b09418"), ("yellow", "f0d020"), ("yellow", "f4e480"),
-    ("green", "184020"), ("green", "287838"), ("green", "30b048"), ("green", "98d890"), ("green", "6c7c28"),
-    ("turquoise", "106868"), ("turquoise", "28b0b0"), ("turquoise", "90dcd8"),
-    ("blue", "101c50"), ("blue", "1c3c94"), ("blue", "2868d8"), ("blue", "88b8ec"),
-    ("purple", "40185c"), ("purple", "7030a0"), ("purple", "b090d8"),
-    ("pink", "d83c88"), ("pink", "f080b0"), ("pink", "f4b8c8"),
-    ("brown", "382010"), ("brown", "6c4020"), ("brown", "986840"),
-    ("beige", "c0a078"), ("beige", "e0cca8"),
-)  # fmt: skip
-"""Colour term -> sRGB examples of it, dark to light. The eleven basic terms of B. Berlin and P. Kay (Basic Color Terms,
-1969) and two more that people say of rooms; the examples are our own choice."""
+CENTROIDS: dict[str, tuple[tuple[float, float, float], ...]] = {
+    "white": ((100, 0, 0), (80, 2, 80), (84, 9, 82), (80, 4, 220)),
+    "light grey": ((64, 1, 0), (64, 6, 85), (64, 5, 230)),
+    "grey": ((50, 1, 0), (50, 5, 80), (50, 5, 240)),
+    "dark grey": ((34, 1, 0), (34, 4, 70), (34, 7, 260)),
+    "black": ((6, 1, 0), (14, 3, 60), (14, 4, 270), (2, 6, 50)),
+    "red": ((53, 100, 40), (46, 78, 36), (38, 60, 32), (32, 50, 29), (55, 60, 32)),
+    "dark red": ((24, 42, 28), (18, 32, 26), (12, 22, 26), (30, 30, 24)),
+    "pink": ((85, 22, 5), (72, 40, 0), (62, 32, 12), (66, 62, 356), (70, 45, 22)),
+    "magenta": ((60, 112, 328), (48, 72, 350), (40, 60, 342), (34, 45, 350)),
+    "purple": ((32, 68, 322), (30, 48, 308), (22, 34, 312), (40, 55, 314), (38, 26, 315)),
+    "light purple": ((78, 24, 307), (62, 42, 310), (68, 18, 312)),
+    "dark blue": ((13, 60, 304), (8, 24, 295), (20, 26, 280), (20, 40, 292), (27, 20, 268)),
+    "blue": ((33, 130, 306), (40, 72, 291), (38, 46, 280), (48, 56, 280), (46, 34, 265)),
+    "light blue": ((84, 16, 230), (78, 26, 238), (64, 40, 268), (72, 18, 255), (66, 26, 245)),
+    "turquoise": ((90, 48, 196), (80, 44, 188), (64, 36, 198), (48, 28, 196), (32, 22, 198)),
+    "light green": ((87, 60, 137), (86, 22, 138), (74, 32, 140), (90, 85, 128), (80, 16, 155)),
+    "green": ((70, 95, 136), (48, 70, 137), (52, 46, 144), (42, 34, 145), (56, 36, 128)),
+    "dark green": ((33, 48, 138), (22, 26, 146), (28, 18, 150), (14, 16, 145)),
+    "olive": ((52, 56, 105), (42, 36, 106), (34, 26, 105), (56, 26, 108)),
+    "yellow": ((96, 96, 102), (87, 86, 90), (78, 72, 92), (94, 50, 102), (66, 62, 94), (56, 58, 94)),
+    "orange": ((75, 84, 72), (67, 90, 58), (62, 76, 54), (72, 66, 66)),
+    "brown": ((38, 48, 58), (36, 30, 64), (46, 38, 64), (42, 24, 66)),
+    "dark brown": ((22, 22, 58), (16, 12, 60), (28, 14, 65)),
+    "light brown": ((62, 42, 70), (62, 30, 74), (56, 44, 62), (70, 36, 76), (54, 22, 75), (66, 26, 88), (62, 22, 95)),
+    "beige": ((84, 17, 82), (78, 22, 80), (92, 16, 95), (74, 15, 82), (78, 24, 92)),
+}
+"""Centroids of each colour as (lightness 0…100, chroma, hue in degrees) in CIELAB of sRGB under D65."""
 
-TERMS = tuple(dict.fromkeys(term for term, _ in PROTOTYPES))
-TONES = ("dark", "medium", "light")
+Meaning = dict[str, float]
+"""Shares of the colours of CENTROIDS, up to a common factor."""
 
-_TERM_SHARE = 0.6
-"""Part of a feature's squared length that tells the term; the rest tells the tone."""
-_LIGHTNESS_WEIGHT = 0.6  # shadows change lightness more than they change hue
-_SPREAD = 11.0  # of a term around its examples, in CIELAB units
-_LUT_BITS = 5
-_BLOCK = 4
+TERMS: dict[str, Meaning] = {
+    "white": {"white": 1.0, "light grey": 0.2},
+    "grey": {"light grey": 0.8, "grey": 1.0, "dark grey": 0.9},
+    "black": {"black": 1.0, "dark grey": 0.1},
+    "red": {"red": 1.0, "dark red": 1.0},
+    "orange": {"orange": 1.0},
+    "yellow": {"yellow": 1.0},
+    "green": {"green": 1.0, "light green": 1.0, "dark green": 1.0, "olive": 0.8},
+    "turquoise": {"turquoise": 1.0},
+    "blue": {"blue": 1.0, "light blue": 1.0, "dark blue": 1.0},
+    "purple": {"purple": 1.0, "light purple": 1.0, "magenta": 0.2},
+    "pink": {"pink": 1.0, "magenta": 0.8},
+    "brown": {"brown": 1.0, "light brown": 0.9, "dark brown": 1.0, "olive": 0.2},
+    "beige": {"beige": 1.0, "light brown": 0.1},
+}
+"""Basic terms, and the share of each colour that they have: the matrix M."""
 
-_OTHER_NAMES: dict[str, tuple[str, ...]] = {
-    "gray": ("grey",), "silver": ("light", "grey"), "charcoal": ("dark", "grey"), "anthracite": ("dark", "grey"),
-    "crimson": ("red",), "scarlet": ("red",), "maroon": ("dark", "red"), "burgundy": ("dark", "red"),
-    "gold": ("yellow",), "golden": ("yellow",), "lemon": ("yellow",), "amber": ("orange",), "lime": ("light", "green"),
-    "olive": ("dark", "green"), "mint": ("light", "green"), "teal": ("dark", "turquoise"), "cyan": ("turquoise",),
-    "aqua": ("turquoise",), "navy": ("dark", "blue"), "azure": ("light", "blue"), "violet": ("purple",),
-    "lilac": ("light", "purple"), "lavender": ("light", "purple"), "magenta": ("pink",), "rose": ("pink",),
-    "chocolate": ("dark", "brown"), "tan": ("beige",), "cream": ("beige",), "ivory": ("beige",), "sand": ("beige",),
-}  # fmt: skip
-_TONE_WORDS = {"dark": "dark", "deep": "dark", "medium": "medium", "light": "light", "pale": "light", "bright": "light"}
+_GOLD = {"yellow": 0.6, "light brown": 0.4}
+
+NAMES: dict[str, Meaning] = {
+    "aqua": {"turquoise": 0.8, "light blue": 0.2},
+    "anthracite": {"dark grey": 0.7, "black": 0.3},
+    "azure": {"light blue": 0.6, "blue": 0.4},
+    "burgundy": {"dark red": 1.0},
+    "charcoal": {"dark grey": 0.7, "black": 0.3},
+    "coral": {"pink": 0.5, "orange": 0.25, "red": 0.25},
+    "cream": {"beige": 0.6, "white": 0.4},
+    "crimson": {"red": 0.6, "dark red": 0.4},
+    "cyan": {"turquoise": 0.8, "light blue": 0.2},
+    "fuchsia": {"magenta": 1.0},
+    "gold": _GOLD,
+    "golden": _GOLD,
+    "indigo": {"dark blue": 0.5, "purple": 0.5},
+    "ivory": {"white": 0.6, "beige": 0.4},
+    "khaki": {"olive": 0.5, "light brown": 0.5},
+    "lavender": {"light purple": 1.0},
+    "lilac": {"light purple": 1.0},
+    "lime": {"light green": 0.7, "yellow": 0.3},
+    "magenta": {"magenta": 0.8, "pink": 0.2},
+    "maroon": {"dark red": 0.8, "dark brown": 0.2},
+    "mauve": {"light purple": 0.7, "pink": 0.3},
+    "mint": {"light green": 0.7, "turquoise": 0.3},
+    "navy": {"dark blue": 1.0},
+    "olive": {"olive": 1.0},
+    "salmon": {"pink": 0.8, "orange": 0.2},
+    "scarlet": {"red": 1.0},
+    "silver": {"light grey": 0.7, "grey": 0.3},
+    "tan": {"light brown": 0.8, "beige": 0.2},
+    "teal": {"turquoise": 0.8, "dark green": 0.2},
+    "violet": {"purple": 0.8, "light purple": 0.2},
+}
+"""What other colour names mean."""
+
+_DARK: dict[str, Meaning] = {
+    "red": {"dark red": 0.9, "red": 0.1},
+    "orange": {"orange": 0.6, "brown": 0.4},
+    "yellow": {"olive": 0.5, "yellow": 0.5},
+    "green": {"dark green": 0.9, "green": 0.1},
+    "blue": {"dark blue": 0.9, "blue": 0.1},
+    "purple": {"purple": 1.0},
+    "pink": {"magenta": 0.7, "pink": 0.3},
+    "brown": {"dark brown": 0.9, "brown": 0.1},
+    "white": {"light grey": 1.0},
+    "grey": {"dark grey": 0.9, "grey": 0.1},
+    "beige": {"light brown": 0.7, "beige": 0.3},
+    "turquoise": {"turquoise": 0.8, "dark green": 0.2},
+}
+_LIGHT: dict[str, Meaning] = {
+    "red": {"red": 0.5, "pink": 0.5},
+    "orange": {"orange": 0.7, "beige": 0.3},
+    "yellow": {"yellow": 0.7, "beige": 0.3},
+    "green": {"light green": 0.9, "green": 0.1},
+    "blue": {"light blue": 0.9, "blue": 0.1},
+    "purple": {"light purple": 0.9, "purple": 0.1},
+    "pink": {"pink": 1.0},
+    "brown": {"light brown": 0.8, "beige": 0.2},
+    "black": {"dark grey": 1.0},
+    "grey": {"light grey": 0.9, "grey": 0.1},
+    "turquoise": {"turquoise": 0.8, "light blue": 0.2},
+}
+_BRIGHT: dict[str, Meaning] = {
+    "red": {"red": 1.0},
+    "green": {"green": 0.6, "light green": 0.4},
+    "blue": {"blue": 0.9, "light blue": 0.1},
+    "purple": {"purple": 1.0},
+    "pink": {"pink": 0.6, "magenta": 0.4},
+    "white": {"white": 1.0},
+}
+MODIFIERS = {"dark": _DARK, "deep": _DARK, "light": _LIGHT, "pale": _LIGHT, "bright": _BRIGHT, "vivid": _BRIGHT}
+"""What a colour name means after a modifier; one that is not listed under it keeps its own meaning."""
+
+_SPELLINGS = {"gray": "grey"}
+
+_SIGMA = 3.5  # of a membership, in units of CIE94
+_LIGHTNESS_WEIGHT = 0.5
+_TERM_SHARE = 0.2  # of the squared text feature of a shade, for the term that it is a shade of
+_TABLE_BITS = 5  # of each channel that the look-up table tells apart
+
+
+@dataclass(frozen=True)
+class Options:
+    """How pixels get colour names."""
+
+    stride: int = 4
+    """Edge in pixels of the blocks whose memberships are averaged into one feature."""
+    white: tuple[float, float, float] | None = None
+    """RGB (16 to 255) that something white has in this capture, for scans under coloured or dim light; null = colours
+    are taken as they are."""
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise ConfigError(f"'stride' must be at least 1, got {self.stride}.")
+        if self.white is not None and not all(16 <= value <= 255 for value in self.white):
+            raise ConfigError(f"'white' must be three numbers from 16 to 255, got {self.white}.")
 
 
 class ColourEncoder(Encoder):
-    """f = (sqrt(0.6 m), sqrt(0.4 l)) with m a pixel's memberships in the terms and l in the tones, each summing to one:
-    f is of unit length, and the cosine of two features a mean of two Bhattacharyya coefficients."""
+    """sqrt of the mean colour memberships of blocks of pixels."""
 
     name: ClassVar[str] = "colour"
-    dimension = len(TERMS) + len(TONES)
+    dimension = len(TERMS) + len(CENTROIDS)
 
-    def __init__(self) -> None:
-        steps = (np.arange(1 << _LUT_BITS) + 0.5) * (256 >> _LUT_BITS)
-        rgb = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-        self._memberships = memberships(rgb)
+    def __init__(self, options: Options | None = None):
+        self.options = options or Options()
+        self._bins = _channel_bins(self.options.white)
+        self._table = _table()
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
-        shift = 8 - _LUT_BITS
-        rgb = frame.color[::2, ::2].astype(np.int32) >> shift
-        entry = (rgb[..., 0] << 2 * _LUT_BITS) | (rgb[..., 1] << _LUT_BITS) | rgb[..., 2]
-        half = _BLOCK // 2
-        height, width = (max(1, size // half) for size in entry.shape)
-        entry = entry[: height * half, : width * half]
-        m = self._memberships[entry]
-        m = m.reshape(height, entry.shape[0] // height, width, entry.shape[1] // width, -1).mean(axis=(1, 3))
-        return np.sqrt(m).astype(np.float16)
+        """(ceil(H / stride), ceil(W / stride), D) float16."""
+        import cv2
+
+        rgb, stride = frame.color, self.options.stride
+        height, width = -(-rgb.shape[0] // stride), -(-rgb.shape[1] // stride)
+        bottom, right = height * stride - rgb.shape[0], width * stride - rgb.shape[1]
+        if bottom or right:
+            rgb = cv2.copyMakeBorder(rgb, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
+        samples = max(1, stride // 2)  # a side: pixels are averaged in pairs first, for less noise and less work
+        rgb = cv2.resize(rgb, (width * samples, height * samples), interpolation=cv2.INTER_AREA)
+        entry = self._bins[0][rgb[..., 0]] + self._bins[1][rgb[..., 1]] + self._bins[2][rgb[..., 2]]
+        total = np.zeros((height, width, self.dimension), np.float32)
+        for row in range(samples):
+            for column in range(samples):
+                total += self._table[entry[row::samples, column::samples]]
+        return np.sqrt(total / samples**2).astype(np.float16)
 
     def text_state(self) -> dict[str, Any]:
-        return {"terms": list(TERMS)}
+        return {"terms": list(TERMS), "colours": list(CENTROIDS)}
 
 
 class ColourWords(TextEncoder):
-    """Colour words, with tones, in any phrase; the rest of the phrase is not understood."""
+    """Colour names, with modifiers, in any phrase; its other words are passed over."""
 
-    threshold = 0.7
+    threshold = 0.6
     temperature = 0.1
+    same_word = 0.3
+    knows = "colour names"
+
+    def __init__(self) -> None:
+        self._pure = np.sqrt(features_squared(np.eye(len(CENTROIDS))))
 
     def encode_words(self, words: list[str]) -> TextFeatures:
-        parsed = [parse(word) for word in words]
-        features = np.zeros((len(words), len(TERMS) + len(TONES)), np.float32)
-        for row, (terms, tone) in enumerate(parsed):
-            for term in terms:
-                features[row, TERMS.index(term)] = np.sqrt(_TERM_SHARE / len(terms))
-            if terms:
-                among = [tone] if tone else list(TONES)
-                for name in among:
-                    features[row, len(TERMS) + TONES.index(name)] = np.sqrt((1 - _TERM_SHARE) / len(among))
-        return TextFeatures(features, tuple(" ".join([*([tone] if tone else []), *terms]) for terms, tone in parsed))
+        features = np.zeros((len(words), len(TERMS) + len(CENTROIDS)), np.float32)
+        attainable = np.ones(len(words), np.float32)
+        understood = []
+        for row, word in enumerate(words):
+            meanings = parse(word)
+            understood.append(", ".join(meanings))
+            if meanings:
+                features[row] = np.sqrt(np.mean([_text_squared(m) for m in meanings.values()], axis=0))
+                attainable[row] = (self._pure @ features[row]).max()  # by a thing that is wholly of one colour
+        return TextFeatures(features, tuple(understood), attainable)
 
     def contrast_words(self) -> list[str]:
         return list(TERMS)
 
 
-def load(capture: Capture) -> ColourEncoder:
+def load(options: Options, capture: Capture) -> ColourEncoder:
     """The encoder; it needs nothing of the capture."""
-    return ColourEncoder()
+    return ColourEncoder(options)
 
 
 def load_text(state: dict[str, Any]) -> ColourWords:
-    """The word side."""
+    """The word side. Raises MapError for a map whose colours are not those that words are defined by."""
+    if state.get("terms") != list(TERMS) or state.get("colours") != list(CENTROIDS):
+        raise MapError("The map's colour features are of another version of freeocc3d: make the map again.")
     return ColourWords()
 
 
-def parse(phrase: str) -> tuple[list[str], str | None]:
-    """The colour terms of a phrase, and the tone that they are qualified with."""
-    terms: list[str] = []
-    tone = None
+def parse(phrase: str) -> dict[str, Meaning | str]:
+    """The colours that a phrase names: "a dark-blue sofa" gives "dark blue". Each with its meaning, or with the basic
+    term that it is."""
+    meanings: dict[str, Meaning | str] = {}
+    modifier = ""
     for token in re.findall(r"[a-z]+", phrase.lower()):
-        for part in _meaning(token):
-            if part in TONES:
-                tone = part
-            elif part not in terms:
-                terms.append(part)
-    return terms, tone if terms else None
+        prefix = next((m for m in MODIFIERS if token.startswith(m) and base_colour(token.removeprefix(m))), "")
+        colour = base_colour(token.removeprefix(prefix))
+        if colour:
+            modifier = prefix or modifier
+            plain = _SPELLINGS.get(colour, colour)
+            meanings[f"{modifier} {colour}".strip()] = MODIFIERS.get(modifier, {}).get(plain, NAMES.get(plain, plain))
+        modifier = token if token in MODIFIERS else ""
+    return meanings
 
 
-def _meaning(token: str) -> tuple[str, ...]:
-    """Terms and tones that one word stands for: itself, another name, or with -ish, -coloured or -s taken off."""
-    stems = [token, *(token.removesuffix(end) for end in ("s", "ish", "dish", "tish") if token.endswith(end))]
-    for stem in (*stems, *(f"{stem}e" for stem in stems[1:])):
-        if stem in TERMS:
-            return (stem,)
-        if stem in _OTHER_NAMES:
-            return _OTHER_NAMES[stem]
-        if stem in _TONE_WORDS:
-            return (_TONE_WORDS[stem],)
-    return ()
+def base_colour(token: str) -> str:
+    """The colour name of which a lower-case token is a form ("reddish", "greys", "redcolored"), or an empty string."""
+    for ending in ("", "s", "coloured", "colored"):
+        if _is_colour(token.removesuffix(ending)):
+            return token.removesuffix(ending)
+    if not token.endswith("ish"):
+        return ""
+    stem = token.removesuffix("ish")  # "green(ish)", "blu(ish)" without its e, "red-d(ish)"
+    return next((word for word in (stem, stem + "e", stem[:-1]) if _is_colour(word)), "")
 
 
-def memberships(rgb: NDArray[np.floating]) -> NDArray[np.float32]:
-    """(N, 3) sRGB 0…255 to (N, terms + tones): memberships times their share, rows sum to one."""
+def _is_colour(word: str) -> bool:
+    return word in TERMS or word in NAMES or word in _SPELLINGS
+
+
+def features_squared(m: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(..., C) memberships in the colours to (..., D) squared features (mu, m) / 2."""
+    return np.concatenate((m @ _shares().T, m), axis=-1) / 2
+
+
+def _shares() -> NDArray[np.float64]:
+    """M: (terms, colours), columns sum to 1."""
+    return np.array([[term.get(colour, 0.0) for colour in CENTROIDS] for term in TERMS.values()])
+
+
+def _text_squared(meaning: Meaning | str) -> NDArray[np.floating]:
+    """(D,) squared text feature of a meaning, or of a basic term."""
+    if isinstance(meaning, str):
+        return np.array([*(float(term == meaning) for term in TERMS), *(0.0 for _ in CENTROIDS)])
+    q = np.array([meaning.get(colour, 0.0) for colour in CENTROIDS])
+    q /= q.sum()
+    return np.concatenate((_TERM_SHARE * _shares() @ q, (1 - _TERM_SHARE) * q))
+
+
+def memberships(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(..., 3) sRGB in 0…255 to (..., C) memberships in the colours of CENTROIDS; they sum to 1."""
     lab = rgb_to_lab(rgb)
-    examples = rgb_to_lab(np.array([[int(code[i : i + 2], 16) for i in (0, 2, 4)] for _, code in PROTOTYPES], float))
-    weight = np.array((_LIGHTNESS_WEIGHT, 1.0, 1.0))
-    squared = (((lab[:, None] - examples[None]) * weight) ** 2).sum(axis=2)
-    closeness = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)) / _SPREAD**2)
-    terms = np.zeros((len(rgb), len(TERMS)))
-    for column, (term, _) in enumerate(PROTOTYPES):
-        index = TERMS.index(term)
-        terms[:, index] = np.maximum(terms[:, index], closeness[:, column])
-    terms /= terms.sum(axis=1, keepdims=True)
-    dark = 1.0 / (1.0 + np.exp((lab[:, 0] - 38.0) / 4.0))
-    light = 1.0 / (1.0 + np.exp((68.0 - lab[:, 0]) / 4.0))
-    tones = np.stack((dark, 1.0 - dark - light, light), axis=1).clip(0.0)
-    tones /= tones.sum(axis=1, keepdims=True)
-    return np.concatenate((_TERM_SHARE * terms, (1 - _TERM_SHARE) * tones), axis=1).astype(np.float32)
+    squared = np.stack(
+        [np.min([_squared_cie94(lab, c) for c in centroids], axis=0) for centroids in CENTROIDS.values()], axis=-1
+    )
+    m = np.exp(-0.5 * (squared - squared.min(axis=-1, keepdims=True)) / _SIGMA**2)
+    return np.asarray(m / m.sum(axis=-1, keepdims=True))
 
 
 def rgb_to_lab(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(N, 3) sRGB 0…255 to CIELAB under D65 (IEC 61966-2-1, CIE 15)."""
-    c = np.asarray(rgb, np.float64) / 255.0
-    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    """(..., 3) sRGB in 0…255 to CIELAB under D65 (IEC 61966-2-1, CIE 15)."""
     to_xyz = np.array(
         ((0.4124564, 0.3575761, 0.1804375), (0.2126729, 0.7151522, 0.0721750), (0.0193339, 0.1191920, 0.9503041))
     )
-    xyz = linear @ to_xyz.T / (0.95047, 1.0, 1.08883)
+    xyz = _linear(np.asarray(rgb, np.float64) / 255.0) @ (to_xyz / to_xyz.sum(axis=1, keepdims=True)).T
     f = np.where(xyz > 216 / 24389, np.cbrt(xyz), (24389 / 27 * xyz + 16) / 116)
-    return np.stack((116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])), axis=1)
+    x, y, z = np.moveaxis(f, -1, 0)
+    return np.stack((116 * y - 16, 500 * (x - y), 200 * (y - z)), axis=-1)
+
+
+def _squared_cie94(lab: NDArray[np.float64], centroid: tuple[float, float, float]) -> NDArray[np.float64]:
+    """(...,) squared CIE94 difference of (..., 3) colours to a centroid (lightness, chroma, hue in degrees)."""
+    L, a, b = np.moveaxis(lab, -1, 0)
+    L_c, C_c, hue = centroid[0], centroid[1], np.radians(centroid[2])
+    squared_dC = (np.hypot(a, b) - C_c) ** 2
+    squared_dH = np.maximum((a - C_c * np.cos(hue)) ** 2 + (b - C_c * np.sin(hue)) ** 2 - squared_dC, 0.0)
+    S_C, S_H = 1 + 0.045 * C_c, 1 + 0.015 * C_c
+    return np.asarray((_LIGHTNESS_WEIGHT * (L - L_c)) ** 2 + squared_dC / S_C**2 + squared_dH / S_H**2)
+
+
+def _table() -> NDArray[np.float32]:
+    """(32768, D) squared features of the centres of 32 x 32 x 32 bins of sRGB, red slowest."""
+    centres = (np.arange(1 << _TABLE_BITS) + 0.5) * (256 >> _TABLE_BITS) - 0.5
+    rgb = np.stack(np.meshgrid(centres, centres, centres, indexing="ij"), axis=-1)
+    return features_squared(memberships(rgb.reshape(-1, 3))).astype(np.float32)
+
+
+def _channel_bins(white: tuple[float, float, float] | None) -> NDArray[np.int32]:
+    """(3, 256) share of each channel's values in the row of the look-up table. Linear light is divided by that of
+    ``white`` on the way: von Kries adaptation at no cost."""
+    gain = 1.0 / _linear(np.asarray(white or (255.0, 255.0, 255.0)) / 255.0)
+    linear = np.minimum(_linear(np.arange(256) / 255.0) * gain[:, None], 1.0)
+    srgb = np.where(linear > 0.0031308, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055, 12.92 * linear)
+    bins = np.rint(srgb * 255).astype(np.int32) >> (8 - _TABLE_BITS)
+    return bins << (_TABLE_BITS * np.array([2, 1, 0], np.int32))[:, None]
+
+
+def _linear(srgb: NDArray[np.floating]) -> NDArray[np.float64]:
+    """sRGB in 0…1 to linear light."""
+    return np.where(srgb > 0.04045, ((srgb + 0.055) / 1.055) ** 2.4, srgb / 12.92)

@@ -13,14 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
-from ...errors import CaptureError, FrameError
+from ...errors import CaptureError, ConfigError
 from ...types import Frame
 from .. import vocabulary
 from .base import Encoder, TextEncoder, TextFeatures
 
 REQUIRES: tuple[str, ...] = ()
 
-_STEP = 2
+_VOID = 255
+"""A value that means nothing in many class images, whether or not there are 255 classes."""
+_ASPECT_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,17 @@ class Options:
     """Where the class images are, if the capture brings none."""
 
     folder: str | None = None
-    """Folder of 8-bit class images; the last number in a file's name is the frame's. null = the capture's own."""
+    """Folder of class images, PNG with one channel. Where there is one for each frame, they are taken in order; else
+    the last number in a file's name is the frame's, counted from 0. null = the capture's own."""
     classes: str | None = None
-    """File with the class names: JSON {"classes": [...]} or one name a line; the first (value 0) means nothing."""
+    """File with the class names: JSON {"classes": [...]} or one name a line; the first (value 0) means nothing. null =
+    classes.json or classes.txt in the folder, or the capture's own."""
+    stride: int = 2
+    """Every n-th pixel of a class image is used."""
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise ConfigError(f"'stride' must be at least 1, got {self.stride}.")
 
 
 class LabelsEncoder(Encoder):
@@ -39,20 +49,42 @@ class LabelsEncoder(Encoder):
 
     name: ClassVar[str] = "labels"
 
-    def __init__(self, classes: tuple[str, ...], images: Callable[[int], NDArray[np.uint8] | None]):
+    def __init__(
+        self, classes: tuple[str, ...], images: Callable[[int], NDArray[np.integer] | None], stride: int = 2
+    ) -> None:
         self.classes = classes
         self.images = images
+        self.stride = stride
         self.dimension = len(classes) - 1
-        self._features = np.zeros((256, self.dimension), np.float16)
+        self._features = np.zeros((len(classes), self.dimension), np.float16)
         self._features[np.arange(1, len(classes)), np.arange(self.dimension)] = 1.0
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
+        """(ceil(H / stride), ceil(W / stride), D) float16; one zero feature for a frame without a class image.
+
+        A class image of another size is sampled at the pixels that show the same. Raises CaptureError for one of
+        another aspect ratio, or with a value that has no name.
+        """
         labels = self.images(frame.index)
         if labels is None:
             return np.zeros((1, 1, self.dimension), np.float16)
-        if labels.max(initial=0) > self.dimension:
-            raise CaptureError(f"The class image of frame {frame.index} has value {labels.max()}, which has no name.")
-        return self._features[labels[_STEP // 2 :: _STEP, _STEP // 2 :: _STEP]]
+        height, width = frame.color.shape[:2]
+        if abs(labels.shape[1] * height / (labels.shape[0] * width) - 1) > _ASPECT_TOLERANCE:
+            raise CaptureError(
+                f"The class image of frame {frame.index} has {labels.shape[1]} x {labels.shape[0]} pixels, the frame "
+                f"{width} x {height}: they cannot show the same view, so make it from the frame's own colour image."
+            )
+        rows, columns = (
+            _sampled(size, self.stride, own) for size, own in zip((height, width), labels.shape, strict=True)
+        )
+        sampled = labels[rows[:, None], columns].astype(np.int64)
+        sampled[(sampled == _VOID) & (len(self.classes) <= _VOID)] = 0
+        if sampled.max(initial=0) > self.dimension:
+            raise CaptureError(
+                f"The class image of frame {frame.index} has value {sampled.max()}, but only {len(self.classes)} "
+                "classes have names: complete the list of classes."
+            )
+        return self._features[sampled]
 
     def text_state(self) -> dict[str, Any]:
         return {"classes": list(self.classes)}
@@ -63,18 +95,24 @@ class LabelWords(TextEncoder):
 
     threshold = 0.5
     temperature = 0.1
+    same_word = 0.05  # classes are orthogonal: any overlap means that one word includes the other
 
     def __init__(self, classes: list[str]):
         self.classes = classes
+        shown = ", ".join(classes[1:13]) + (", …" if len(classes) > 13 else "")
+        self.knows = f"the classes that it was built with and words for them ({shown})"
 
     def encode_words(self, words: list[str]) -> TextFeatures:
         features = np.zeros((len(words), len(self.classes) - 1), np.float32)
+        attainable = np.ones(len(words), np.float32)
         understood = []
         for row, word in enumerate(words):
             matched, part = vocabulary.matching_names(word, self.classes[1:])
-            features[row, matched] = 1.0 / np.sqrt(max(len(matched), 1))
             understood.append(part)
-        return TextFeatures(features, tuple(understood))
+            if matched:
+                attainable[row] = 1.0 / np.sqrt(len(matched))
+                features[row, matched] = attainable[row]
+        return TextFeatures(features, tuple(understood), attainable)
 
     def contrast_words(self) -> list[str]:
         return self.classes[1:]
@@ -84,20 +122,32 @@ def load(options: Options, capture: Capture) -> LabelsEncoder:
     """The encoder. Raises CaptureError if there are no class images or no names for them."""
     if options.folder is None:
         classes = _read_classes(Path(options.classes)) if options.classes else capture.classes
-        if not classes or capture.labels(0) is None:
+        if len(classes) < 2 or all(capture.labels(index) is None for index in range(min(len(capture), 10))):
             raise CaptureError(
                 f"{capture.path} brings no class images with names: give them with language.labels.folder and "
-                "language.labels.classes, or use another encoder."
+                "language.labels.classes, or use another encoder, for example language.encoder=colour."
             )
-        return LabelsEncoder(tuple(classes), capture.labels)
-    if options.classes is None:
-        raise CaptureError("language.labels.folder needs language.labels.classes, a file with the classes' names.")
-    return LabelsEncoder(_read_classes(Path(options.classes)), _FolderImages(Path(options.folder)))
+        return LabelsEncoder(tuple(classes), capture.labels, options.stride)
+    folder = Path(options.folder)
+    beside = next((folder / name for name in ("classes.json", "classes.txt") if (folder / name).is_file()), None)
+    named = Path(options.classes) if options.classes else beside
+    if named is None:
+        raise CaptureError(
+            f"There is no classes.json or classes.txt in {folder}: add one, or give language.labels.classes, a file "
+            "with the classes' names."
+        )
+    return LabelsEncoder(_read_classes(named), _FolderImages(folder, len(capture)), options.stride)
 
 
 def load_text(state: dict[str, Any]) -> LabelWords:
     """The word side."""
     return LabelWords([str(name) for name in state["classes"]])
+
+
+def _sampled(size: int, stride: int, own_size: int) -> NDArray[np.int64]:
+    """Pixels along an axis of a class image of ``own_size`` at the centres of blocks of ``stride`` of ``size``."""
+    count = -(-size // stride)
+    return np.minimum(((np.arange(count) + 0.5) * own_size / count).astype(np.int64), own_size - 1)
 
 
 def _read_classes(path: Path) -> tuple[str, ...]:
@@ -106,29 +156,39 @@ def _read_classes(path: Path) -> tuple[str, ...]:
         text = path.read_text(encoding="utf-8")
         names = json.loads(text) if path.suffix == ".json" else [line for line in text.splitlines() if line.strip()]
         names = names["classes"] if isinstance(names, dict) else names
-    except (OSError, ValueError, KeyError) as error:
-        raise CaptureError(f"Cannot read the class names in {path}: {error}.") from error
-    if not isinstance(names, list) or not 2 <= len(names) <= 256:
-        raise CaptureError(f"{path} must name 2 to 256 classes, the first of which means nothing.")
-    return tuple(str(name).strip() for name in names)
+    except OSError as error:
+        raise CaptureError(f"Cannot read the class names in {path}: {error.strerror}.") from error
+    except (ValueError, KeyError) as error:
+        raise CaptureError(f'{path} must hold {{"classes": ["nothing", "name of class 1", …]}}: {error}.') from error
+    if not isinstance(names, list) or not 2 <= len(names) <= 65536 or not all(isinstance(name, str) for name in names):
+        raise CaptureError(f"{path} must name at least 2 classes, the first of which means nothing.")
+    return tuple(name.strip() for name in names)
 
 
 class _FolderImages:
-    """Class images in a folder, found by the last number in their names."""
+    """Class images in a folder, in the order of the last number in their names, or found by it."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, frames: int):
         paths = [path for path in folder.glob("*.png") if re.search(r"\d", path.stem)] if folder.is_dir() else []
-        self._paths = {int(re.findall(r"\d+", path.stem)[-1]): path for path in paths}
-        if not self._paths:
+        if not paths:
             raise CaptureError(f"There are no class images (*.png with the frame's number in the name) in {folder}.")
+        numbered = {int(re.findall(r"\d+", path.stem)[-1]): path for path in sorted(paths)}
+        if len(numbered) < len(paths):
+            raise CaptureError(f"Several class images in {folder} have the same number: keep one for each frame.")
+        in_order = len(numbered) == frames
+        self._paths = dict(enumerate(numbered[n] for n in sorted(numbered))) if in_order else numbered
 
-    def __call__(self, index: int) -> NDArray[np.uint8] | None:
+    def __call__(self, index: int) -> NDArray[np.integer] | None:
         import cv2
 
         path = self._paths.get(index)
         if path is None:
             return None
-        image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is None or image.ndim != 2 or image.dtype != np.uint8:
-            raise FrameError(f"{path} is not an 8-bit class image with one channel.")
+        try:
+            data = np.frombuffer(path.read_bytes(), np.uint8)
+        except OSError as error:
+            raise CaptureError(f"Cannot read the class image {path}: {error.strerror}.") from error
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        if image is None or image.ndim != 2:
+            raise CaptureError(f"{path} is not a class image: it must be a PNG with one channel.")
         return np.asarray(image)
