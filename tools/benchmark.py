@@ -438,14 +438,20 @@ def reconstruct_rows(figures: Figures, results: dict[str, Figures]) -> list[Row]
 
 def score_rows(figures: Figures, results: dict[str, Figures]) -> list[Row]:
     peer = results.get("slam", {}).get("ate_rmse_m")
-    asked = f"at most {100 * peer:.2f} cm, dense SLAM's" if peer is not None else ""
+    asked = f"as it is; dense SLAM's {100 * peer:.2f} cm" if peer is not None else "as it is"
     rows = [
         ("map, ATE after SE(3) alignment", f"{100 * figures['ate_rmse_m']:.2f} cm", asked),
         ("  frames with a true and an own pose", f"{figures['frames_matched']}", ""),
     ]
     if "iou" in figures:
         shares = ", ".join(f"{name} {100 * figures[name]:.1f}" for name in ("precision", "recall"))
-        rows.append(("map, IoU", f"{100 * figures['iou']:.1f} ({shares})", "65.2 on the kitchen, dense SLAM's"))
+        rows.append(
+            (
+                "map, IoU",
+                f"{100 * figures['iou']:.1f} ({shares})",
+                "as it is; 65.2 on the kitchen from dense SLAM's poses, TSDF",
+            )
+        )
     return rows
 
 
@@ -453,7 +459,7 @@ def splat_rows(figures: Figures, results: dict[str, Figures]) -> list[Row]:
     floor = figures["floor_seconds"]
     steps = ", ".join(f"{step} {1e3 * value:.0f}" for step, value in figures["steps"].items())
     return [
-        ("Gaussians to voxels", f"{figures['gaussians_per_second'] / 1e6:.2f} million/s", ""),
+        ("Gaussians to voxels", f"{figures['gaussians_per_second'] / 1e6:.2f} million/s", "at least 2"),
         ("  2 million at 8 cm", f"{1e3 * figures['seconds']:.0f} ms: {steps}", ""),
         (
             "  floor: their exponentials alone",
@@ -470,8 +476,8 @@ def splat_rows(figures: Figures, results: dict[str, Figures]) -> list[Row]:
 
 def query_rows(figures: Figures, results: dict[str, Figures]) -> list[Row]:
     return [
-        ("query from a cold start", f"{figures['cold_seconds']:.2f} s", "at most 2 s"),
-        ("query in a loaded map", f"{1e3 * figures['loaded_seconds']:.1f} ms", "at once"),
+        ("query from a cold start", f"{figures['cold_seconds']:.2f} s", "under 3 s"),
+        ("query in a loaded map", f"{1e3 * figures['loaded_seconds']:.1f} ms", "under 50 ms"),
         ("  loading with the first answer", f"{figures['first_seconds']:.2f} s", ""),
     ]
 

@@ -62,7 +62,7 @@ def _slot(table: NDArray[np.int64], key: int) -> int:
     return at
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def touched_blocks(lo: NDArray[np.int32], hi: NDArray[np.int32]) -> NDArray[np.int64]:
     """Distinct packed keys of the blocks that boxes of voxels, (N, 3) first and last index, touch; empty boxes
     (lo > hi) touch none."""

@@ -13,16 +13,18 @@ A Gaussian that the cutoff leaves out would have contributed less than exp(-cuto
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 
 from ..geometry import quats_to_rotations
 from ..registry import require_positive
 from ..types import BLOCK, Gaussians
-from .grid import build_table, find, packed_key, touched_blocks
+from .grid import build_table, find, packed_key, touched_blocks, union
 
 _SMALLEST_SCALE = 1e-5
 
@@ -73,8 +75,7 @@ def bin_gaussians(gaussians: Gaussians, origin: NDArray[np.float64], voxel_size:
     precision, extent = _precisions(gaussians.quats_wxyz.astype(np.float32), scales)
     log_weight = np.log(np.maximum(gaussians.opacities, 1e-6)) - np.log(scales).sum(axis=1)
     lo, hi = _boxes(means, extent, np.float32(cutoff))
-    packed = np.sort(touched_blocks(lo, hi))
-    start, gaussian = _sort_by_block(packed, lo, hi)
+    packed, start, gaussian = _sort_by_block(lo, hi)
     return Bins(packed, start, gaussian, means, precision, log_weight.astype(np.float32), lo, hi, cutoff)
 
 
@@ -174,33 +175,65 @@ def _boxes(
     return lo, hi
 
 
-@njit(cache=True)
 def _sort_by_block(
-    packed: NDArray[np.int64], lo: NDArray[np.int32], hi: NDArray[np.int32]
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Counting sort of the (Gaussian, block) pairs: where each block's Gaussians start, and the Gaussians."""
-    table, rows = build_table(packed)
-    start = np.zeros(len(packed) + 1, np.int64)
-    gaussian = np.empty(0, np.int32)
-    for counting in (True, False):
-        for g in range(len(lo)):
-            if lo[g, 0] > hi[g, 0] or lo[g, 1] > hi[g, 1] or lo[g, 2] > hi[g, 2]:
-                continue
-            for i in range(lo[g, 0] >> 3, (hi[g, 0] >> 3) + 1):
-                for j in range(lo[g, 1] >> 3, (hi[g, 1] >> 3) + 1):
-                    for k in range(lo[g, 2] >> 3, (hi[g, 2] >> 3) + 1):
-                        b = find(table, rows, packed_key(i, j, k))
-                        if counting:
-                            start[b + 1] += 1
-                        else:
-                            gaussian[start[b]] = g
-                            start[b] += 1  # becomes the next block's start, and is shifted back below
-        if counting:
-            start = np.cumsum(start)
-            gaussian = np.empty(start[-1], np.int32)
-    start[1:] = start[:-1].copy()
-    start[0] = 0
-    return start, gaussian
+    lo: NDArray[np.int32], hi: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
+    """Counting sort of the (Gaussian, block) pairs: the blocks' packed keys, where each block's Gaussians start, and
+    the Gaussians. Each thread sorts a part of the Gaussians; the parts keep their order, so that the result is the
+    same with any number of threads."""
+    bounds = np.linspace(0, len(lo), get_num_threads() + 1).astype(int)
+    parts = [slice(first, end) for first, end in pairwise(bounds)]
+    with ThreadPoolExecutor(len(parts)) as threads:
+        packed = union(*threads.map(lambda part: touched_blocks(lo[part], hi[part]), parts))
+        table, rows = build_table(packed)
+        count = np.stack(list(threads.map(lambda part: _count(table, rows, lo[part], hi[part], len(packed)), parts)))
+        start = np.concatenate(([0], np.cumsum(count.sum(axis=0))))
+        place = start[:-1] + np.cumsum(count, axis=0) - count  # where each part's share of each block begins
+        gaussian = np.empty(start[-1], np.int32)
+        list(
+            threads.map(
+                lambda part, at: _place(table, rows, lo[part], hi[part], part.start, at, gaussian), parts, place
+            )
+        )
+    return packed, start, gaussian
+
+
+@njit(cache=True, nogil=True)
+def _count(
+    table: NDArray[np.int64], rows: NDArray[np.int32], lo: NDArray[np.int32], hi: NDArray[np.int32], blocks: int
+) -> NDArray[np.int64]:
+    """(B,) Gaussians of this part in each block."""
+    count = np.zeros(blocks, np.int64)
+    for g in range(len(lo)):
+        if lo[g, 0] > hi[g, 0] or lo[g, 1] > hi[g, 1] or lo[g, 2] > hi[g, 2]:
+            continue
+        for i in range(lo[g, 0] >> 3, (hi[g, 0] >> 3) + 1):
+            for j in range(lo[g, 1] >> 3, (hi[g, 1] >> 3) + 1):
+                for k in range(lo[g, 2] >> 3, (hi[g, 2] >> 3) + 1):
+                    count[find(table, rows, packed_key(i, j, k))] += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _place(
+    table: NDArray[np.int64],
+    rows: NDArray[np.int32],
+    lo: NDArray[np.int32],
+    hi: NDArray[np.int32],
+    first: int,
+    place: NDArray[np.int64],
+    gaussian: NDArray[np.int32],
+) -> None:
+    """Write this part's Gaussians, numbered from ``first``, at ``place`` (B,), which is used up."""
+    for g in range(len(lo)):
+        if lo[g, 0] > hi[g, 0] or lo[g, 1] > hi[g, 1] or lo[g, 2] > hi[g, 2]:
+            continue
+        for i in range(lo[g, 0] >> 3, (hi[g, 0] >> 3) + 1):
+            for j in range(lo[g, 1] >> 3, (hi[g, 1] >> 3) + 1):
+                for k in range(lo[g, 2] >> 3, (hi[g, 2] >> 3) + 1):
+                    b = find(table, rows, packed_key(i, j, k))
+                    gaussian[place[b]] = first + g
+                    place[b] += 1
 
 
 @njit(parallel=True, cache=True)
