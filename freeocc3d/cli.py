@@ -253,7 +253,7 @@ def demo(
     print(_info_text(_info(made)))
     written = [output / "map.png"]
     pictures.map_picture(made, written[0], by="rgb")
-    results = made.query_words(["red cup", "blue chair", "green plant"])
+    results = made.query_words(["red cup", "blue chair", "green plant"], top_k=5)
     print(asking.to_text(results))
     for result in results:
         written.append(output / f"query_{result.word.replace(' ', '_')}.png")

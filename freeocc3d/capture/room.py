@@ -1,18 +1,16 @@
-"""The built-in room: furniture as triangles with a class, a colour and a procedural texture each."""
+"""The built-in room: furniture as triangles with a class and a material each, and how a surface point looks."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from itertools import pairwise
+import math
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
-SIZE = (5.2, 4.2, 2.6)
+SIZE = (5.2, 4.2, 2.5)
 """Extent of the room, metres; the world's origin is the middle of the floor, z is up."""
-
-PLAIN, WOOD, CHECKER, BOOKS, PATCHES, PLASTER = range(6)
-"""Kinds of texture."""
 
 CLASSES = (
     "nothing", "wall", "floor", "ceiling", "rug", "table", "cup", "chair", "sofa", "cushion", "bed", "pillow",
@@ -20,244 +18,382 @@ CLASSES = (
 )  # fmt: skip
 
 CUPS = {"red": (1.92, 0.14, 0.75), "yellow": (1.92, 0.26, 0.75)}
-"""Middle of each paper cup's foot, on the table."""
+"""Middle of each paper cup's foot on the table, metres, world."""
 
 CUP_HEIGHT, CUP_FOOT, CUP_RIM = 0.09, 0.028, 0.038
+"""Height and radii of a paper cup, metres."""
 
+PLAIN, WOOD, CHECKER, BOOKS, PATCHES, PLASTER, STRIPES, PAINTING = range(8)
+"""Kinds of texture."""
+
+Point = tuple[float, float, float]
 Color = tuple[int, int, int]
-_WOOD_BROWN, _DARK_WOOD, _LIGHT_WOOD = (139, 90, 43), (88, 54, 30), (196, 154, 108)
+Triangles = NDArray[np.float64]
+"""(T, 3, 3) corners, counter-clockwise seen from outside, metres, world."""
+
+_LIGHT = (0.34, -0.24, 0.91)  # unit vector towards the light; the same for all points, as of a large lamp
 
 
-@dataclass
+@dataclass(frozen=True)
+class Material:
+    """A procedural texture between two colours (RGB 0…255). scale: size of its features, metres."""
+
+    color: Color
+    texture: int = PLAIN
+    second: Color = (0, 0, 0)
+    scale: float = 0.06
+
+
+@dataclass(frozen=True)
 class Room:
-    """Triangles of all objects.
+    """All objects as T triangles.
 
-    vertices: (3 T, 3) metres, world.  Per triangle: ``class_id`` (T,), ``object_id`` (T,), ``texture`` (T,) kind,
-    ``color`` (T, 3) and ``second`` (T, 3) RGB 0…255, ``scale`` (T,) size of the texture's features in metres.
-    objects: name of each object.
+    objects: class name of each object.
+    Per triangle: triangles (T, 3, 3) float32 corners, metres, world; normals (T, 3) float32, unit, outwards;
+    class_ids (T,) uint8, index into CLASSES; object_ids (T,) int32, index into ``objects``;
+    textures (T,) int32 kinds; colors (T, 2, 3) float32, the two of its material; scales (T,) float32 metres.
     """
 
-    objects: list[str] = field(default_factory=list)
-    _parts: list[tuple[NDArray[np.float64], int, int, int, Color, Color, float]] = field(default_factory=list)
-
-    def add(
-        self,
-        name: str,
-        triangles: NDArray[np.float64],
-        color: Color,
-        texture: int = PLAIN,
-        second: Color | None = None,
-        scale: float = 0.1,
-        part_of: str | None = None,
-    ) -> None:
-        """Add (T, 3, 3) triangles of class ``name``; ``part_of`` joins them to the object added last."""
-        if part_of is None:
-            self.objects.append(name)
-        class_id = CLASSES.index(part_of or name)
-        self._parts.append((triangles, class_id, len(self.objects) - 1, texture, color, second or color, scale))
-
-    def _each(self, column: int) -> NDArray[np.generic]:
-        return np.concatenate([np.repeat([part[column]], len(part[0]), axis=0) for part in self._parts])
-
-    @property
-    def triangles(self) -> NDArray[np.float32]:
-        """(T, 3, 3) corners, counter-clockwise from outside."""
-        return np.concatenate([part[0] for part in self._parts]).astype(np.float32)
-
-    @property
-    def class_id(self) -> NDArray[np.uint8]:
-        return self._each(1).astype(np.uint8)
-
-    @property
-    def object_id(self) -> NDArray[np.int32]:
-        return self._each(2).astype(np.int32)
-
-    @property
-    def texture(self) -> NDArray[np.int32]:
-        return self._each(3).astype(np.int32)
-
-    @property
-    def color(self) -> NDArray[np.float32]:
-        return self._each(4).astype(np.float32)
-
-    @property
-    def second(self) -> NDArray[np.float32]:
-        return self._each(5).astype(np.float32)
-
-    @property
-    def scale(self) -> NDArray[np.float32]:
-        return self._each(6).astype(np.float32)
+    objects: tuple[str, ...]
+    triangles: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    class_ids: NDArray[np.uint8]
+    object_ids: NDArray[np.int32]
+    textures: NDArray[np.int32]
+    colors: NDArray[np.float32]
+    scales: NDArray[np.float32]
 
 
-def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> NDArray[np.float64]:
-    """(12, 3, 3) triangles of an axis-aligned box."""
-    x, y, z = np.stack((low, high)).T
-    quads = [
-        [(x[0], y[0], z[0]), (x[0], y[1], z[0]), (x[1], y[1], z[0]), (x[1], y[0], z[0])],
-        [(x[0], y[0], z[1]), (x[1], y[0], z[1]), (x[1], y[1], z[1]), (x[0], y[1], z[1])],
-        [(x[0], y[0], z[0]), (x[1], y[0], z[0]), (x[1], y[0], z[1]), (x[0], y[0], z[1])],
-        [(x[0], y[1], z[0]), (x[0], y[1], z[1]), (x[1], y[1], z[1]), (x[1], y[1], z[0])],
-        [(x[0], y[0], z[0]), (x[0], y[0], z[1]), (x[0], y[1], z[1]), (x[0], y[1], z[0])],
-        [(x[1], y[0], z[0]), (x[1], y[1], z[0]), (x[1], y[1], z[1]), (x[1], y[0], z[1])],
-    ]
-    return np.array([(quad[0], quad[i], quad[i + 1]) for quad in quads for i in (1, 2)])
+class _Builder:
+    """Collects objects, each made of parts of one material."""
+
+    def __init__(self) -> None:
+        self._objects: list[str] = []
+        self._parts: list[tuple[int, Triangles, Material]] = []
+
+    def add(self, name: str, *parts: tuple[Triangles, Material]) -> None:
+        """Add one object of class ``name``."""
+        self._objects.append(name)
+        self._parts += [(len(self._objects) - 1, triangles, material) for triangles, material in parts]
+
+    def build(self) -> Room:
+        counts = [len(triangles) for _, triangles, _ in self._parts]
+        materials = [material for _, _, material in self._parts]
+        corners = np.concatenate([triangles for _, triangles, _ in self._parts])
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        object_ids = np.repeat([number for number, _, _ in self._parts], counts)
+        return Room(
+            tuple(self._objects),
+            corners.astype(np.float32),
+            normals.astype(np.float32),
+            np.array([CLASSES.index(name) for name in self._objects], np.uint8)[object_ids],
+            object_ids.astype(np.int32),
+            np.repeat([m.texture for m in materials], counts).astype(np.int32),
+            np.repeat([(m.color, m.second) for m in materials], counts, axis=0).astype(np.float32),
+            np.repeat([m.scale for m in materials], counts).astype(np.float32),
+        )
 
 
-def lathe(middle: tuple[float, float], profile: list[tuple[float, float]], sides: int = 24) -> NDArray[np.float64]:
-    """Triangles of a surface of revolution about a vertical axis; profile: (radius, height) from bottom to top."""
+def quad(corner: ArrayLike, u: ArrayLike, v: ArrayLike) -> Triangles:
+    """(2, 3, 3) a parallelogram from its corner and two edges; it faces along u x v."""
+    a, b, d = np.asarray(corner), np.add(corner, u), np.add(corner, v)
+    c = np.add(b, v)
+    return np.array([(a, b, c), (a, c, d)])
+
+
+def box(low: ArrayLike, high: ArrayLike) -> Triangles:
+    """(12, 3, 3) an axis-aligned box."""
+    x, y, z = np.diag(np.subtract(high, low))
+    at_low = [quad(low, y, x), quad(low, x, z), quad(low, z, y)]
+    at_high = [quad(high, -x, -y), quad(high, -z, -x), quad(high, -y, -z)]
+    return np.concatenate(at_low + at_high)
+
+
+def legs(low: tuple[float, float], high: tuple[float, float], top: float, width: float) -> Triangles:
+    """Four square legs below the corners of a rectangle."""
+    at = [(x, y) for x in (low[0], high[0] - width) for y in (low[1], high[1] - width)]
+    return np.concatenate([box((x, y, 0), (x + width, y + width, top)) for x, y in at])
+
+
+def lathe(middle: tuple[float, float], profile: list[tuple[float, float]], sides: int = 24) -> Triangles:
+    """A surface of revolution about a vertical axis. profile: (radius, height) of its rings, walked so that the outside
+    lies to the right (upwards on the outer side of a cup, then downwards on its inner side)."""
     angles = np.linspace(0, 2 * np.pi, sides + 1)
-    ring = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    circle = np.stack((np.cos(angles), np.sin(angles), 0 * angles), axis=1)
+    rings = [np.array((*middle, z)) + r * circle for r, z in profile]
     triangles = []
-    for (r0, z0), (r1, z1) in pairwise(profile):
-        for i in range(sides):
-            a, b = (np.array((*(middle + r0 * ring[j]), z0)) for j in (i, i + 1))
-            c, d = (np.array((*(middle + r1 * ring[j]), z1)) for j in (i, i + 1))
-            triangles += [(a, b, d)] * (r0 > 0) + [(a, d, c)] * (r1 > 0)  # a point is no edge
-    return np.array(triangles)
+    for (r0, _), (r1, _), lower, upper in zip(profile[:-1], profile[1:], rings[:-1], rings[1:], strict=True):
+        if r0 > 0:
+            triangles.append(np.stack((lower[:-1], lower[1:], upper[1:]), axis=1))
+        if r1 > 0:
+            triangles.append(np.stack((lower[:-1], upper[1:], upper[:-1]), axis=1))
+    return np.concatenate(triangles)
+
+
+_BROWN_WOOD = Material((142, 94, 50), WOOD, (104, 66, 36), 0.07)
+_DARK_WOOD = Material((88, 56, 34), WOOD, (60, 37, 22), 0.06)
+_LIGHT_WOOD = Material((204, 168, 120), WOOD, (172, 132, 88), 0.10)
+_WHITE_PAINT = Material((246, 246, 242), PLASTER, (222, 222, 218), 0.05)
+_WHITE_CLOTH = Material((238, 236, 230), PLASTER, (208, 205, 198), 0.05)
+_METAL = Material((82, 83, 88), PLASTER, (62, 63, 68), 0.04)
 
 
 def furnished() -> Room:
     """The room with everything in it."""
-    room = Room()
+    room = _Builder()
     _shell(room)
     _table_and_cups(room)
-    _chair(room, (1.95, -0.85), (35, 80, 190))
-    _chair(room, (1.95, 1.30), (40, 140, 60))
+    _chair(room, (2.06, -0.72), (0, -1), Material((36, 82, 196)))
+    _chair(room, (2.06, 1.20), (0, 1), Material((40, 146, 62)))
+    _chair(room, (2.27, -1.76), (0, -1), _LIGHT_WOOD)
     _sofa(room)
     _bed(room)
     _storage(room)
     _television(room)
     _small_things(room)
     _on_the_walls(room)
-    return room
+    return room.build()
 
 
-def _shell(room: Room) -> None:
+def _shell(room: _Builder) -> None:
     x, y, z = SIZE[0] / 2, SIZE[1] / 2, SIZE[2]
-    t = 0.1
-    room.add("floor", box((-x, -y, -t), (x, y, 0)), (176, 136, 92), WOOD, (140, 102, 66), 0.12)
-    room.add("ceiling", box((-x, -y, z), (x, y, z + t)), (236, 234, 228), PLASTER, (214, 212, 206), 0.25)
-    walls = [
-        ((-x - t, -y, 0), (-x, y, z)),
-        ((x, -y, 0), (x + t, y, z)),
-        ((-x, -y - t, 0), (x, -y, z)),
-        ((-x, y, 0), (x, y + t, z)),
-    ]
-    tints = [(226, 222, 210), (214, 220, 226), (228, 216, 204), (218, 226, 214)]
-    for (low, high), tint in zip(walls, tints, strict=True):
-        shadow: Color = (tint[0] - 30, tint[1] - 30, tint[2] - 30)
-        room.add("wall", box(low, high), tint, PLASTER, shadow, 0.22)
-    room.add("rug", box((-1.0, -0.7, 0), (1.0, 0.7, 0.012)), (52, 74, 128), CHECKER, (222, 210, 182), 0.16)
-
-
-def _legs(low: tuple[float, float], high: tuple[float, float], top: float, w: float) -> NDArray[np.float64]:
-    return np.concatenate(
-        [box((x, y, 0), (x + w, y + w, top)) for x in (low[0], high[0] - w) for y in (low[1], high[1] - w)]
+    along_x, along_y, up = (2 * x, 0.0, 0.0), (0.0, 2 * y, 0.0), (0.0, 0.0, z)
+    room.add("floor", (quad((-x, -y, 0), along_x, along_y), Material((186, 146, 102), WOOD, (152, 112, 74), 0.12)))
+    ceiling = Material((240, 238, 232), PLASTER, (220, 218, 212), 0.25)
+    room.add("ceiling", (quad((-x, -y, z), along_y, along_x), ceiling))
+    d, h = 0.015, 0.09  # the skirting board's thickness and height
+    walls = (
+        ((-x, -y, 0), along_y, up, box((-x, -y, 0), (-x + d, y, h)), (232, 226, 208), (206, 200, 184), PLASTER),
+        ((x, -y, 0), up, along_y, box((x - d, -y, 0), (x, y, h)), (212, 222, 232), (188, 202, 218), STRIPES),
+        ((-x, -y, 0), up, along_x, box((-x, -y, 0), (x, -y + d, h)), (236, 222, 210), (210, 196, 184), PLASTER),
+        ((-x, y, 0), along_x, up, box((-x, y - d, 0), (x, y, h)), (222, 230, 216), (198, 206, 192), PLASTER),
     )
+    for corner, u, v, skirting, color, second, texture in walls:
+        room.add("wall", (quad(corner, u, v), Material(color, texture, second, 0.16)), (skirting, _WHITE_PAINT))
+    rug = Material((150, 44, 60), CHECKER, (226, 212, 182), 0.16)
+    room.add("rug", (box((-2.35, -0.38, 0), (-1.0, 0.66, 0.012)), rug))
 
 
-def _table_and_cups(room: Room) -> None:
+def _table_and_cups(room: _Builder) -> None:
     low, high = (1.65, -0.45), (2.45, 0.95)
-    room.add("table", box((*low, 0.71), (*high, 0.75)), _WOOD_BROWN, WOOD, _DARK_WOOD, 0.07)
-    room.add("legs", _legs(low, high, 0.71, 0.06), _DARK_WOOD, WOOD, (70, 44, 24), 0.05, part_of="table")
-    colors: dict[str, Color] = {"red": (205, 28, 34), "yellow": (238, 200, 30)}
+    room.add("table", (box((*low, 0.71), (*high, 0.75)), _BROWN_WOOD), (legs(low, high, 0.71, 0.06), _DARK_WOOD))
+    colors = {"red": (208, 26, 32), "yellow": (242, 204, 28)}
     for name, (x, y, z) in CUPS.items():
         outside = [(0.0, z), (CUP_FOOT, z), (CUP_RIM, z + CUP_HEIGHT)]
         inside = [(CUP_RIM - 0.002, z + CUP_HEIGHT), (CUP_FOOT - 0.002, z + 0.004), (0.0, z + 0.004)]
-        room.add("cup", lathe((x, y), outside + inside), colors[name], PLAIN, scale=0.02)
+        room.add("cup", (lathe((x, y), outside + inside), Material(colors[name], scale=0.02)))
 
 
-def _chair(room: Room, middle: tuple[float, float], color: Color) -> None:
+def _chair(room: _Builder, middle: tuple[float, float], back: tuple[int, int], material: Material) -> None:
+    """back: the side of the seat on which the back stands, a unit vector along x or y."""
     x, y = middle
-    seat_low, seat_high = (x - 0.21, y - 0.21), (x + 0.21, y + 0.21)
-    room.add("chair", box((*seat_low, 0.42), (*seat_high, 0.47)), color, PLAIN, scale=0.06)
-    room.add("legs", _legs(seat_low, seat_high, 0.42, 0.04), color, PLAIN, scale=0.06, part_of="chair")
-    room.add("back", box((x + 0.17, y - 0.21, 0.47), (x + 0.21, y + 0.21, 0.92)), color, part_of="chair", scale=0.06)
+    low, high = (x - 0.21, y - 0.21), (x + 0.21, y + 0.21)
+    bx, by = x + 0.19 * back[0], y + 0.19 * back[1]
+    wx, wy = (0.02, 0.21) if back[0] else (0.21, 0.02)
+    seat, rest = box((*low, 0.42), (*high, 0.47)), box((bx - wx, by - wy, 0.47), (bx + wx, by + wy, 0.92))
+    room.add("chair", (np.concatenate([seat, rest, legs(low, high, 0.42, 0.04)]), material))
 
 
-def _sofa(room: Room) -> None:
-    white = (232, 229, 222)
-    room.add("sofa", box((-0.75, 1.30, 0.08), (0.95, 2.05, 0.42)), white, PLASTER, (206, 202, 194), 0.05)
-    for low, high in (
-        ((-0.75, 1.85, 0.42), (0.95, 2.08, 0.85)),
-        ((-0.95, 1.30, 0.05), (-0.75, 2.05, 0.62)),
-        ((0.95, 1.30, 0.05), (1.15, 2.05, 0.62)),
-    ):
-        room.add("part", box(low, high), white, PLASTER, (206, 202, 194), 0.05, part_of="sofa")
-    room.add("cushion", box((-0.6, 1.62, 0.42), (-0.2, 1.82, 0.78)), (232, 120, 28), PLAIN, scale=0.05)
-    room.add("cushion", box((0.45, 1.62, 0.42), (0.85, 1.82, 0.78)), (120, 50, 150), PLAIN, scale=0.05)
+def _sofa(room: _Builder) -> None:
+    seat, back = box((-0.75, 1.30, 0.05), (0.95, 2.05, 0.42)), box((-0.75, 1.84, 0.42), (0.95, 2.08, 0.85))
+    arms = [box((x, 1.30, 0.05), (x + 0.2, 2.08, 0.62)) for x in (-0.95, 0.95)]
+    room.add("sofa", (np.concatenate([seat, back, *arms]), _WHITE_CLOTH))
+    room.add("cushion", (box((-0.60, 1.68, 0.42), (-0.20, 1.84, 0.78)), Material((236, 122, 26))))
+    room.add("cushion", (box((0.45, 1.68, 0.42), (0.85, 1.84, 0.78)), Material((122, 50, 156))))
 
 
-def _bed(room: Room) -> None:
-    room.add("bed", box((-2.55, -1.6, 0.1), (-1.05, -0.5, 0.42)), _LIGHT_WOOD, WOOD, _WOOD_BROWN, 0.08)
-    mattress = box((-2.5, -1.56, 0.42), (-1.08, -0.54, 0.55))
-    room.add("mattress", mattress, (70, 150, 190), CHECKER, (220, 232, 238), 0.11, part_of="bed")
-    room.add("board", box((-2.6, -1.6, 0.1), (-2.53, -0.5, 0.95)), _LIGHT_WOOD, WOOD, _WOOD_BROWN, 0.08, part_of="bed")
-    room.add("pillow", box((-2.48, -1.35, 0.55), (-2.12, -0.75, 0.66)), (240, 238, 236), PLASTER, (214, 212, 212), 0.04)
+def _bed(room: _Builder) -> None:
+    cover = Material((74, 156, 200), CHECKER, (226, 236, 242), 0.12)
+    room.add(
+        "bed",
+        (box((-2.53, -1.62, 0.10), (-1.05, -0.50, 0.42)), _LIGHT_WOOD),
+        (box((-2.50, -1.58, 0.42), (-1.08, -0.54, 0.55)), cover),
+        (box((-2.59, -1.62, 0.0), (-2.53, -0.50, 0.95)), _LIGHT_WOOD),
+        (legs((-2.50, -1.60), (-1.10, -0.52), 0.10, 0.08), _LIGHT_WOOD),
+    )
+    room.add("pillow", (box((-2.48, -1.35, 0.55), (-2.12, -0.75, 0.66)), _WHITE_CLOTH))
 
 
-def _storage(room: Room) -> None:
-    room.add("wardrobe", box((-2.58, 0.75, 0), (-2.0, 2.05, 2.0)), _LIGHT_WOOD, WOOD, (164, 122, 78), 0.10)
-    for y in (1.34, 1.44):
-        handle = box((-2.0, y, 0.9), (-1.97, y + 0.02, 1.15))
-        room.add("handle", handle, (60, 60, 62), PLAIN, part_of="wardrobe", scale=0.03)
-    low, high = (0.35, -2.08), (1.35, -1.78)
-    for z in (0.02, 0.42, 0.82, 1.22, 1.62):
-        board = box((*low, z), (*high, z + 0.03))
-        joined = "bookshelf" if z > 0.02 else None
-        room.add(
-            "bookshelf" if joined is None else "board", board, _DARK_WOOD, WOOD, (60, 36, 20), 0.06, part_of=joined
-        )
-        if z < 1.6:
-            books = box((low[0] + 0.04, -2.06, z + 0.03), (high[0] - 0.12, -1.84, z + 0.3))
-            room.add("books", books, (160, 60, 50), BOOKS, (40, 70, 120), 0.045, part_of="bookshelf")
-    for x in (low[0], high[0] - 0.03):
-        side = box((x, low[1], 0), (x + 0.03, high[1], 1.65))
-        room.add("side", side, _DARK_WOOD, WOOD, (60, 36, 20), 0.06, part_of="bookshelf")
-    room.add("box", box((1.55, -2.0, 0), (2.0, -1.65, 0.35)), (30, 150, 150), PLAIN, scale=0.05)
+def _storage(room: _Builder) -> None:
+    handles = np.concatenate([box((-1.98, y, 0.9), (-1.95, y + 0.02, 1.15)) for y in (1.34, 1.44)])
+    gap = box((-1.98, 1.39, 0.06), (-1.978, 1.41, 1.96))
+    doors = box((-2.59, 0.75, 0), (-1.98, 2.05, 2.0))
+    room.add("wardrobe", (doors, _LIGHT_WOOD), (handles, _METAL), (gap, _METAL))
+    boards = [box((0.35, -2.09, z), (1.35, -1.78, z + 0.03)) for z in (0.02, 0.42, 0.82, 1.22, 1.62)]
+    sides = [box((x, -2.09, 0), (x + 0.03, -1.78, 1.65)) for x in (0.35, 1.32)]
+    books = [
+        box((0.40, -2.06, z + 0.03), (0.40 + length, -1.83, z + 0.03 + height))
+        for z, length, height in ((0.02, 0.86, 0.30), (0.42, 0.70, 0.27), (0.82, 0.88, 0.29), (1.22, 0.62, 0.25))
+    ]
+    spines = Material((176, 62, 50), BOOKS, (44, 86, 140), 0.045)
+    room.add("bookshelf", (np.concatenate(boards + sides), _DARK_WOOD), (np.concatenate(books), spines))
+    room.add("box", (box((1.55, -2.0, 0), (1.98, -1.62, 0.35)), Material((28, 156, 156))))
 
 
-def _television(room: Room) -> None:
-    room.add("tv stand", box((-0.95, -2.05, 0), (0.15, -1.65, 0.45)), (120, 78, 46), WOOD, (94, 58, 32), 0.07)
-    room.add("television", box((-0.9, -1.95, 0.52), (0.1, -1.90, 1.10)), (14, 14, 16), PATCHES, (34, 40, 60), 0.18)
-    room.add("foot", box((-0.55, -1.98, 0.45), (-0.25, -1.82, 0.52)), (20, 20, 22), part_of="television")
+def _television(room: _Builder) -> None:
+    room.add("tv stand", (box((-0.95, -2.05, 0), (0.15, -1.65, 0.45)), _BROWN_WOOD))
+    room.add(
+        "television",
+        (box((-0.90, -1.95, 0.53), (0.10, -1.90, 1.10)), Material((13, 13, 15), PATCHES, (36, 40, 56), 0.2)),
+        (box((-0.55, -1.99, 0.45), (-0.25, -1.82, 0.53)), _METAL),
+    )
 
 
-def _small_things(room: Room) -> None:
-    stand = [(0.0, 0.0), (0.14, 0.0), (0.14, 0.03), (0.015, 0.04), (0.015, 1.35)]
-    room.add("lamp", lathe((-1.35, -1.85), stand), (70, 70, 74))
-    shade = [(0.20, 1.30), (0.13, 1.62), (0.0, 1.62)]
-    room.add("shade", lathe((-1.35, -1.85), shade), (240, 222, 150), PLASTER, (222, 200, 120), 0.06, part_of="lamp")
+def _small_things(room: _Builder) -> None:
+    stand = [(0.0, 0.0), (0.14, 0.0), (0.14, 0.03), (0.015, 0.04), (0.015, 1.32)]
+    hood = [(0.0, 1.32), (0.19, 1.32), (0.20, 1.30), (0.13, 1.62), (0.0, 1.62)]
+    cloth = Material((246, 226, 160), PLASTER, (228, 204, 128), 0.06)
+    room.add("lamp", (lathe((-1.35, -1.85), stand), _METAL), (lathe((-1.35, -1.85), hood), cloth))
+    clay = Material((190, 100, 62), PLASTER, (164, 82, 50), 0.04)
+    leaf = Material((48, 134, 52), PATCHES, (22, 84, 30), 0.05)
     pot = [(0.0, 0.0), (0.12, 0.0), (0.16, 0.30), (0.14, 0.30), (0.13, 0.26), (0.0, 0.26)]
-    room.add("plant", lathe((-1.45, 1.75), pot), (186, 96, 58), PLASTER, (160, 78, 46), 0.04)
-    for radius, low, high in ((0.24, 0.30, 0.62), (0.20, 0.52, 0.86), (0.14, 0.78, 1.08)):
-        middle = 0.5 * (low + high)
-        leaves = [(0.0, low), (0.6 * radius, low + 0.06), (radius, middle), (0.6 * radius, high - 0.05), (0.0, high)]
-        room.add(
-            "leaves", lathe((-1.45, 1.75), leaves, 14), (44, 124, 48), PATCHES, (24, 82, 30), 0.05, part_of="plant"
-        )
+    crown = [
+        lathe((-1.45, 1.75), [(0.0, z), (0.6 * r, z + 0.06), (r, z + 0.17), (0.6 * r, z + 0.28), (0.0, z + 0.33)], 14)
+        for r, z in ((0.24, 0.30), (0.20, 0.52), (0.14, 0.76))
+    ]
+    room.add("plant", (lathe((-1.45, 1.75), pot), clay), (np.concatenate(crown), leaf))
     can = [(0.0, 0.0), (0.12, 0.0), (0.15, 0.36), (0.14, 0.36), (0.11, 0.02), (0.0, 0.02)]
-    room.add("trash can", lathe((1.60, 1.80), can), (96, 98, 104), PLASTER, (76, 78, 84), 0.05)
+    room.add("trash can", (lathe((1.60, 1.80), can), _METAL))
 
 
-def _on_the_walls(room: Room) -> None:
+def _on_the_walls(room: _Builder) -> None:
     x, y = SIZE[0] / 2, SIZE[1] / 2
-    room.add("picture", box((x - 0.03, -0.35, 1.25), (x, 0.35, 1.80)), (190, 70, 50), PATCHES, (50, 90, 160), 0.12)
-    room.add("picture", box((x - 0.03, 0.75, 1.20), (x, 1.30, 1.90)), (230, 190, 90), PATCHES, (60, 110, 80), 0.10)
+    _picture(room, (x - 0.02, -0.35, 1.25), (x, 0.35, 1.80), (196, 72, 48), (52, 92, 168), 0.22)
+    _picture(room, (x - 0.02, 0.75, 1.20), (x, 1.30, 1.90), (234, 192, 84), (56, 112, 84), 0.17)
+    _picture(room, (-x, -1.45, 1.30), (-x + 0.02, -0.65, 1.85), (80, 152, 184), (232, 150, 116), 0.20)
+    _picture(room, (-0.75, -y, 1.35), (-0.05, -y + 0.02, 1.85), (152, 58, 118), (242, 222, 148), 0.18)
+    panels = [box((-x + 0.04, a, c), (-x + 0.05, a + 0.30, c + 0.75)) for a in (-0.18, 0.22) for c in (0.2, 1.12)]
+    leaf = Material((168, 112, 68), WOOD, (136, 86, 50), 0.10)
     room.add(
-        "picture", box((-x, -1.45, 1.30), (-x + 0.03, -0.65, 1.85)), (80, 150, 180), PATCHES, (230, 150, 120), 0.13
+        "door",
+        (box((-x, -0.25, 0), (-x + 0.04, 0.60, 2.05)), leaf),
+        (np.concatenate(panels), _BROWN_WOOD),
+        (box((-x + 0.04, 0.53, 0.98), (-x + 0.10, 0.57, 1.02)), Material((206, 190, 110))),
     )
-    room.add(
-        "picture", box((-0.75, -y, 1.35), (-0.05, -y + 0.03, 1.85)), (150, 60, 120), PATCHES, (240, 220, 150), 0.11
-    )
-    room.add("door", box((-x, -0.25, 0), (-x + 0.04, 0.60, 2.05)), (150, 98, 58), WOOD, (118, 74, 42), 0.12)
-    room.add("knob", box((-x + 0.04, 0.48, 1.0), (-x + 0.09, 0.54, 1.05)), (190, 180, 120), part_of="door", scale=0.03)
-    room.add("window", box((-0.5, y - 0.03, 1.15), (0.9, y, 2.1)), (168, 206, 236), PATCHES, (214, 232, 246), 0.3)
-    for low, high in (
-        ((-0.56, y - 0.05, 1.09), (0.96, y, 1.15)),
-        ((-0.56, y - 0.05, 2.10), (0.96, y, 2.16)),
-        ((-0.56, y - 0.05, 1.09), (-0.50, y, 2.16)),
-        ((0.90, y - 0.05, 1.09), (0.96, y, 2.16)),
-        ((0.17, y - 0.05, 1.15), (0.23, y, 2.10)),
-    ):
-        room.add("frame", box(low, high), (244, 244, 240), PLASTER, (220, 220, 216), 0.05, part_of="window")
+    sky = Material((150, 196, 236), PATCHES, (232, 240, 248), 0.3)
+    bars = [
+        *(box((-0.56, y - 0.05, z), (0.96, y, z + 0.06)) for z in (1.09, 2.10)),
+        *(box((x, y - 0.05, 1.15), (x + 0.06, y, 2.10)) for x in (-0.56, 0.17, 0.90)),
+    ]
+    room.add("window", (box((-0.5, y - 0.02, 1.15), (0.9, y, 2.1)), sky), (np.concatenate(bars), _WHITE_PAINT))
+
+
+def _picture(room: _Builder, low: Point, high: Point, color: Color, second: Color, scale: float) -> None:
+    """A painting in a frame 3 cm wide; the canvas stands 5 mm out of it in front and behind, so it fits any wall."""
+    extent = np.subtract(high, low)
+    inset = np.where(extent == extent.min(), -0.005, 0.03)
+    canvas = box(np.add(low, inset), np.subtract(high, inset))
+    room.add("picture", (box(low, high), _DARK_WOOD), (canvas, Material(color, PAINTING, second, scale)))
+
+
+@njit(nogil=True, cache=True)  # on one core: frames are read ahead while the tracker works on the others
+def shade(
+    points: NDArray[np.float32],
+    triangle: NDArray[np.int32],
+    footprint: NDArray[np.float32],
+    textures: NDArray[np.int32],
+    colors: NDArray[np.float32],
+    scales: NDArray[np.float32],
+    normals: NDArray[np.float32],
+) -> NDArray[np.uint8]:
+    """(P, 3) RGB of P surface points: a mix of the two colours of their triangle's material, times a fixed light, so
+    that a point looks the same from everywhere. Detail finer than a pixel fades out.
+
+    points: (P, 3) metres, world.  triangle: (P,) its row in the arrays of ``Room``, -1 = nothing, which is black.
+    footprint: (P,) metres of surface that a pixel covers.
+    """
+    image = np.zeros((len(points), 3), np.uint8)
+    for p in range(len(points)):
+        t = triangle[p]
+        if t < 0:
+            continue
+        x, y, z = float(points[p, 0]), float(points[p, 1]), float(points[p, 2])
+        scale, pixel = float(scales[t]), float(footprint[p])
+        fade = min(1.0, scale / (3.0 * pixel + 1e-6))
+        mix = _texture(textures[t], x, y, z, normals[t], scale, pixel)
+        mix = 0.5 + (mix - 0.5) * fade if textures[t] != PLAIN else 0.0
+        coarse = _noise(x / (0.35 * scale), y / (0.35 * scale), z / (0.35 * scale), 23) - 0.5
+        fine = _noise(x / 0.013, y / 0.013, z / 0.013, 29) - 0.5
+        grain = 0.14 * coarse * min(1.0, 0.35 * scale / (2.0 * pixel)) + 0.10 * fine * min(1.0, 0.013 / (2.0 * pixel))
+        light = _lighting(x, y, z, normals[t])
+        for channel in range(3):
+            value = colors[t, 0, channel] + mix * (colors[t, 1, channel] - colors[t, 0, channel])
+            value = (value * (1.0 + grain) + 24.0 * grain) * light
+            image[p, channel] = np.uint8(min(max(value, 0.0), 255.0))
+    return image
+
+
+@njit(cache=True)
+def _texture(kind: int, x: float, y: float, z: float, normal: NDArray[np.float32], scale: float, pixel: float) -> float:
+    """Place between a material's two colours, mostly in 0…1."""
+    # Two coordinates on the surface: those that are not along its normal.
+    nx, ny, nz = abs(normal[0]), abs(normal[1]), abs(normal[2])
+    if nz >= nx and nz >= ny:
+        a, b = x, y
+    elif nx >= ny:
+        a, b = y, z
+    else:
+        a, b = x, z
+    if kind == WOOD:
+        wobble = _noise(a / (6 * scale), b / (2 * scale), 0.5, 3)
+        grain = math.sin(2 * math.pi * (b / scale + 1.5 * wobble))
+        return 0.1 + 0.15 * grain + 0.4 * wobble + 0.5 * _bands(b, 3 * scale, 0, pixel)
+    if kind == CHECKER:
+        wave = math.sin(math.pi * a / scale) * math.sin(math.pi * b / scale)
+        return min(max(0.5 + wave * scale / (math.pi * pixel + 1e-6), 0.0), 1.0)  # edges one pixel soft
+    if kind == BOOKS:  # each its own colour, between the two and beyond
+        return 1.6 * _bands(a, scale, math.floor(z / 0.4), pixel) - 0.3
+    if kind == PATCHES:
+        return 1.5 * _noise(a / scale, b / scale, 0.5, 11) - 0.25
+    if kind == PLASTER:
+        return _noise(x / scale, y / scale, z / scale, 17)
+    if kind == STRIPES:
+        return _bands(a, scale, 1, pixel)
+    if kind == PAINTING:  # flat areas of five tones
+        return 0.35 * math.floor(5.0 * _noise(a / scale, b / scale, 0.5, 31)) - 0.2
+    return 0.0
+
+
+@njit(cache=True)
+def _bands(a: float, width: float, row: int, pixel: float) -> float:
+    """Bands across ``a``, each of its own tone in 0…1: none can be taken for the next. Edges are a pixel soft."""
+    edge = math.floor(a / width + 0.5)
+    before, after = _hash(edge - 1, row, 7, 5), _hash(edge, row, 7, 5)
+    return before + (after - before) * min(max((a - edge * width) / (pixel + 1e-6) + 0.5, 0.0), 1.0)
+
+
+@njit(cache=True)
+def _lighting(x: float, y: float, z: float, normal: NDArray[np.float32]) -> float:
+    """Ambient and Lambertian light in 0…1, darker near the room's edges, where less of the room is open to a point."""
+    lambert = normal[0] * _LIGHT[0] + normal[1] * _LIGHT[1] + normal[2] * _LIGHT[2]
+    light = 0.87 + 0.13 * lambert
+    to_walls = (SIZE[0] / 2 - abs(x), SIZE[1] / 2 - abs(y), min(z, SIZE[2] - z))
+    for axis in range(3):
+        if abs(normal[axis]) < 0.9:  # a surface is not darkened by the wall that it is, or lies on
+            light *= 1.0 - 0.22 * math.exp(-max(to_walls[axis], 0.0) / 0.15)
+    return light
+
+
+@njit(cache=True)
+def _hash(i: int, j: int, k: int, seed: int) -> float:
+    """A number in 0…1 for each lattice point."""
+    h = (i * 374761393 + j * 668265263 + k * 2147483647 + seed * 1274126177) & 0xFFFFFFFF
+    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
+    h = ((h ^ (h >> 16)) * 2246822519) & 0xFFFFFFFF
+    return float((h ^ (h >> 15)) & 0xFFFF) / 65535.0
+
+
+@njit(cache=True)
+def _noise(x: float, y: float, z: float, seed: int) -> float:
+    """Value noise in 0…1: lattice numbers, interpolated smoothly."""
+    i, j, k = math.floor(x), math.floor(y), math.floor(z)
+    u, v, w = x - i, y - j, z - k
+    u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
+    total = 0.0
+    for a in range(2):
+        for b in range(2):
+            for c in range(2):
+                weight = (u if a else 1 - u) * (v if b else 1 - v) * (w if c else 1 - w)
+                total += weight * _hash(i + a, j + b, k + c, seed)
+    return total
