@@ -76,7 +76,9 @@ class ConsoleProgress(Progress):
 @app.callback(invoke_without_command=True)
 def _options(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error; also after a command.")
+    ] = False,
 ) -> None:
     if version:
         print(__version__)
@@ -115,6 +117,7 @@ def query(
     threshold: Annotated[float | None, typer.Option("--threshold", help="Least similarity, 0…1.")] = None,
     ply: Annotated[Path | None, typer.Option("--ply", help="Write the map as PLY, matches coloured.")] = None,
     picture: Annotated[Path | None, typer.Option("--picture", help="Write a picture, matches coloured (PNG).")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Ask a map where something is."""
     from . import query as asking
@@ -130,11 +133,11 @@ def query(
     if ply is not None:
         from .export.ply import write_query_ply
 
-        write_query_ply(loaded.occupancy, results, ply)
+        write_query_ply(loaded.occupancy, results, ply, overwrite)
     if picture is not None:
         from .viewer import pictures
 
-        pictures.query_picture(loaded, results, picture)
+        pictures.query_picture(loaded, results, picture, overwrite)
     if as_json:
         print(json.dumps(asking.to_json(map_path, results)))
     else:
@@ -172,6 +175,7 @@ def view(
     picture: Annotated[Path, typer.Option("--picture", help="PNG file to write.")],
     word: Annotated[str | None, typer.Option("--query", metavar="WORD", help="Show what matches a word.")] = None,
     by: Annotated[str, typer.Option("--by", help="Colour by rgb, class or height.")] = "rgb",
+    overwrite: Overwrite = False,
 ) -> None:
     """Draw a map from above and from a corner."""
     from .store import load_map
@@ -179,9 +183,9 @@ def view(
 
     loaded = load_map(map_path)
     if word is None:
-        pictures.map_picture(loaded, picture, by=by)
+        pictures.map_picture(loaded, picture, by, overwrite)
     else:
-        pictures.query_picture(loaded, loaded.query_words([word]), picture)
+        pictures.query_picture(loaded, loaded.query_words([word]), picture, overwrite)
     print(picture)
 
 
@@ -252,12 +256,12 @@ def demo(
         progress.close()
     print(_info_text(_info(made)))
     written = [output / "map.png"]
-    pictures.map_picture(made, written[0], by="rgb")
+    pictures.map_picture(made, written[0], overwrite=overwrite)
     results = made.query_words(["red cup", "blue chair", "green plant"], top_k=5)
     print(asking.to_text(results))
     for result in results:
         written.append(output / f"query_{result.word.replace(' ', '_')}.png")
-        pictures.query_picture(made, [result], written[-1])
+        pictures.query_picture(made, [result], written[-1], overwrite)
     print("pictures: " + ", ".join(str(path) for path in written))
 
 
@@ -309,12 +313,13 @@ def _info_text(facts: dict[str, Any]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command; a known error is one line on stderr and exit code 1."""
+    """Run the command; a known error is one line on stderr and exit code 1, or with --debug its traceback."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in arguments
     try:
-        app(args=arguments, prog_name="freeocc3d")
+        app(args=[argument for argument in arguments if argument != "--debug"], prog_name="freeocc3d")
     except FreeOccError as error:
-        if "--debug" in arguments:
+        if debug:
             raise
         print(f"freeocc3d: {' '.join(str(error).split())}", file=sys.stderr)
         raise SystemExit(1) from None

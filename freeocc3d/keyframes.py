@@ -1,5 +1,5 @@
 """Keyframes on disk: colour (JPEG), depth (16-bit PNG, millimetres) and intrinsics, enough to build every later layer
-without the capture. They are written while the camera is tracked and read one at a time, so that memory stays flat."""
+without the capture. They are written while the camera is tracked, and read one at a time."""
 
 from __future__ import annotations
 
@@ -37,11 +37,6 @@ class Keyframes(Sequence[Frame]):
             raise MapError(f"Cannot read the keyframes' index {folder / INDEX}: {error}.") from error
         return keyframes
 
-    @property
-    def frame_indices(self) -> list[int]:
-        """Each keyframe's index in the capture."""
-        return [int(entry["frame"]) for entry in self._entries]
-
     def append(self, frame: Frame) -> None:
         """Write a keyframe. Raises OSError."""
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -49,8 +44,9 @@ class Keyframes(Sequence[Frame]):
         color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
         units = np.clip(np.rint(frame.depth_m * _UNITS_PER_METRE), 0, 65535).astype(np.uint16)
         depth = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-        self._color_path(frame.index).write_bytes(color.tobytes())
-        self._depth_path(frame.index).write_bytes(depth.tobytes())
+        color_path, depth_path = self._paths(frame.index)
+        color_path.write_bytes(color.tobytes())
+        depth_path.write_bytes(depth.tobytes())
         camera = frame.intrinsics
         self._entries.append(
             {"frame": frame.index, "timestamp": frame.timestamp, "width": camera.width, "height": camera.height,
@@ -60,6 +56,13 @@ class Keyframes(Sequence[Frame]):
     def truncate(self, length: int) -> None:
         """Forget all but the first ``length``; their files are overwritten when the frames come again."""
         del self._entries[length:]
+
+    def drop_unlisted(self) -> None:
+        """Remove images that a run left which was interrupted after its last checkpoint."""
+        listed = {path for entry in self._entries for path in self._paths(int(entry["frame"]))}
+        for path in [*self.folder.glob("*.color.jpg"), *self.folder.glob("*.depth.png")]:
+            if path not in listed:
+                path.unlink()
 
     def save_index(self) -> None:
         """Write the index, whole or not at all. Raises OSError."""
@@ -88,18 +91,17 @@ class Keyframes(Sequence[Frame]):
         camera = Intrinsics(
             int(entry["width"]), int(entry["height"]), entry["fx"], entry["fy"], entry["cx"], entry["cy"]
         )
-        color = _decode(self._color_path(index), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        units = _decode(self._depth_path(index), cv2.IMREAD_UNCHANGED)
+        color_path, depth_path = self._paths(index)
+        color = _decode(color_path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        units = _decode(depth_path, cv2.IMREAD_UNCHANGED)
         if color.shape != (camera.height, camera.width, 3) or units.shape != color.shape[:2]:
-            raise MapError(f"{self._color_path(index)} or its depth does not have the size that {INDEX} states.")
+            raise MapError(f"{color_path} or its depth does not have the size that {INDEX} states.")
         depth_m = units.astype(np.float32) / np.float32(_UNITS_PER_METRE)
         return Frame(index, entry["timestamp"], cv2.cvtColor(color, cv2.COLOR_BGR2RGB), depth_m, camera)
 
-    def _color_path(self, index: int) -> Path:
-        return self.folder / f"{index:06d}.color.jpg"
-
-    def _depth_path(self, index: int) -> Path:
-        return self.folder / f"{index:06d}.depth.png"
+    def _paths(self, index: int) -> tuple[Path, Path]:
+        """Colour and depth image of a frame."""
+        return self.folder / f"{index:06d}.color.jpg", self.folder / f"{index:06d}.depth.png"
 
 
 def _decode(path: Path, flags: int) -> np.ndarray:

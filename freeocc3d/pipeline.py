@@ -83,7 +83,10 @@ class Mapper:
         fusion = lift.FeatureFusion(len(gaussians), encoder.dimension, options)
         progress.stage("language", len(self.keyframes))
         for done, (frame, T) in enumerate(zip(self.keyframes, self.trajectory().T_world_keyframe, strict=True), 1):
-            fusion.add(gaussians, frame, T, encoder.encode(frame))
+            try:
+                fusion.add(gaussians, frame, T, encoder.encode(frame))
+            except FrameError as error:  # a broken class image: the other keyframes see most of what it showed
+                progress.warn(str(error))
             progress.advance(done)
         return fusion.features()
 
@@ -130,7 +133,8 @@ def reconstruct(
         return _run(opened, resolved, output, work, progress)
     except KeyboardInterrupt as error:
         raise Interrupted(
-            f"Stopped. The work so far is in {work.folder}: run the same command with --resume to go on."
+            f"Stopped. The work up to the last checkpoint is in {work.folder}: run the same command with --resume to "
+            "go on."
         ) from error
     except OSError as error:
         reason = "the disk is full" if error.errno == errno.ENOSPC else str(error.strerror or error).lower()
@@ -274,7 +278,7 @@ def _save(
         store.write_tum(folder / store.TRAJECTORY, trajectory)
         (folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
         keyframes.save_index()
-        work.drop_checkpoints()
+        keyframes.drop_unlisted()
     report = _report(work, capture, trajectory, gaussians, occupancy)
     (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
     store.write_manifest(folder, _manifest(capture, trajectory, gaussians, occupancy, encoder, settings))
@@ -344,12 +348,15 @@ def _load_backend(settings: Config, section: str, key: str, capture: Capture) ->
 
 
 def _check_ranges(settings: Config) -> None:
-    """Build every layer's options once, so that a value out of range is told before any work."""
+    """Build the options of every layer and of the chosen backends, so that a value out of range is told before any
+    work."""
     for section, module in (("gaussians", anchors), ("language", lift), ("occupancy", splat), ("carving", carve)):
         _options(module, config.options(settings, section))
     for section, key in (("tracking", "backend"), ("language", "encoder")):
-        folder = config.SECTIONS[section][1]
-        registry.load(str(folder), settings[section][key])
+        name = settings[section][key]
+        backend = registry.load(str(config.SECTIONS[section][1]), name)
+        if hasattr(backend, "Options"):
+            _options(backend, settings[section].get(name, {}))
 
 
 def _options(module: Any, values: dict[str, Any]) -> Any:

@@ -61,15 +61,13 @@ class Map:
     def occupancy(self) -> Occupancy:
         """The voxels with probabilities, evidence, features and colours."""
         arrays = read_arrays(self.path / OCCUPANCY, _OCCUPANCY_ARRAYS)
-        tables = {k: v for k, v in self._feature_arrays.items() if k.startswith("codec_")}
-        codec = Codec.from_tables({k.removeprefix("codec_"): v for k, v in tables.items()})
         blocks = len(arrays["keys"])
         occupied = int(np.count_nonzero(arrays["state"] == OCCUPIED))
         shapes_fit = (
             arrays["keys"].shape == (blocks, 3)
             and all(arrays[name].shape == (blocks, BLOCK**3) for name in ("probability", "free", "hits", "state"))
             and arrays["colors"].shape == (occupied, 3)
-            and len(arrays["feature_codes"]) == occupied
+            and arrays["feature_codes"].shape == (occupied, self._feature_arrays["gaussian_codes"].shape[1])
         )
         if not shapes_fit:
             raise MapError(f"{self.path / OCCUPANCY} is damaged: its arrays do not belong together.")
@@ -81,7 +79,7 @@ class Map:
             free=arrays["free"].astype(np.uint16),
             hits=arrays["hits"].astype(np.uint16),
             state=arrays["state"].astype(np.uint8),
-            features=codec.decode(arrays["feature_codes"]),
+            features=self._codec.decode(arrays["feature_codes"]),
             colors=arrays["colors"].astype(np.uint8),
         )
 
@@ -96,9 +94,7 @@ class Map:
     @functools.cached_property
     def gaussian_features(self) -> NDArray[np.float16]:
         """(N, D) unit features of the Gaussians."""
-        arrays = self._feature_arrays
-        codec = Codec.from_tables({k.removeprefix("codec_"): v for k, v in arrays.items() if k.startswith("codec_")})
-        return codec.decode(arrays["gaussian_codes"])
+        return self._codec.decode(self._feature_arrays["gaussian_codes"])
 
     @functools.cached_property
     def trajectory(self) -> Trajectory:
@@ -145,14 +141,13 @@ class Map:
 
     @functools.cached_property
     def _class_labels(self) -> NDArray[np.uint8]:
-        from . import query
-
-        words = self.vocabulary[:254]
-        features = self.occupancy.features
+        words = self.vocabulary[:253]
+        features = self.occupancy.features.astype(np.float32)
         if not words or not len(features):
             return np.zeros(len(features), np.uint8)
-        scores = query.similarity(features, self.text_encoder.encode_words(words))
-        return np.where(features.any(axis=1), scores.argmax(axis=1) + 1, 0).astype(np.uint8)
+        # Plain cosines: of "table" and "coffee table" the narrower word is nearer to a coffee table, though both fit.
+        cosines = features @ self.text_encoder.encode_words(words).features.T
+        return np.where(features.any(axis=1), cosines.argmax(axis=1) + 1, 0).astype(np.uint8)
 
     def labels(self) -> NDArray[np.uint8]:
         """(V,) class of each occupied voxel: 0 = nothing known, k = ``vocabulary[k - 1]``."""
@@ -171,7 +166,17 @@ class Map:
 
     @functools.cached_property
     def _feature_arrays(self) -> dict[str, NDArray[Any]]:
-        return read_arrays(self.path / FEATURES, {"gaussian_codes": ("u", 2)})
+        return read_arrays(
+            self.path / FEATURES, {"gaussian_codes": ("u", 2), "codec_offset": ("f", 1), "codec_scale": ("f", 1)}
+        )
+
+    @functools.cached_property
+    def _codec(self) -> Codec:
+        arrays = self._feature_arrays
+        tables = {name.removeprefix("codec_"): table for name, table in arrays.items() if name.startswith("codec_")}
+        if any(table.shape != arrays["gaussian_codes"].shape[1:] for table in tables.values()):
+            raise MapError(f"{self.path / FEATURES} is damaged: its tables do not belong to its codes.")
+        return Codec.from_tables(tables)
 
     def _require(self, name: str) -> None:
         expected = self.manifest["files"].get(name)
@@ -212,12 +217,10 @@ def load_map(path: str | Path) -> Map:
 
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write map.yaml with the sizes of all files beside it. Raises OSError."""
-    files = {
-        file.relative_to(folder).as_posix(): file.stat().st_size
-        for file in sorted(folder.rglob("*"))
-        if file.is_file() and file.name != MANIFEST
-    }
+    """Write map.yaml with the sizes of the map's files beside it. Raises OSError."""
+    parts = (CONFIG, REPORT, TRAJECTORY, GAUSSIANS, OCCUPANCY, FEATURES)
+    paths = [*(folder / name for name in parts), *sorted((folder / KEYFRAMES).iterdir())]
+    files = {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
     content = {"format_version": FORMAT_VERSION, **manifest, "files": files}
     (folder / MANIFEST).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
@@ -309,10 +312,21 @@ def _place(timestamps: NDArray[np.float64], times: NDArray[np.float64], T: NDArr
 
 
 def _check_manifest(manifest: dict[str, Any], path: Path) -> None:
-    needed = {"voxel_size_m": float, "origin": list, "up": list, "encoder": dict, "keyframes": list, "files": dict}
+    needed = {
+        "voxel_size_m": float, "origin": list, "up": list, "encoder": dict, "keyframes": list, "files": dict,
+        "counts": dict, "capture": dict, "T_world_map": list, "freeocc3d": str,
+    }  # fmt: skip
     for key, kind in needed.items():
         if not isinstance(manifest.get(key), kind):
             raise MapError(f"{path / MANIFEST} is damaged: '{key}' is missing or not a {kind.__name__}.")
+    inner: dict[str, tuple[str, ...]] = {
+        "encoder": ("name", "state"),
+        "capture": ("path", "format"),
+        "counts": ("gaussians", "voxels", "frames", "frames_with_pose", "submaps"),
+    }
+    for key, names in inner.items():
+        if missing := [name for name in names if name not in manifest[key]]:
+            raise MapError(f"{path / MANIFEST} is damaged: '{key}' lacks {', '.join(missing)}.")
     for name in manifest["files"]:
         inside = (path / str(name)).resolve().is_relative_to(path.resolve())
         if not inside:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -27,6 +28,10 @@ STAGES = {
 """Stages whose results are saved, and the configuration sections that they depend on."""
 
 _TRACKING, _STAGE_FEATURES, _MARKS = "tracking.npz", "features.stage.npz", "stages.json"
+_OWN_FILES = {
+    _TRACKING, "tracking.tmp.npz", _STAGE_FEATURES, _MARKS, f"{_MARKS}.tmp", store.MANIFEST, store.CONFIG, store.REPORT,
+    store.TRAJECTORY, store.GAUSSIANS, store.OCCUPANCY, store.FEATURES, store.KEYFRAMES,
+}  # fmt: skip
 
 
 class WorkFolder:
@@ -38,50 +43,63 @@ class WorkFolder:
         self.seconds: dict[str, float] = {}
         self.warnings: list[str] = []
         self.broken: dict[int, str] = {}  # frame -> what is wrong with it
+        self._stage, self._since = "", 0.0
         self._fingerprints: dict[str, str] = {}
         self._valid: set[str] = set()
 
     @classmethod
     def open(cls, output: Path, overwrite: bool, resume: bool) -> WorkFolder:
-        """Raises MapError if a map or an interrupted run is in the way."""
-        folder = output.with_name(output.name + ".partial")
+        """Raises MapError if a map or an interrupted run is in the way; changes nothing on disk."""
         if not output.name:
             raise MapError(f"'{output}' cannot be the name of a map folder.")
+        folder = output.with_name(output.name + ".partial")
         if output.exists() and not overwrite:
             raise MapError(f"{output} exists: choose another folder, or replace it with --overwrite.")
         if output.exists() and not (output / store.MANIFEST).is_file():
             raise MapError(f"{output} is not a map, so it is not overwritten: choose another folder.")
-        if folder.exists() and not (resume or overwrite):
-            raise MapError(
-                f"{folder} holds the work of an interrupted run: go on with --resume, or start again with --overwrite."
-            )
-        if folder.exists() and not resume:
-            shutil.rmtree(folder)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise MapError(f"Cannot create {folder}: {error.strerror}.") from error
-        return cls(folder, resume)
+        if folder.exists():
+            strange = folder.is_file() or {path.name for path in folder.iterdir()} - _OWN_FILES
+            if strange:
+                raise MapError(f"{folder} is in the way, and is not an interrupted run's: move it, or choose another.")
+            if (folder / _MARKS).is_file() and not (resume or overwrite):
+                raise MapError(
+                    f"{folder} holds the work of an interrupted run: go on with --resume, or start again with "
+                    "--overwrite."
+                )
+        return cls(folder, resume and (folder / _MARKS).is_file())
 
     def begin(self, identity: list[Any], settings: Config) -> None:
-        """Decide which saved stages are still valid for this configuration and what ``identity`` says of the input."""
+        """Make the folder, and decide which saved stages are still valid for this configuration and for what
+        ``identity`` says of the input. Raises MapError, and touches nothing, if a resumed run was another's."""
+        relevant = {**settings, "identity": {"of": identity}}
+        relevant["capture"] = {key: value for key, value in settings["capture"].items() if key != "max_broken"}
         self._fingerprints = {
-            stage: config.fingerprint({**settings, "identity": {"of": identity}}, (*sections, "identity"))
-            for stage, sections in STAGES.items()
+            stage: config.fingerprint(relevant, (*sections, "identity")) for stage, sections in STAGES.items()
         }
-        saved = {}
         if self.resumed:
-            with contextlib.suppress(OSError, ValueError):
+            try:
                 saved = json.loads((self.folder / _MARKS).read_text(encoding="utf-8"))
-        self._valid = {stage for stage, value in self._fingerprints.items() if saved.get(stage) == value}
-        if self.resumed and "tracking" not in self._valid:
+            except (OSError, ValueError) as error:
+                raise MapError(f"Cannot read {self.folder / _MARKS}: start again with --overwrite.") from error
+            self._valid = {stage for stage, value in self._fingerprints.items() if saved.get(stage) == value}
+            if "tracking" not in self._valid:
+                raise MapError(
+                    f"{self.folder} was begun with another capture, or other capture or tracking options: resume it "
+                    "with the same ones, or start again with --overwrite."
+                )
+            return
+        if self.folder.exists():
             shutil.rmtree(self.folder)
-            self.folder.mkdir()
+        try:
+            self.folder.mkdir(parents=True)
+        except OSError as error:
+            raise MapError(f"Cannot create {self.folder}: {error.strerror}.") from error
 
     def save_tracking(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Keep layer 1's state, in place of the one before."""
         temporary = self.folder / "tracking.tmp.npz"
-        log = {"broken": self.broken, "warnings": self.warnings, "seconds": self.seconds}
+        seconds = {**self.seconds, self._stage: self.seconds.get(self._stage, 0.0) + time.perf_counter() - self._since}
+        log = {"broken": self.broken, "warnings": self.warnings, "seconds": seconds}
         arrays: dict[str, Any] = {**state, "log": np.array(json.dumps(log))}
         np.savez(temporary, **arrays)
         temporary.replace(self.folder / _TRACKING)
@@ -96,7 +114,7 @@ class WorkFolder:
         log = json.loads(str(state.pop("log")))
         self.broken = {int(index): text for index, text in log["broken"].items()}
         self.warnings = log["warnings"]
-        self.seconds["before the interruption"] = sum(log["seconds"].values())
+        self.seconds = {name: self.seconds.get(name, 0.0) + value for name, value in log["seconds"].items()}
         return state
 
     def gaussians(self, compute: Callable[[], Gaussians]) -> Gaussians:
@@ -120,19 +138,22 @@ class WorkFolder:
         self._mark("language")
         return features
 
-    def drop_checkpoints(self) -> None:
-        """Remove what a finished map does not need."""
-        for name in (_TRACKING, _STAGE_FEATURES, _MARKS):
-            (self.folder / name).unlink(missing_ok=True)
-
     def finish(self, output: Path) -> None:
         """The work folder takes the map's name; a map that it replaces is gone only when the new one stands."""
-        old = output.with_name(output.name + ".old")
-        if output.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            output.rename(old)
-        self.folder.rename(output)
-        shutil.rmtree(old, ignore_errors=True)
+        for name in (_TRACKING, "tracking.tmp.npz", _STAGE_FEATURES, _MARKS, f"{_MARKS}.tmp"):
+            (self.folder / name).unlink(missing_ok=True)
+        if not output.exists():
+            self.folder.rename(output)
+            return
+        aside = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent)) / output.name
+        output.rename(aside)
+        try:
+            self.folder.rename(output)
+        except OSError:
+            aside.rename(output)
+            raise
+        finally:
+            shutil.rmtree(aside.parent, ignore_errors=True)
 
     def drop_if_empty(self) -> None:
         """Leave nothing behind where nothing was done."""
@@ -142,15 +163,17 @@ class WorkFolder:
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:
         """Add the time spent inside to the stage's."""
-        start = time.perf_counter()
+        self._stage, self._since = stage, time.perf_counter()
         try:
             yield
         finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - self._since
 
     def _mark(self, stage: str) -> None:
         """Record that a stage's result is saved; later stages' results are out of date."""
         order = list(STAGES)
         self._valid = {name for name in self._valid if order.index(name) < order.index(stage)} | {stage}
         marks = {name: self._fingerprints[name] for name in self._valid}
-        (self.folder / _MARKS).write_text(json.dumps(marks), encoding="utf-8")
+        temporary = self.folder / f"{_MARKS}.tmp"
+        temporary.write_text(json.dumps(marks), encoding="utf-8")
+        temporary.replace(self.folder / _MARKS)

@@ -55,6 +55,10 @@ def test_query_text_ply_and_picture(room, tmp_path) -> None:
     assert "yellow: 1 region" in done.stdout
     assert (tmp_path / "q.ply").read_bytes().startswith(b"ply\n")
     assert (tmp_path / "q.png").read_bytes().startswith(b"\x89PNG")
+    before = (room / "gaussians.ply").read_bytes()
+    assert "--overwrite" in refused("query", room, "yellow", "--ply", room / "gaussians.ply")
+    assert (room / "gaussians.ply").read_bytes() == before
+    run("view", room, "--picture", tmp_path / "q.png", "--overwrite")
 
 
 def test_info_json_has_the_documented_keys(room) -> None:
@@ -130,7 +134,7 @@ def test_mistakes_with_maps(tmp_path) -> None:
 
 def test_debug_shows_the_traceback(tmp_path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "freeocc3d.cli", "--debug", "info", tmp_path], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "freeocc3d.cli", "info", tmp_path, "--debug"], capture_output=True, text=True, timeout=60
     )
     assert "Traceback" in done.stderr
 
@@ -147,8 +151,7 @@ def test_ctrl_c_ends_cleanly_and_resumes(tmp_path) -> None:
         str(out),
     ]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    keyframes = Path(f"{out}.partial") / "keyframes"
-    while not (keyframes / "keyframes.json").exists():  # the first checkpoint
+    while not (Path(f"{out}.partial") / "stages.json").exists():  # the first checkpoint
         assert process.poll() is None
         os.sched_yield()
     process.send_signal(signal.SIGINT)

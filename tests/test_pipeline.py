@@ -4,6 +4,7 @@ bad input."""
 from __future__ import annotations
 
 import errno
+import json
 import shutil
 
 import cv2
@@ -104,22 +105,70 @@ def test_an_interrupted_run_leaves_no_map_and_resumes_to_the_same(tmp_path, room
     with pytest.raises(Interrupted, match="--resume"):
         freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper(stage, after))
     assert not output.exists()
-    with pytest.raises(MapError, match="--resume"):
-        freeocc3d.reconstruct("builtin:room", output, ROOM)
+    if after != 3:  # there was a checkpoint
+        with pytest.raises(MapError, match="--resume"):
+            freeocc3d.reconstruct("builtin:room", output, ROOM)
     resumed = freeocc3d.reconstruct("builtin:room", output, ROOM, resume=True)
     assert not (tmp_path / "map.partial").exists()
     np.testing.assert_allclose(resumed.trajectory.T_world_cam[:24], room.trajectory.T_world_cam[:24], atol=5e-3)
     assert resumed.manifest["keyframes"] == room.manifest["keyframes"]
 
 
-def test_a_resumed_run_with_another_configuration_starts_over(tmp_path, monkeypatch) -> None:
+def test_a_run_is_not_resumed_with_other_options_and_loses_nothing_by_the_attempt(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(pipeline, "_CHECKPOINT_FRAMES", 5)
+    output, work = tmp_path / "map", tmp_path / "map.partial"
     with pytest.raises(Interrupted):
-        freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, progress=Stopper("tracking", 12))
-    other = {**ROOM, "tracking": {"backend": "known"}}
-    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", other, resume=True)
-    capture = open_capture("builtin:room", *_synthetic())
-    np.testing.assert_allclose(made.trajectory.T_world_cam[5], capture.pose(5), atol=1e-6)
+        freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper("tracking", 12))
+    before = listing(work)
+    for other in ({"tracking": {"backend": "known"}}, {"tracking": {"rgbd": {"width": -1}}}):
+        with pytest.raises(FreeOccError):
+            freeocc3d.reconstruct("builtin:room", output, {**ROOM, **other}, resume=True)
+    with pytest.raises(CaptureError):
+        freeocc3d.reconstruct(tmp_path / "typo", output, overwrite=True)
+    assert listing(work) == before
+    more_broken = {**ROOM, "capture": {**ROOM["capture"], "max_broken": 0.5}}
+    assert freeocc3d.reconstruct("builtin:room", output, more_broken, resume=True).trajectory.has_pose[:24].all()
+
+
+def test_time_before_an_interruption_counts(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(pipeline, "_CHECKPOINT_FRAMES", 20)
+    with pytest.raises(Interrupted):
+        freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, progress=Stopper("tracking", 21))
+    state = np.load(tmp_path / "map.partial" / "tracking.npz")
+    spent = json.loads(str(state["log"]))["seconds"]["tracking"]
+    assert spent > 0.05
+    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, resume=True)
+    assert made.report["seconds"]["tracking"] > spent
+
+
+def test_neighbouring_folders_are_left_alone(tmp_path, room) -> None:
+    output = shutil.copytree(room.path, tmp_path / "map")
+    (tmp_path / "map.old").mkdir()
+    (tmp_path / "map.old" / "backup.txt").write_text("mine")
+    short = {"capture": {**ROOM["capture"], "stop": 4}}
+    freeocc3d.reconstruct("builtin:room", output, short, overwrite=True)
+    assert (tmp_path / "map.old" / "backup.txt").read_text() == "mine"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["map", "map.old"]
+    (tmp_path / "next.partial").mkdir()
+    (tmp_path / "next.partial" / "notes.txt").write_text("mine")
+    for options in ({}, {"overwrite": True}, {"resume": True}):
+        with pytest.raises(MapError, match="in the way"):
+            freeocc3d.reconstruct("builtin:room", tmp_path / "next", short, **options)
+    with pytest.raises(MapError, match="cannot be the name"):
+        freeocc3d.reconstruct("builtin:room", ".", short)
+
+
+def test_a_disk_that_fills_up_at_the_very_end_costs_nothing(tmp_path, monkeypatch) -> None:
+    def full(*arguments) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "write_manifest", full)
+        with pytest.raises(MapError, match="disk is full"):
+            freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM)
+    kept = np.load(tmp_path / "map.partial" / "tracking.npz")
+    assert int(kept["done"]) == 24
+    assert freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, resume=True).query("red").matched
 
 
 def test_an_existing_map_is_not_touched_without_overwrite(tmp_path, room) -> None:

@@ -42,7 +42,8 @@ class Options:
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the arrays. Raises ExportError if the dense grid would not fit into memory."""
-    arrays = (dense if options.form == "dense" else sparse)(scan_map.occupancy, scan_map.labels())
+    form = dense if options.form == "dense" else sparse
+    arrays = form(scan_map.occupancy, scan_map.labels(), len(scan_map.vocabulary))
     arrays |= {
         "voxel_size": np.float64(scan_map.occupancy.voxel_size),
         "T_world_map": np.array(scan_map.manifest["T_world_map"], np.float64),
@@ -52,14 +53,13 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         np.savez_compressed(stream, **arrays)
 
 
-def sparse(occupancy: Occupancy, labels: NDArray[np.uint8]) -> dict[str, Any]:
-    """Known voxels, row by row; ``labels`` (V,) of the occupied ones, 0 = nothing known."""
+def sparse(occupancy: Occupancy, labels: NDArray[np.uint8], classes: int) -> dict[str, Any]:
+    """Known voxels, row by row; ``labels`` (V,) 0…classes of the occupied ones, 0 = nothing known."""
     block, local = np.nonzero(occupancy.state != UNKNOWN)
     state = occupancy.state[block, local]
     offsets = np.stack((local // 64, local // 8 % 8, local % 8), axis=1)
     label = np.zeros(len(state), np.uint8)
-    unlabelled = np.uint8(min(int(labels.max(initial=0)) + 1, 254))
-    label[state == OCCUPIED] = np.where(labels > 0, labels, unlabelled)
+    label[state == OCCUPIED] = np.where(labels > 0, labels, min(classes + 1, 254))
     return {
         "voxels": (occupancy.keys[block] * 8 + offsets).astype(np.int32),
         "state": state,
@@ -69,9 +69,9 @@ def sparse(occupancy: Occupancy, labels: NDArray[np.uint8]) -> dict[str, Any]:
     }
 
 
-def dense(occupancy: Occupancy, labels: NDArray[np.uint8]) -> dict[str, Any]:
+def dense(occupancy: Occupancy, labels: NDArray[np.uint8], classes: int) -> dict[str, Any]:
     """The grid over the box of all known voxels; an empty map gives arrays of shape (0, 0, 0)."""
-    known = sparse(occupancy, labels)
+    known = sparse(occupancy, labels, classes)
     voxels = known["voxels"]
     low = voxels.min(axis=0) if len(voxels) else np.zeros(3, np.int32)
     shape = tuple(int(n) for n in (voxels.max(axis=0) + 1 - low if len(voxels) else np.zeros(3, int)))

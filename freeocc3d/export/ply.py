@@ -43,7 +43,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     _write(scan_map.occupancy, colors, path, options.form)
 
 
-def write_query_ply(occupancy: Occupancy, results: list[QueryResult], path: Path, overwrite: bool = True) -> None:
+def write_query_ply(occupancy: Occupancy, results: list[QueryResult], path: Path, overwrite: bool = False) -> None:
     """Write all occupied voxels as cubes, those of the results' regions in one strong colour a word, the others pale.
     Raises ExportError."""
     colors = highlighted(occupancy.colors, [result.regions for result in results])

@@ -40,7 +40,7 @@ class _Scene:
     boxes: list[tuple[NDArray[np.float64], tuple[int, int, int]]]  # (8, 3) corners and a colour
 
 
-def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: bool = True) -> None:
+def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: bool = False) -> None:
     """Draw the map coloured by "rgb", "class" or "height", with the camera's way, as PNG.
 
     Raises ExportError (empty map, unwritable target, unknown colouring), DependencyError (no off-screen rendering).
@@ -66,7 +66,7 @@ def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: boo
     _draw(scan_map, colors, [], _title(scan_map), legend, Path(path), overwrite)
 
 
-def query_picture(scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = True) -> None:
+def query_picture(scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False) -> None:
     """Draw the map pale with what each word matched in a strong colour, boxed; PNG. Raises as ``map_picture``."""
     colors = highlighted(scan_map.occupancy.colors, [result.regions for result in results])
     legend = []
