@@ -26,7 +26,6 @@ SECTIONS: dict[str, tuple[str, str | None]] = {
     "language": ("language.lift", "language.encoders"),
     "occupancy": ("occupancy.splat", None),
     "carving": ("occupancy.carve", None),
-    "query": ("query", None),
 }
 """Section -> (module whose ``Options`` it configures, folder of its backends)."""
 

@@ -20,7 +20,7 @@ class ConfigError(FreeOccError):
 
 
 class DependencyError(FreeOccError):
-    """A backend needs a package that is not installed; the message names the extra that brings it."""
+    """A backend needs a package that is not installed; the message says which."""
 
 
 class TrackingError(FreeOccError):

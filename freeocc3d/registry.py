@@ -8,6 +8,7 @@ the syntax tree, so that listing is instant and works where a backend's packages
 from __future__ import annotations
 
 import ast
+import contextlib
 import difflib
 import functools
 import importlib
@@ -169,6 +170,9 @@ def _fit(kind: str, value: Any) -> tuple[bool, Any]:
     if kind == "int":
         return isinstance(value, int) and not isinstance(value, bool), value
     if kind == "float":
+        if isinstance(value, str):  # YAML 1.1 takes 1e-4, without a point, for a word
+            with contextlib.suppress(ValueError):
+                value = float(value)
         is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
         return is_number, float(value) if is_number else value
     if kind == "str":

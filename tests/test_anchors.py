@@ -49,6 +49,18 @@ def test_averaging_over_keyframes_beats_the_noise_of_one() -> None:
     assert np.std(many.means[:, 2]) < 0.5 * np.std(one.means[:, 2])
 
 
+def test_a_near_measurement_outweighs_a_far_one_by_its_uncertainty() -> None:
+    # The same cell of a wall at z = 2.1 seen from 1 m at 2.10, and from 4 m (behind) at 2.14.
+    near, far = np.eye(4), np.eye(4)
+    near[2, 3], far[2, 3] = 1.1, -1.86
+    g = lifted([wall_frame(1.0), wall_frame(4.0)], [near, far], cell=0.25)
+    middle = np.abs(g.means[:, :2]).max(axis=1) < 0.3
+    sigma = anchors.depth_sigma(np.float32([1.0, 4.0]))
+    assert sigma[1] / sigma[0] > 10
+    assert np.abs(g.means[middle, 2] - 2.10).max() < 0.004
+    assert (g.anchor_keyframe[middle] == 0).all()
+
+
 def test_means_are_their_anchors_in_their_keyframes_and_keep_pixel_and_depth() -> None:
     frames, poses = [wall_frame(2.0, 0), wall_frame(1.5, 1)], [random_pose(0), random_pose(1)]
     g = lifted(frames, poses)

@@ -66,6 +66,30 @@ def test_missing_depth_says_nothing() -> None:
     assert len(carve.visible_blocks(empty, np.eye(4), ORIGIN, V, 16)) == 0
 
 
+def test_the_margin_grows_with_the_depths_uncertainty() -> None:
+    # 20 cm before a wall at 5.8 m is within three standard deviations of its depth and the margin of a voxel.
+    for distance, free_there in ((2.0, 1), (5.8, 0)):
+        free, _, centers = evidence_of(wall_frame(distance))
+        near_axis = np.abs(centers[..., :2]).max(axis=-1) < 0.2
+        before = near_axis & (np.abs(centers[..., 2] - (distance - 0.2)) < 0.04)
+        assert before.any()
+        assert (free[before] == free_there).all()
+
+
+def test_no_block_is_missed_however_small_blocks_are() -> None:
+    frame = wall_frame(4.0)
+    for voxel_size in (0.08, 0.02):
+        found = set(carve.visible_blocks(frame, np.eye(4), ORIGIN, voxel_size, 16).tolist())
+        edge = 8 * voxel_size
+        keys = np.stack(np.meshgrid(*[np.arange(-8, 8)] * 2, np.arange(1, int(3.8 / edge))), axis=-1).reshape(-1, 3)
+        middles = (keys + 0.5) * edge
+        pixels, _ = project(middles, CAMERA)
+        inside = (pixels > 0).all(axis=1) & (pixels < (CAMERA.width - 1, CAMERA.height - 1)).all(axis=1)
+        wanted = grid.pack(np.floor((middles[inside] - ORIGIN) / edge).astype(int))
+        assert len(wanted) > 50
+        assert set(wanted.tolist()) <= found
+
+
 def test_counts_add_up_over_images() -> None:
     frame = wall_frame(2.0)
     packed = carve.visible_blocks(frame, np.eye(4), ORIGIN, V, 16)

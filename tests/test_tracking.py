@@ -14,7 +14,7 @@ from freeocc3d.tracking.base import Tracker
 from freeocc3d.tracking.overlap import DepthView, mutual_overlap, overlap, sample_points
 from freeocc3d.tracking.pose_graph import Edge
 from freeocc3d.tracking.records import Records
-from freeocc3d.types import Frame
+from freeocc3d.types import Frame, Intrinsics
 
 
 def tracker(**options) -> rgbd.RgbdTracker:
@@ -85,6 +85,62 @@ def test_the_first_usable_frame_starts_the_map() -> None:
     assert t.trajectory(np.arange(3.0)).keyframes.tolist() == [1]
 
 
+def test_each_part_of_the_failure_test_can_fail() -> None:
+    kitchen = open_capture(data_folder() / "7scenes-kitchen")
+    good = tracker()
+    good.track(kitchen[0])
+    assert good.track(kitchen[1]).status == "tracked"
+    for strict in ({"min_fitness": 0.999}, {"max_residual": 1e-6}, {"min_information": 1e3}):
+        t = tracker(**strict)
+        t.track(kitchen[0])
+        assert t.track(kitchen[1]).status == "lost", strict
+
+
+def test_a_point_source_of_structure_is_not_enough() -> None:
+    # Depth in a patch of a few pixels: its points lie so close together that rotations are hardly constrained.
+    t = tracker()
+    frames = [wall_frame(2.0, i) for i in range(2)]
+    patches = []
+    for frame in frames:
+        depth = np.zeros_like(frame.depth_m)
+        depth[40:77, 60:92] = 2.0
+        patches.append(Frame(frame.index, frame.timestamp, frame.color, depth, frame.intrinsics))
+    strict = tracker(min_information=0.05)
+    for one, status in ((t, "tracked"), (strict, "lost")):
+        one.track(patches[0])
+        assert one.track(patches[1]).status == status
+
+
+def test_keyframes_that_look_at_the_same_place_are_tied_together_and_that_helps() -> None:
+    capture = open_capture(data_folder() / "house" / "bedroom")
+    indices = range(0, 120, 3)
+    tied, chain = tracker(), tracker(overlap_edges=0)
+    for i in indices:
+        frame = capture[i]
+        tied.track(frame)
+        chain.track(frame)
+    assert len(chain.edges) == len(chain.records.keyframe_index) - 1
+    assert sum(edge.uncertain for edge in tied.edges) > len(chain.edges)
+    assert all(edge.source - edge.target > 1 for edge in tied.edges if edge.uncertain)
+    before = [T.copy() for T in tied.records.T_world_keyframe]
+    tied.optimize()
+    moved = [np.abs(a - b).max() for a, b in zip(before, tied.records.T_world_keyframe, strict=True)]
+    assert moved[0] < 1e-9
+    assert 0 < max(moved) < 0.05
+
+
+@pytest.mark.parametrize("width", [640, 960, 1280])
+def test_a_smaller_view_has_its_depth_exactly_where_its_camera_says(width) -> None:
+    camera = Intrinsics(width, width * 3 // 4, 0.9 * width, 0.9 * width, 0.51 * width, 0.37 * width)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    depth = (2.0 / (1.0 + 0.4 * x - 0.3 * y)).astype(np.float32)  # the plane z + 0.4 x - 0.3 y = 2
+    frame = Frame(0, 0.0, np.zeros((*depth.shape, 3), np.uint8), depth, camera)
+    x, y, z = tracker()._view(frame).points.T
+    assert len(z) > 100
+    np.testing.assert_allclose(z + 0.4 * x - 0.3 * y, 2.0, atol=1e-4)
+
+
 def test_a_restored_tracker_goes_on_as_if_nothing_had_happened() -> None:
     kitchen = open_capture(data_folder() / "7scenes-kitchen")
     whole, part = tracker(), tracker()
@@ -115,6 +171,23 @@ def test_known_takes_the_captures_poses_and_says_when_there_are_none(tmp_path) -
     poseless = open_capture(write_seven_scenes(tmp_path / "poseless", 3, poses=False))
     with pytest.raises(TrackingError, match=r"tracking\.backend=rgbd"):
         known.load(known.Options(), poseless)
+
+
+def test_known_makes_no_keyframe_of_a_frame_without_depth_and_refuses_poses_far_away(monkeypatch) -> None:
+    known = registry.load("tracking", "known")
+    kitchen = open_capture(data_folder() / "7scenes-kitchen")
+    t = known.load(known.Options(), kitchen)
+    for i in range(6):
+        frame = kitchen[i]
+        depth = np.zeros_like(frame.depth_m) if i in (0, 2, 3) else frame.depth_m
+        t.track(Frame(i, float(i), frame.color, depth, frame.intrinsics))
+    trajectory = t.trajectory(kitchen.timestamps)
+    assert trajectory.keyframes.tolist() == [1]
+    assert trajectory.status[:4].tolist() == ["lost", "keyframe", "tracked", "tracked"]
+    far = kitchen.pose(0) + [[0, 0, 0, 5e5], [0] * 4, [0] * 4, [0] * 4]
+    monkeypatch.setattr(type(kitchen), "pose", lambda self, index: far)
+    with pytest.raises(TrackingError, match="common offset"):
+        known.load(known.Options(), kitchen).track(kitchen[0])
 
 
 def test_records_move_frames_with_their_keyframe() -> None:

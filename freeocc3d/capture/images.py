@@ -44,10 +44,13 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
 
 
 def read_classes(path: Path, count: int) -> NDArray[np.uint8]:
-    """(H, W) class image with values below ``count``. Raises FrameError, also for a value that has no class."""
+    """(H, W) class image with values below ``count``; 255, which many programs write for "nothing", becomes 0 unless it
+    has a name. Raises FrameError, also for a value that has no class."""
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"{path} is not a class image: expected 8- or 16-bit grey, got {_kind(image)}.")
+    if count <= 255:
+        image[image == 255] = 0
     if (largest := int(image.max())) >= count:
         raise FrameError(f"{path} holds class {largest}, but only {count} classes are named (0…{count - 1}).")
     return image.astype(np.uint8, copy=False)

@@ -18,6 +18,7 @@ from ..geometry import back_project, invert
 from ..registry import require_positive
 from ..types import FREE, UNKNOWN, Frame, Intrinsics
 from . import base, room
+from .calibration import given
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 
@@ -82,8 +83,8 @@ class Reader(base.Capture):
         self.classes = room.CLASSES
         focal = _FOCAL_PER_WIDTH * own.width
         self.camera = Intrinsics(own.width, own.height, focal, focal, (own.width - 1) / 2, (own.height - 1) / 2)
-        stated = options.intrinsics or (focal, focal, self.camera.cx, self.camera.cy)
-        self.intrinsics = Intrinsics(own.width, own.height, *stated)
+        stated = given(options)
+        self.intrinsics = stated.camera((own.width, own.height)) if stated else self.camera
         self._lock = threading.Lock()
 
     @classmethod

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import config, registry
 from ..gaussians import anchors
+from ..keyframes import Keyframes
 from ..occupancy import build, carve, splat
 from ..store import CONFIG, Map
+from ..types import Frame
 from .align import Alignment
 
 
@@ -34,10 +40,11 @@ def occupied_on_lattice(
     T_world_keyframe[:, :3, 3] = scale * T_world_keyframe[:, :3, 3] @ R.T + t
     T_world_keyframe[:, :3, :3] = R @ T_world_keyframe[:, :3, :3]
     gaussians = anchors.aligned(scan_map.gaussians, scale, R, t)
+    keyframes = _Scaled(scan_map.keyframes, scale)
     occupancy = build.build_occupancy(
         gaussians,
         np.zeros((len(gaussians), 0), np.float16),
-        scan_map.keyframes,
+        keyframes,
         T_world_keyframe,
         splatting,
         registry.build_options(carve, settings["carving"]),
@@ -48,3 +55,18 @@ def occupied_on_lattice(
     inside = ((voxels >= 0) & (voxels < shape)).all(axis=1)
     occupied[tuple(voxels[inside].T)] = True
     return occupied
+
+
+class _Scaled(Sequence[Frame]):
+    """Keyframes whose depth is in the true frame's metres; a similarity scales the cameras' frames as well."""
+
+    def __init__(self, keyframes: Keyframes, scale: float):
+        self.keyframes = keyframes
+        self.scale = np.float32(scale)
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+    def __getitem__(self, row: Any) -> Any:
+        frame = self.keyframes[row]
+        return replace(frame, depth_m=frame.depth_m * self.scale)

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ..errors import ConfigError
 from ..geometry import back_project, invert, transform
 from ..registry import require_positive
 from ..types import BLOCK, Frame
@@ -27,16 +28,21 @@ class Options:
     min_free: int = 1
     """Depth images that must see through a voxel that holds no surface before it counts as free."""
     ray_step: int = 16
-    """Every n-th pixel's ray is followed to find the blocks that the camera looked into."""
+    """Every n-th pixel's ray (more where blocks are small) is followed to find the blocks that a camera looked into."""
 
     def __post_init__(self) -> None:
         require_positive(self, "margin", "min_free", "ray_step")
+        if self.noise < 0:
+            raise ConfigError(f"'noise' must not be negative, got {self.noise}.")
 
 
 def visible_blocks(
     frame: Frame, T_world_cam: NDArray[np.float64], origin: NDArray[np.float64], voxel_size: float, ray_step: int
 ) -> NDArray[np.int64]:
-    """Packed keys of the blocks between the camera and what its depth image shows."""
+    """Packed keys of the blocks between the camera and what its depth image shows. Rays are no farther apart than half
+    a block at the greatest depth, so that few blocks are missed, and those at their corners."""
+    farthest = max(float(frame.depth_m.max(initial=0.0)), 1e-3)
+    ray_step = max(1, min(ray_step, int(0.5 * BLOCK * voxel_size * frame.intrinsics.fx / farthest)))
     depth = frame.depth_m[ray_step // 2 :: ray_step, ray_step // 2 :: ray_step]
     v, u = np.nonzero(depth)
     if len(v) == 0:

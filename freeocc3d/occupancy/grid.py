@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from ..types import BLOCK
 
 KEY_LIMIT = 1 << 20
-"""Block indices lie in [-KEY_LIMIT, KEY_LIMIT) along each axis: 670 km at 8 cm."""
+"""Block indices lie in [-KEY_LIMIT, KEY_LIMIT) along each axis. Single precision of positions ends far earlier: a
+kilometre from the origin it costs tenths of a millimetre."""
 
 
 def pack(keys: NDArray[np.integer]) -> NDArray[np.int64]:
@@ -37,7 +38,7 @@ def blocks_along_rays(
     voxel_size: float,
 ) -> NDArray[np.int64]:
     """Packed keys of the blocks that lie on the segments from a camera's centre to (P, 3) points, sampled at half a
-    block: a corner that a segment only grazes may be missed, which other rays of the same image make up for."""
+    block; a corner that a segment only grazes may be missed."""
     edge = BLOCK * voxel_size
     steps = np.linalg.norm(points_world - center_world, axis=1) / (0.5 * edge)
     fractions = np.linspace(0.0, 1.0, int(np.ceil(steps.max(initial=0.0))) + 1)

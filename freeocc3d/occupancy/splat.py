@@ -21,6 +21,7 @@ import numpy as np
 from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 
+from ..errors import ConfigError
 from ..geometry import quats_to_rotations
 from ..registry import require_positive
 from ..types import BLOCK, Gaussians
@@ -45,6 +46,8 @@ class Options:
 
     def __post_init__(self) -> None:
         require_positive(self, "voxel_size", "cutoff", "threshold", "seen_through")
+        if self.threshold >= 1:
+            raise ConfigError(f"'threshold' must be less than 1, got {self.threshold}.")
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 from ..capture.base import Capture
 from ..errors import TrackingError
 from ..geometry import invert, nearest_rigid
+from ..registry import require_positive
 from ..types import Frame, Trajectory
 from .base import Tracked, Tracker
 from .overlap import DepthView, mutual_overlap, sample_points
 from .records import Records
 
 REQUIRES: tuple[str, ...] = ()
+
+_FARTHEST = 2000.0
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,9 @@ class Options:
 
     keyframe_overlap: float = 0.85
     """A frame that shares less than this of its keyframe's view becomes a keyframe."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "keyframe_overlap")
 
 
 def load(options: Options, capture: Capture) -> KnownTracker:
@@ -49,10 +55,20 @@ class KnownTracker(Tracker):
             self.records.add_lost(frame.index)
             return Tracked("lost", None, 0.0)
         T_world_cam = nearest_rigid(given)  # files state poses to a few digits
+        if np.abs(T_world_cam[:3, 3]).max() > _FARTHEST:
+            raise TrackingError(
+                f"The pose of frame {frame.index} lies more than {_FARTHEST:g} m from the origin, where positions lose "
+                "their millimetres: subtract a common offset from the capture's poses."
+            )
         view = self._view(frame)
+        nothing_seen = np.count_nonzero(frame.depth_m) < 0.05 * frame.depth_m.size
+        if nothing_seen and self._keyframe is None:
+            self.records.add_lost(frame.index)
+            return Tracked("lost", None, 0.0)
         if self._keyframe is not None:
             T_keyframe_cam = invert(self.records.T_world_keyframe[-1]) @ T_world_cam
-            if mutual_overlap(view, self._keyframe, T_keyframe_cam) >= self.options.keyframe_overlap:
+            shared = mutual_overlap(view, self._keyframe, T_keyframe_cam)
+            if nothing_seen or shared >= self.options.keyframe_overlap:
                 row = len(self.records.keyframe_index) - 1
                 self.records.add_tracked(frame.index, row, T_keyframe_cam, 1.0)
                 return Tracked("tracked", T_world_cam, 1.0)

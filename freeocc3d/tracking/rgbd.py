@@ -50,6 +50,8 @@ class Options:
 
     def __post_init__(self) -> None:
         require_positive(self, "width", "depth_difference", "keyframe_overlap", "min_fitness", "max_residual")
+        if min(self.iterations) < 0 or max(self.iterations) == 0:
+            raise ConfigError(f"'iterations' must not be negative, nor all zero, got {self.iterations}.")
 
 
 @dataclass(frozen=True)
@@ -201,17 +203,17 @@ class RgbdTracker(Tracker):
     def _view(self, frame: Frame) -> _View:
         import open3d as o3d
 
-        camera = frame.intrinsics
+        camera, color, depth = frame.intrinsics, frame.color, frame.depth_m
         step = max(1, round(camera.width / self.options.width))
-        color, depth = frame.color, frame.depth_m
         if step > 1:
-            # Depth is picked, never averaged across an edge; picking pixel step*i + step//2 shifts the principal point.
-            width, height = camera.width // step, camera.height // step
-            color = cv2.resize(color[: height * step, : width * step], (width, height), interpolation=cv2.INTER_AREA)
-            depth = depth[step // 2 :: step, step // 2 :: step][:height, :width]
+            # Depth is picked, never averaged across an edge; colour is averaged around the same pixels, by a window of
+            # odd size, so that both stay registered and the principal point moves with them exactly.
+            first = step // 2
+            color = cv2.blur(color, (step | 1, step | 1))[first::step, first::step]
+            depth = depth[first::step, first::step]
             camera = Intrinsics(
-                width, height, camera.fx / step, camera.fy / step,
-                (camera.cx + 0.5) / step - 0.5, (camera.cy + 0.5) / step - 0.5,
+                depth.shape[1], depth.shape[0], camera.fx / step, camera.fy / step,
+                (camera.cx - first) / step, (camera.cy - first) / step,
             )  # fmt: skip
         depth = np.ascontiguousarray(depth)
         rgbd = o3d.t.geometry.RGBDImage(
