@@ -5,7 +5,7 @@ import pytest
 from scenes import CAMERA, wall_frame
 
 from freeocc3d.gaussians import anchors
-from freeocc3d.geometry import invert, project, quats_to_rotations, rotations_to_quats, transform
+from freeocc3d.geometry import depth_sigma, invert, project, quats_to_rotations, rotations_to_quats, transform
 from freeocc3d.occupancy import splat
 from freeocc3d.types import Frame
 
@@ -55,7 +55,7 @@ def test_a_near_measurement_outweighs_a_far_one_by_its_uncertainty() -> None:
     near[2, 3], far[2, 3] = 1.1, -1.86
     g = lifted([wall_frame(1.0), wall_frame(4.0)], [near, far], cell=0.25)
     middle = np.abs(g.means[:, :2]).max(axis=1) < 0.3
-    sigma = anchors.depth_sigma(np.float32([1.0, 4.0]))
+    sigma = depth_sigma(np.float32([1.0, 4.0]))
     assert sigma[1] / sigma[0] > 10
     assert np.abs(g.means[middle, 2] - 2.10).max() < 0.004
     assert (g.anchor_keyframe[middle] == 0).all()

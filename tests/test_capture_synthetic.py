@@ -10,7 +10,7 @@ import pytest
 
 from freeocc3d.capture import base, open_capture, room, synthetic
 from freeocc3d.errors import CaptureError, ConfigError
-from freeocc3d.geometry import back_project, invert, is_rigid, project, transform
+from freeocc3d.geometry import back_project, depth_sigma, invert, is_rigid, project, transform
 from freeocc3d.types import FREE, UNKNOWN, Frame
 
 CUP = room.CLASSES.index("cup")
@@ -205,7 +205,7 @@ def test_a_frames_depth_has_that_noise(noisy, exact) -> None:
         measured, true = noisy[index].depth_m, exact[index].depth_m
         holes += np.count_nonzero((measured == 0) & (true > 0))
         near = (measured > 0) & (np.abs(measured - true) < 0.05)
-        ratios.append(((measured - true) / synthetic.axial_noise(true))[near])
+        ratios.append(((measured - true) / depth_sigma(true))[near])
     ratio = np.concatenate(ratios)
     assert abs(np.median(ratio)) < 0.05
     assert np.median(np.abs(ratio)) == pytest.approx(0.6745, rel=0.1)  # that of a unit normal distribution

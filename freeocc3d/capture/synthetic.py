@@ -14,7 +14,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..errors import CaptureError
-from ..geometry import back_project, invert
+from ..geometry import back_project, depth_sigma, invert
 from ..registry import require_positive
 from ..types import FREE, UNKNOWN, Frame, Intrinsics
 from . import base, room
@@ -247,12 +247,6 @@ def camera_on_the_walk(phase: float) -> NDArray[np.float64]:
     return T_world_cam
 
 
-def axial_noise(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Standard deviation, metres, of a structured-light sensor's depth (Nguyen, Izadi, Lovell, Modeling Kinect Sensor
-    Noise for Improved 3D Reconstruction and Tracking, 3DIMPVT 2012)."""
-    return np.asarray(0.0012 + 0.0019 * (depth_m - 0.4) ** 2, np.float32)
-
-
 def disturbed_depth(
     depth_m: NDArray[np.float32], cosine: NDArray[np.float32], rng: np.random.Generator
 ) -> NDArray[np.float32]:
@@ -264,7 +258,7 @@ def disturbed_depth(
     columns = np.clip(np.arange(width)[None] + shift[1], 0, width - 1)
     edges = _edges(depth_m)
     noisy = np.where(edges, depth_m[rows, columns], depth_m)
-    noisy = noisy + axial_noise(noisy) * rng.standard_normal(noisy.shape, np.float32)
+    noisy = noisy + depth_sigma(noisy) * rng.standard_normal(noisy.shape, np.float32)
     chance = np.where(edges, 0.5, np.clip((_GRAZING[1] - cosine) / (_GRAZING[1] - _GRAZING[0]), 0, 1))
     holes = (rng.random(depth_m.shape, np.float32) < chance) | (depth_m < _NEAREST_M)
     return np.where(holes, 0, np.rint(noisy * 1000) / 1000).astype(np.float32)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigError
-from ..geometry import back_project, invert, multiply_quats, rotations_to_quats, transform
+from ..geometry import back_project, depth_sigma, invert, multiply_quats, rotations_to_quats, transform
 from ..registry import require_positive
 from ..types import Frame, Gaussians, Intrinsics
 
@@ -51,14 +51,6 @@ class Options:
         require_positive(self, "cell_size", "pixel_stride", "coverage", "gamma", "opacity", "edge", "min_pixels")
         if self.opacity > 1:
             raise ConfigError(f"'opacity' must be at most 1, got {self.opacity}.")
-
-
-def depth_sigma(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Standard deviation in metres of a structured-light or stereo depth measurement.
-
-    Source: C. V. Nguyen, S. Izadi, D. Lovell, Modeling Kinect Sensor Noise, 3DIMPVT 2012, axial noise.
-    """
-    return (0.0012 + 0.0019 * (depth_m - 0.4) ** 2).astype(np.float32)
 
 
 def away_from_edges(depth_m: NDArray[np.float32], edge: float) -> NDArray[np.bool_]:
