@@ -298,7 +298,7 @@ def _info_text(facts: dict[str, Any]) -> str:
     lines = [
         f"map        {facts['map']}  ({size / 1e6:.1f} MB)",
         f"capture    {facts['capture']['path']}  ({facts['capture']['format']})",
-        f"frames     {facts['frames']}, {facts['frames_with_pose']} with a pose, {facts['keyframes']} keyframes, "
+        f"frames     {facts['frames']}, {facts['frames_with_pose']} with a pose, {facts['keyframes']} keyframe{'s' if facts['keyframes'] != 1 else ''}, "
         f"{facts['submaps']} submap{'s' if facts['submaps'] != 1 else ''}",
         f"gaussians  {facts['gaussians']:,}",
         f"voxels     {facts['voxels']['occupied']:,} occupied, {facts['voxels']['free']:,} free, "

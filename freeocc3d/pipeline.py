@@ -131,6 +131,9 @@ def reconstruct(
         opened = _open(capture, resolved, progress, work)
         work.begin([_absolute(opened.path), len(opened), __version__], resolved)
         return _run(opened, resolved, output, work, progress)
+    except TrackingError:
+        work.discard()  # nothing in it is of use
+        raise
     except KeyboardInterrupt as error:
         raise Interrupted(
             f"Stopped. The work up to the last checkpoint is in {work.folder}: run the same command with --resume to "
@@ -253,7 +256,8 @@ def _check_result(trajectory: Trajectory, progress: Progress, work: WorkFolder) 
     if lost:
         share = lost / max(int(np.count_nonzero(used)), 1)
         first = int(np.flatnonzero(trajectory.status == "lost")[0])
-        text = f"Tracking lost {lost} frames ({share:.0%}), the first is frame {first}; they are not in the map."
+        frames = f"{lost} frame{'s' if lost > 1 else ''} ({share:.0%})"
+        text = f"Tracking lost {frames}, the first is frame {first}: what only these show is not in the map."
         if share > _FEW_TRACKED:
             text += " Most of the scan is missing: was it captured slowly, with depth in most of each image?"
         work.warnings.append(text)

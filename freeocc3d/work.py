@@ -155,6 +155,10 @@ class WorkFolder:
         finally:
             shutil.rmtree(aside.parent, ignore_errors=True)
 
+    def discard(self) -> None:
+        """Remove the folder of a run that cannot lead to a map."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
     def drop_if_empty(self) -> None:
         """Leave nothing behind where nothing was done."""
         with contextlib.suppress(OSError):

@@ -266,6 +266,7 @@ def test_a_scan_without_any_depth_says_so(tmp_path) -> None:
         cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
     with pytest.raises(TrackingError, match=r"capture\.depth_scale"):
         freeocc3d.reconstruct(scan, tmp_path / "map")
+    assert [p.name for p in tmp_path.iterdir()] == ["scan"]
 
 
 def test_depth_in_the_wrong_unit_is_warned_about(tmp_path) -> None:
