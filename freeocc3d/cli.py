@@ -282,6 +282,7 @@ def _info(loaded: Any) -> dict[str, Any]:
         "voxels": {"occupied": counts["voxels"]["occupied"], "free": counts["voxels"]["free"]},
         "voxel_size_m": manifest["voxel_size_m"],
         "encoder": manifest["encoder"]["name"],
+        "encoder_knows": loaded.text_encoder.knows,
         "bytes": {
             name: sum(size for file, size in manifest["files"].items() if file.split("/")[0] == name)
             for name in dict.fromkeys(file.split("/")[0] for file in manifest["files"])
@@ -304,8 +305,7 @@ def _info_text(facts: dict[str, Any]) -> str:
         f"gaussians  {facts['gaussians']:,}",
         f"voxels     {facts['voxels']['occupied']:,} occupied, {facts['voxels']['free']:,} free, "
         f"edge {facts['voxel_size_m']:g} m",
-        f"encoder    {facts['encoder']}"
-        + (" (colour names only: no image network is installed)" if facts["encoder"] == "colour" else ""),
+        f"encoder    {facts['encoder']}, which knows {facts['encoder_knows']}",
         f"time       {sum(facts['seconds'].values()):.1f} s: {seconds}",
         f"memory     {facts['peak_memory_bytes'] / 1e9:.2f} GB at most",
     ]

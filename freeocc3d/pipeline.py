@@ -173,7 +173,7 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
         occupancy = mapper.build_occupancy(gaussians, features, progress)
     _check_result(trajectory, progress, work)
     progress.stage("saving")
-    _save(work, capture, settings, trajectory, gaussians, features, occupancy, encoder, mapper.keyframes)
+    _save(work, mapper, trajectory, gaussians, features, occupancy, encoder)
     work.finish(output)
     return load_map(output)
 
@@ -266,26 +266,25 @@ def _check_result(trajectory: Trajectory, progress: Progress, work: WorkFolder) 
 
 def _save(
     work: WorkFolder,
-    capture: Capture,
-    settings: Config,
+    mapper: Mapper,
     trajectory: Trajectory,
     gaussians: Gaussians,
     features: NDArray[np.float16],
     occupancy: Occupancy,
     encoder: Encoder,
-    keyframes: Keyframes,
 ) -> None:
+    capture, keyframes = mapper.capture, mapper.keyframes
     folder = work.folder
     with work.timed("saving"):
         codec = Codec.fit(features)
         store.write_occupancy(folder, occupancy, codec, features)
         store.write_tum(folder / store.TRAJECTORY, trajectory)
-        (folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
+        (folder / store.CONFIG).write_text(config.dump(mapper.settings), encoding="utf-8")
         keyframes.save_index()
         keyframes.drop_unlisted()
     report = _report(work, capture, trajectory, gaussians, occupancy)
     (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
-    store.write_manifest(folder, _manifest(capture, trajectory, gaussians, occupancy, encoder, settings))
+    store.write_manifest(folder, _manifest(capture, trajectory, gaussians, occupancy, encoder, mapper.tracker.world))
 
 
 def _manifest(
@@ -294,14 +293,12 @@ def _manifest(
     gaussians: Gaussians,
     occupancy: Occupancy,
     encoder: Encoder,
-    settings: Config,
+    world: str,
 ) -> dict[str, Any]:
     return {
         "freeocc3d": __version__,
         "capture": {"path": _absolute(capture.path), "format": capture.format, "frames": len(capture)},
-        "frame": "OpenCV camera axes of the first keyframe, metres"
-        if settings["tracking"]["backend"] != "known"
-        else "world frame of the capture's poses, metres",
+        "frame": world,
         "poses": "camera to world",
         "voxel_size_m": occupancy.voxel_size,
         "origin": occupancy.origin.tolist(),

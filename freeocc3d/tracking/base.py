@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,9 @@ class Tracked:
 
 class Tracker(ABC):
     """Follows the camera through a capture. Frames must come in ascending order; some may be left out."""
+
+    world: ClassVar[str] = "OpenCV camera axes of the first keyframe, metres"
+    """The frame that poses and maps are in, for the map's manifest."""
 
     @abstractmethod
     def track(self, frame: Frame) -> Tracked:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,8 @@ def load(options: Options, capture: Capture) -> KnownTracker:
 
 class KnownTracker(Tracker):
     """The world frame is that of the capture's poses; a frame without a pose is lost."""
+
+    world: ClassVar[str] = "world frame of the capture's poses, metres"
 
     def __init__(self, options: Options, capture: Capture):
         self.options = options

@@ -218,7 +218,7 @@ class ColourWords(TextEncoder):
     threshold = 0.6
     temperature = 0.1
     same_word = 0.3
-    knows = "colour names"
+    knows = "colour names (it needs no image network, and has none)"
 
     def __init__(self) -> None:
         self._pure = np.sqrt(features_squared(np.eye(len(CENTROIDS))))
