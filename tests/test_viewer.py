@@ -88,3 +88,46 @@ def test_an_empty_map_and_an_unwritable_place_are_told(tmp_path) -> None:
     with pytest.raises(ExportError, match="no occupied voxel"):
         pictures.map_picture(room, tmp_path / "map.png")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_match_above_the_cut_is_drawn(tmp_path) -> None:
+    room = room_map(tmp_path)
+    below = pictures._below_cut(room.occupancy, pictures._upright(room.up, room.occupancy))
+    above = np.flatnonzero(~below)[:40]
+
+    def strong(rows) -> int:
+        """Pixels of the voxels: the box has no extent, so that it adds none."""
+        region = Region(0.7, 0.9, np.zeros(3), np.zeros(3), np.zeros(3), 0.04, rows)
+        found = SimpleNamespace(word="lamp", regions=[region])
+        pictures.query_picture(room, [found], tmp_path / "lamp.png", overwrite=True)
+        return shown(tmp_path / "lamp.png", HIGHLIGHTS[0], 40) - 16 * 17
+
+    assert strong(above) > 2000
+    few = np.flatnonzero(below)[:41]
+    assert strong(few) > 500
+    assert strong(np.append(few, above)) == strong(few)  # what is mostly below the cut stays cut
+
+
+def test_the_legend_holds_two_rows_and_counts_what_it_leaves_out() -> None:
+    assert pictures._placed([300] * 4) == [(0, 16), (0, 336), (0, 656), (0, 976)]
+    places = pictures._placed([300] * 40)
+    assert {row for row, _ in places} == {0, 1}
+    assert len(places) == 8
+    assert places[-1][1] + 300 <= pictures.SIZE[0] - 130
+    assert pictures._placed([]) == []
+
+
+def test_the_legend_tells_regions_and_scores() -> None:
+    regions = [SimpleNamespace(score=0.914), SimpleNamespace(score=0.3)]
+    assert pictures._found(SimpleNamespace(word="cup", regions=regions)) == "cup: 2 regions, best 0.91"
+    assert pictures._found(SimpleNamespace(word="cup", regions=regions[:1])) == "cup: 1 region, 0.91"
+    assert pictures._found(SimpleNamespace(word="cup", regions=[])) == "cup: no match"
+    assert len(pictures._found(SimpleNamespace(word="x" * 200, regions=[]))) < 70
+
+
+@pytest.mark.parametrize("by", ["rgb", "class", "height"])
+def test_an_empty_map_is_refused_however_it_is_coloured(tmp_path, by) -> None:
+    room = room_map(tmp_path)
+    room.occupancy = occupancy_of([])
+    with pytest.raises(ExportError, match="no occupied voxel"):
+        pictures.map_picture(room, tmp_path / "map.png", by)

@@ -4,7 +4,7 @@ Keys of the dense form (`form=dense`), over the box of all known voxels:
     occupancy (X, Y, Z) uint8: 0 free, 1 occupied, 255 unknown
     probability (X, Y, Z) float16: alpha of the voxel's centre
     labels (X, Y, Z) uint8: 0 free, k = classes[k - 1], len(classes) + 1 = occupied by nothing known, 255 unknown
-    classes (C,) names
+    classes (C,) names, C = 0 without a vocabulary; at most 253, so that every label fits into a byte
     origin (3,) lower corner of voxel (0, 0, 0), metres; voxel_size metres; T_world_map (4, 4)
 Of the sparse form: voxels (V, 3) int32 indices, state (V,) uint8 as above, probability (V,), labels (V,), classes,
 origin, voxel_size, T_world_map; voxel (i, j, k) covers origin + [i, i + 1) * voxel_size in both.
@@ -26,6 +26,7 @@ from ..types import FREE, OCCUPIED, UNKNOWN, Occupancy
 REQUIRES: tuple[str, ...] = ()
 
 _LARGEST_DENSE = 2 << 30
+_MOST_CLASSES = 253  # 0 is free, 254 at the most stands for "nothing known", 255 is unknown
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,12 @@ class Options:
 def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the arrays. Raises ExportError if the dense grid would not fit into memory."""
     form = dense if options.form == "dense" else sparse
-    arrays = form(scan_map.occupancy, scan_map.labels(), len(scan_map.vocabulary))
+    classes = scan_map.vocabulary[:_MOST_CLASSES]
+    arrays = form(scan_map.occupancy, scan_map.labels(), len(classes))
     arrays |= {
         "voxel_size": np.float64(scan_map.occupancy.voxel_size),
         "T_world_map": np.array(scan_map.manifest["T_world_map"], np.float64),
-        "classes": np.array(scan_map.vocabulary),
+        "classes": np.array(classes, np.str_),
     }
     with path.open("wb") as stream:
         np.savez_compressed(stream, **arrays)
@@ -59,7 +61,7 @@ def sparse(occupancy: Occupancy, labels: NDArray[np.uint8], classes: int) -> dic
     state = occupancy.state[block, local]
     offsets = np.stack((local // 64, local // 8 % 8, local % 8), axis=1)
     label = np.zeros(len(state), np.uint8)
-    label[state == OCCUPIED] = np.where(labels > 0, labels, min(classes + 1, 254))
+    label[state == OCCUPIED] = np.where(labels > 0, labels, classes + 1)
     return {
         "voxels": (occupancy.keys[block] * 8 + offsets).astype(np.int32),
         "state": state,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +15,11 @@ from ..occupancy.faces import exposed_faces
 from ..palette import class_colors, highlighted
 from ..query import QueryResult
 from ..store import Map
-from ..types import Occupancy
+from ..types import OCCUPIED, Occupancy
 
 REQUIRES: tuple[str, ...] = ()
+
+_COLORS = "rgb", "class", "height", "probability"
 
 
 @dataclass(frozen=True)
@@ -26,33 +29,57 @@ class Options:
     form: str = "cubes"
     """"cubes" for a mesh of the faces between occupied and other voxels, "points" for voxel centres."""
     color: str = "rgb"
-    """"rgb" for the surface's own colour, "class" for the class that fits best."""
+    """"rgb" for the surface's own colour, "class" for the class that fits best, "height" above the lowest voxel, or
+    "probability" of being occupied, 0 to 1; the last two from dark blue to yellow."""
 
     def __post_init__(self) -> None:
         if self.form not in ("cubes", "points"):
             raise ConfigError(f"'form' must be cubes or points, got '{self.form}'.")
-        if self.color not in ("rgb", "class"):
-            raise ConfigError(f"'color' must be rgb or class, got '{self.color}'.")
+        if self.color not in _COLORS:
+            raise ConfigError(f"'color' must be {', '.join(_COLORS[:-1])} or {_COLORS[-1]}, got '{self.color}'.")
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the occupied voxels. Raises ExportError for a map without any."""
-    colors = scan_map.occupancy.colors
-    if options.color == "class":
-        colors = class_colors(scan_map.vocabulary)[scan_map.labels()]
-    _write(scan_map.occupancy, colors, path, options.form)
+    _refuse_empty(scan_map.occupancy)
+    _write(scan_map.occupancy, _colors(scan_map, options.color), path, options.form)
 
 
 def write_query_ply(occupancy: Occupancy, results: list[QueryResult], path: Path, overwrite: bool = False) -> None:
     """Write all occupied voxels as cubes, those of the results' regions in one strong colour a word, the others pale.
     Raises ExportError."""
+    _refuse_empty(occupancy)
     colors = highlighted(occupancy.colors, [result.regions for result in results])
     write_whole(path, lambda target: _write(occupancy, colors, target, "cubes"), overwrite)
 
 
-def _write(occupancy: Occupancy, colors: NDArray[np.uint8], path: Path, form: str) -> None:
-    if len(colors) == 0:
+def _refuse_empty(occupancy: Occupancy) -> None:
+    if len(occupancy.colors) == 0:
         raise ExportError("The map has no occupied voxel to write.")
+
+
+def _colors(scan_map: Map, by: str) -> NDArray[np.uint8]:
+    """(V, 3) colour of each occupied voxel."""
+    occupancy = scan_map.occupancy
+    if by == "class":
+        return class_colors(scan_map.vocabulary)[scan_map.labels()]
+    if by == "height":
+        height = occupancy.centers(occupancy.occupied_voxels()) @ scan_map.up
+        return _ramp((height - height.min()) / max(float(np.ptp(height)), 1e-9))
+    if by == "probability":
+        return _ramp(occupancy.probability[occupancy.state == OCCUPIED])
+    return occupancy.colors
+
+
+def _ramp(values: NDArray[Any]) -> NDArray[np.uint8]:
+    """(N, 3) viridis colours of (N,) values in 0…1."""
+    import cv2  # here, for a query's PLY has no use for it and starts sooner without
+
+    level = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(level[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1])
+
+
+def _write(occupancy: Occupancy, colors: NDArray[np.uint8], path: Path, form: str) -> None:
     if form == "points":
         points = occupancy.centers(occupancy.occupied_voxels()).astype(np.float32)
         _write_ply(path, points, colors, None)

@@ -21,12 +21,15 @@ from ..types import Occupancy
 
 SIZE = 1600, 900
 CUT = 0.8
-"""What is higher than this share of the map's height is left out, so that one looks into the rooms."""
+"""What is higher than this share of the map's height is left out, so that one looks into the rooms; a region that lies
+mostly above it is drawn all the same."""
 
 _BAR = 56  # pixels above and below the views
 _BACKGROUND = (250, 250, 250)
 _TEXT = (40, 40, 40)
-_LEGEND_ENTRIES = 12
+_LEGEND_ROWS = 2
+_LONGEST_NAME = 48  # characters of a word in the legend
+_MARGIN, _SWATCH, _GAP, _MORE = 16, 22, 20, 130  # pixels: left edge, box before a name, after it, room for "and N more"
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,7 @@ def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: boo
 
     Raises ExportError (empty map, unwritable target, unknown colouring), DependencyError (no off-screen rendering).
     """
+    _refuse_empty(scan_map)
     occupancy = scan_map.occupancy
     legend: list[tuple[str, tuple[int, int, int]]] = []
     if by == "rgb":
@@ -53,13 +57,12 @@ def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: boo
         palette, labels = class_colors(scan_map.vocabulary), scan_map.labels()
         colors = palette[labels]
         present = np.bincount(labels, minlength=len(palette))
-        common = [int(k) for k in np.argsort(-present) if present[k]][:_LEGEND_ENTRIES]
+        common = [int(k) for k in np.argsort(-present, kind="stable") if present[k]]
         names = ["nothing known", *scan_map.vocabulary]
         legend = [(names[k], tuple(palette[k].tolist())) for k in common]
     elif by == "height":
         height = occupancy.centers(occupancy.occupied_voxels()) @ scan_map.up
-        span = max(float(np.ptp(height)), 1e-9) if len(height) else 1.0
-        ramp = np.rint(255 * (height - height.min(initial=np.inf)) / span).astype(np.uint8)
+        ramp = np.rint(255 * (height - height.min()) / max(float(np.ptp(height)), 1e-9)).astype(np.uint8)
         colors = cv2.applyColorMap(ramp[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
     else:
         raise ExportError(f"A map can be coloured by rgb, class or height, not by '{by}'.")
@@ -68,16 +71,29 @@ def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: boo
 
 def query_picture(scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False) -> None:
     """Draw the map pale with what each word matched in a strong colour, boxed; PNG. Raises as ``map_picture``."""
+    _refuse_empty(scan_map)
     colors = highlighted(scan_map.occupancy.colors, [result.regions for result in results])
     legend = []
     boxes: list[tuple[Region, tuple[int, int, int]]] = []
     for number, result in enumerate(results):
         color = tuple(HIGHLIGHTS[number % len(HIGHLIGHTS)].tolist())
-        count = len(result.regions)
-        found = f"{count} region{'s' if count != 1 else ''}" if count else "no match"
-        legend.append((f"{result.word}: {found}", color))
+        legend.append((_found(result), color))
         boxes += [(region, color) for region in result.regions]
     _draw(scan_map, colors, boxes, _title(scan_map), legend, Path(path), overwrite)
+
+
+def _found(result: QueryResult) -> str:
+    """What the legend says of a word: how many regions, and the score of the best."""
+    word = result.word if len(result.word) <= _LONGEST_NAME else result.word[: _LONGEST_NAME - 3] + "..."
+    if not result.regions:
+        return f"{word}: no match"
+    count, best = len(result.regions), f"{result.regions[0].score:.2f}"
+    return f"{word}: {count} regions, best {best}" if count > 1 else f"{word}: 1 region, {best}"
+
+
+def _refuse_empty(scan_map: Map) -> None:
+    if len(scan_map.occupancy.colors) == 0:
+        raise ExportError(f"The map {scan_map.path} has no occupied voxel to draw.")
 
 
 def _draw(
@@ -89,8 +105,6 @@ def _draw(
     path: Path,
     overwrite: bool,
 ) -> None:
-    if len(colors) == 0:
-        raise ExportError(f"The map {scan_map.path} has no occupied voxel to draw.")
     scene = _scene(scan_map, colors, regions)
     width, height = SIZE[0] // 2, SIZE[1] - 2 * _BAR
     views = np.hstack([_render(scene, view, (width, height)) for view in ("above", "corner")])
@@ -104,10 +118,14 @@ def _write_bytes(path: Path, data: bytes) -> None:
 
 
 def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region, tuple[int, int, int]]]) -> _Scene:
-    """The voxels' exposed faces below the cut, turned so that z is up and the longer walls lie along x."""
+    """The exposed faces of the voxels below the cut and of the regions that lie mostly above it, turned so that z is up
+    and the longer walls lie along x."""
     occupancy = scan_map.occupancy
     R = _upright(scan_map.up, occupancy)
     kept = _below_cut(occupancy, R)
+    for region, _ in regions:  # a lamp that was asked for is drawn; a wall that was asked for does not hide the room
+        if 2 * np.count_nonzero(kept[region.rows]) < len(region.rows):
+            kept[region.rows] = True
     vertices, quads, rows = exposed_faces(occupancy, kept)
     turned = vertices.astype(np.float64) @ R.T
     corners = turned.reshape(-1, 4, 3)
@@ -218,16 +236,30 @@ def _framed(views: NDArray[np.uint8], title: str, legend: list[tuple[str, tuple[
     picture = np.full((SIZE[1], SIZE[0], 3), _BACKGROUND, np.uint8)
     picture[_BAR : _BAR + views.shape[0], : views.shape[1]] = views
     _put(picture, title, (16, 36), 0.62)
-    x = 16
-    baseline = SIZE[1] - 20
-    for text, color in legend:
-        width = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.52, 1)[0][0]
-        if x + 24 + width > SIZE[0]:
-            break
-        cv2.rectangle(picture, (x, baseline - 14), (x + 16, baseline + 2), color, -1, cv2.LINE_AA)
-        _put(picture, text, (x + 22, baseline), 0.52)
-        x += 22 + width + 20
+    widths = [_SWATCH + cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.52, 1)[0][0] for text, _ in legend]
+    places = _placed(widths)
+    baselines = (SIZE[1] - 20,) if not places or places[-1][0] == 0 else (SIZE[1] - 36, SIZE[1] - 12)
+    for (text, color), (row, x) in zip(legend, places, strict=False):
+        y = baselines[row]
+        cv2.rectangle(picture, (x, y - 14), (x + 16, y + 2), color, -1, cv2.LINE_AA)
+        _put(picture, text, (x + _SWATCH, y), 0.52)
+    if left_out := len(legend) - len(places):
+        _put(picture, f"and {left_out} more", (SIZE[0] - _MORE, baselines[-1]), 0.52)
     return picture
+
+
+def _placed(widths: list[int]) -> list[tuple[int, int]]:
+    """(row, x) of the legend's entries, as many as its rows hold; the last row keeps room to count those left out."""
+    places: list[tuple[int, int]] = []
+    row, x = 0, _MARGIN
+    for width in widths:
+        while row < _LEGEND_ROWS and x + width > SIZE[0] - (_MORE if row == _LEGEND_ROWS - 1 else _MARGIN):
+            row, x = row + 1, _MARGIN
+        if row == _LEGEND_ROWS:
+            break
+        places.append((row, x))
+        x += width + _GAP
+    return places
 
 
 def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: float) -> None:
