@@ -1,4 +1,4 @@
-"""Colours for classes and for what a query found."""
+"""Colours for classes, heights and what a query found."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .query import Region
+from .types import Occupancy
 
 HIGHLIGHTS = np.array(
     [(255, 64, 32), (20, 120, 255), (30, 190, 70), (240, 60, 200), (255, 170, 0), (0, 190, 200)], np.uint8
@@ -38,6 +39,20 @@ def highlighted(colors: NDArray[np.uint8], words: list[list[Region]]) -> NDArray
         for region in regions:
             out[region.rows] = HIGHLIGHTS[number % len(HIGHLIGHTS)]
     return out
+
+
+def height_colors(occupancy: Occupancy, up: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(V, 3) colour of each occupied voxel by its height along ``up``, lowest dark blue, highest yellow."""
+    height = occupancy.centers(occupancy.occupied_voxels()) @ up
+    return ramp((height - height.min()) / max(float(np.ptp(height)), 1e-9))
+
+
+def ramp(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """(N, 3) viridis colours of (N,) values in 0…1."""
+    import cv2  # here, for a query's PLY has no use for it and starts sooner without
+
+    level = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(level[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8)
 
 
 def _hashed(name: str) -> tuple[int, int, int]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import ConfigError, ExportError
 from ..files import write_whole
 from ..occupancy.faces import exposed_faces
-from ..palette import class_colors, highlighted
+from ..palette import class_colors, height_colors, highlighted, ramp
 from ..query import QueryResult
 from ..store import Map
 from ..types import OCCUPIED, Occupancy
@@ -64,19 +63,10 @@ def _colors(scan_map: Map, by: str) -> NDArray[np.uint8]:
     if by == "class":
         return class_colors(scan_map.vocabulary)[scan_map.labels()]
     if by == "height":
-        height = occupancy.centers(occupancy.occupied_voxels()) @ scan_map.up
-        return _ramp((height - height.min()) / max(float(np.ptp(height)), 1e-9))
+        return height_colors(occupancy, scan_map.up)
     if by == "probability":
-        return _ramp(occupancy.probability[occupancy.state == OCCUPIED])
+        return ramp(occupancy.probability[occupancy.state == OCCUPIED])
     return occupancy.colors
-
-
-def _ramp(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """(N, 3) viridis colours of (N,) values in 0…1."""
-    import cv2  # here, for a query's PLY has no use for it and starts sooner without
-
-    level = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
-    return np.asarray(cv2.applyColorMap(level[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1])
 
 
 def _write(occupancy: Occupancy, colors: NDArray[np.uint8], path: Path, form: str) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import DependencyError, ExportError, FreeOccError
 from ..files import write_whole
 from ..occupancy.faces import exposed_faces
-from ..palette import HIGHLIGHTS, class_colors, highlighted
+from ..palette import HIGHLIGHTS, class_colors, height_colors, highlighted
 from ..query import QueryResult, Region
 from ..store import Map
 from ..types import Occupancy
@@ -61,9 +61,7 @@ def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: boo
         names = ["nothing known", *scan_map.vocabulary]
         legend = [(names[k], tuple(palette[k].tolist())) for k in common]
     elif by == "height":
-        height = occupancy.centers(occupancy.occupied_voxels()) @ scan_map.up
-        ramp = np.rint(255 * (height - height.min()) / max(float(np.ptp(height)), 1e-9)).astype(np.uint8)
-        colors = cv2.applyColorMap(ramp[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
+        colors = height_colors(occupancy, scan_map.up)
     else:
         raise ExportError(f"A map can be coloured by rgb, class or height, not by '{by}'.")
     _draw(scan_map, colors, [], _title(scan_map), legend, Path(path), overwrite)
