@@ -295,12 +295,13 @@ def _info(loaded: Any) -> dict[str, Any]:
 
 def _info_text(facts: dict[str, Any]) -> str:
     size = sum(facts["bytes"].values())
+    used = facts["frames"] - facts["frame_status"].get("unused", 0)
     plural = {name: "s" if facts[name] != 1 else "" for name in ("keyframes", "submaps")}
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in facts["seconds"].items())
     lines = [
         f"map        {facts['map']}  ({size / 1e6:.1f} MB)",
         f"capture    {facts['capture']['path']}  ({facts['capture']['format']})",
-        f"frames     {facts['frames']}, {facts['frames_with_pose']} with a pose, "
+        f"frames     {facts['frames']} in the capture, {used} used, {facts['frames_with_pose']} with a pose, "
         f"{facts['keyframes']} keyframe{plural['keyframes']}, {facts['submaps']} submap{plural['submaps']}",
         f"gaussians  {facts['gaussians']:,}",
         f"voxels     {facts['voxels']['occupied']:,} occupied, {facts['voxels']['free']:,} free, "

@@ -171,6 +171,11 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
         features = work.features(lambda: mapper.build_features(gaussians, encoder, progress))
     with work.timed("occupancy"):
         occupancy = mapper.build_occupancy(gaussians, features, progress)
+    if not len(occupancy.colors):
+        raise TrackingError(
+            f"No voxel of {capture.path} is occupied: is its depth in the right unit (capture.depth_scale), and is "
+            "occupancy.voxel_size smaller than the scene?"
+        )
     _check_result(trajectory, progress, work)
     progress.stage("saving")
     _save(work, mapper, trajectory, gaussians, features, occupancy, encoder)
@@ -251,6 +256,11 @@ def _open(capture: str | Path, settings: Config, progress: Progress, work: WorkF
 
 def _check_result(trajectory: Trajectory, progress: Progress, work: WorkFolder) -> None:
     """Warn about a run whose map shows only part of the scan."""
+    if work.broken:
+        count = len(work.broken)
+        text = f"{count} frame{'s' if count > 1 else ''} could not be read and were skipped; report.json says why."
+        work.warnings.append(text)
+        progress.warn(text)
     used = trajectory.status != "unused"
     lost = int(np.count_nonzero(trajectory.status == "lost"))
     if lost:

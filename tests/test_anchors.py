@@ -140,6 +140,13 @@ def test_pixels_at_depth_edges_are_dropped() -> None:
     assert good[:, 11:].all()
 
 
+def test_cells_smaller_than_the_pixels_spacing_keep_the_surface() -> None:
+    # 15 mm between pixels, cells of 5 mm: every pixel stays, as a Gaussian as wide as the spacing.
+    g = lifted([wall_frame(2.0)], [np.eye(4)], cell=0.005)
+    assert len(g) > 0.95 * CAMERA.width * CAMERA.height
+    assert g.scales[:, 0].min() == pytest.approx(0.62 * 2.0 / CAMERA.fx, rel=1e-3)
+
+
 def test_a_frame_without_depth_adds_nothing() -> None:
     frame = wall_frame(2.0)
     empty = Frame(0, 0.0, frame.color, np.zeros_like(frame.depth_m), CAMERA)

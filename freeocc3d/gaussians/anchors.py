@@ -30,7 +30,8 @@ class Options:
     cell_size: float | None = None
     """Edge of the cells that hold one Gaussian each, metres; null = half the voxel size."""
     pixel_stride: int | None = None
-    """Every n-th pixel of a keyframe, in both directions, is lifted; null = as many as leave 320 columns."""
+    """Every n-th pixel of a keyframe, in both directions, is lifted; null = as many as leave 320 columns, more where
+    cells are small."""
     coverage: float = 0.62
     """s_perp over the spacing of the Gaussians, which is the cell's edge or, where that is greater, the footprint of a
     pixel on the surface. At 0.62 a flat wall reaches alpha = 0.5 half a voxel from its surface,
@@ -45,7 +46,7 @@ class Options:
     """Pixels whose depth differs from a neighbour's by more than this share of it are dropped: at an edge the sensor
     reports depths that belong to neither side."""
     min_pixels: int = 2
-    """Measurements that a cell needs."""
+    """Measurements that a cell needs, unless it is too small to hold so many."""
 
     def __post_init__(self) -> None:
         require_positive(self, "cell_size", "pixel_stride", "coverage", "gamma", "opacity", "edge", "min_pixels")
@@ -128,7 +129,9 @@ class AnchoredCells:
         if self._cells is None:
             return _no_gaussians()
         cells = self._cells
-        keep = cells.pixels >= self.options.min_pixels
+        # A cell smaller than the measurements' spacing cannot hold as many as a large one: one is enough there.
+        possible = np.maximum((self.cell_size / cells.best_footprint) ** 2, 1.0)
+        keep = cells.pixels >= np.minimum(self.options.min_pixels, np.floor(possible))
         mean = (cells.position[keep] / cells.weight[keep, None]).astype(np.float32)
         color = np.rint(cells.color[keep] / cells.weight[keep, None]).astype(np.uint8)
         keyframe = cells.best_keyframe[keep]
@@ -138,7 +141,7 @@ class AnchoredCells:
         return ray_aligned(anchor_cam, keyframe, T_world_keyframe, self.options.coverage * spacing, color, self.options)
 
     def _measure(self, frame: Frame, T_world_cam: NDArray[np.float64], row: int) -> _Cells | None:
-        step = self.options.pixel_stride or max(1, frame.intrinsics.width // 320)
+        step = self.options.pixel_stride or self._stride(frame)
         usable = away_from_edges(frame.depth_m, self.options.edge)[::step, ::step]
         v, u = (step * index for index in np.nonzero(usable))
         if len(v) == 0:
@@ -162,6 +165,13 @@ class AnchoredCells:
             np.full(len(key), row, np.int32),
             footprint.astype(np.float32),
         )
+
+    def _stride(self, frame: Frame) -> int:
+        """As many pixels as leave 320 columns, or more where cells are small: about two to a cell's edge."""
+        measured = frame.depth_m[frame.depth_m > 0]
+        usual = float(np.median(measured)) if len(measured) else 1.0
+        fine = int(0.5 * self.cell_size * frame.intrinsics.fx / usual)
+        return max(1, min(frame.intrinsics.width // 320, fine))
 
     def _merge(self) -> None:
         if not self._pending:
