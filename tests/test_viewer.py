@@ -84,6 +84,8 @@ def test_an_empty_map_and_an_unwritable_place_are_told(tmp_path) -> None:
     room = room_map(tmp_path)
     with pytest.raises(ExportError, match="Cannot write"):
         pictures.map_picture(room, tmp_path / "missing" / "map.png")
+    with pytest.raises(ExportError, match=r"map\.png in place of"):
+        pictures.map_picture(room, tmp_path / "map.jpg")
     room.occupancy = occupancy_of([])
     with pytest.raises(ExportError, match="no occupied voxel"):
         pictures.map_picture(room, tmp_path / "map.png")

@@ -103,6 +103,8 @@ def _draw(
     path: Path,
     overwrite: bool,
 ) -> None:
+    if path.suffix.lower() != ".png":
+        raise ExportError(f"Pictures are written as PNG: name it {path.with_suffix('.png')} in place of {path}.")
     scene = _scene(scan_map, colors, regions)
     width, height = SIZE[0] // 2, SIZE[1] - 2 * _BAR
     views = np.hstack([_render(scene, view, (width, height)) for view in ("above", "corner")])
