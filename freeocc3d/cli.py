@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from . import __version__
-from .errors import FreeOccError
+from .errors import ExportError, FreeOccError
 from .progress import Progress
 
 app = typer.Typer(
@@ -167,6 +167,96 @@ def export(
         options[name.strip()] = yaml.safe_load(text)
     export_map(load_map(map_path), format_name, output, options, overwrite=overwrite)
     print(f"{output}: {output.stat().st_size:,} bytes")
+
+
+@app.command()
+def evaluate(
+    maps: Annotated[
+        list[Path] | None, typer.Argument(metavar="[MAP]...", help="Map folders; pooled by voxels.")
+    ] = None,
+    ground_truth: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--ground-truth",
+            metavar="GT",
+            help="ground_truth.npz, a package's <scene>.pkl, or a folder of packages; one for each map. "
+            "[default: the capture's own]",
+        ),
+    ] = None,
+    gaussians: Annotated[
+        Path | None, typer.Option("--gaussians", metavar="PLY", help="Score another system's 3DGS PLY.")
+    ] = None,
+    grid: Annotated[Path | None, typer.Option("--grid", metavar="NPZ", help="Score a finished voxel grid.")] = None,
+    frames: Annotated[
+        Path | None, typer.Option("--frames", metavar="FOLDER", help="Score per-frame Gaussians, fused by true poses.")
+    ] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option("--trajectory", metavar="TXT", help="Trajectory of --gaussians or --grid (TUM).")
+    ] = None,
+    poses: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--poses",
+            metavar="FILE|CAPTURE",
+            help="True poses; one for each map. [default: the poses of the capture that the map was made of]",
+        ),
+    ] = None,
+    align: Annotated[str, typer.Option("--align", help="se3, sim3 (monocular) or none.")] = "se3",
+    classes: Annotated[Path | None, typer.Option("--classes", metavar="FILE", help="Classes to score.")] = None,
+    split: Annotated[
+        Path | None, typer.Option("--split", metavar="FILE", help="Score the scenes that this file lists.")
+    ] = None,
+    overrides: Set = None,
+    as_json: Json = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Score maps, or what other systems made, against the truth."""
+    from .evaluation import evaluate as scoring
+
+    others = {"--gaussians": gaussians, "--grid": grid, "--frames": frames}
+    named = [f"{option} {path}" for option, path in others.items() if path is not None]
+    if len(named) + bool(maps) != 1:
+        raise typer.BadParameter("give maps, or one of --gaussians, --grid and --frames.")
+    asked = scoring.Asked(
+        maps=maps or [],
+        gaussians=gaussians,
+        grid=grid,
+        frames=frames,
+        trajectory=trajectory,
+        ground_truths=ground_truth or [],
+        poses=poses or [],
+        align=align,
+        classes=classes,
+        split=split,
+        overrides=overrides or [],
+    )
+    result = scoring.evaluate(asked)
+    print(json.dumps(result.to_json()) if as_json else result.to_text())
+
+
+@app.command("ground-truth")
+def ground_truth_command(
+    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Folder of a scan with poses, or builtin:room.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="GT.npz", help="File to write.")],
+    protocol: Annotated[str, typer.Option("--protocol", help="replicaocc (the only one).")] = "replicaocc",
+    overrides: Set = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Build the true occupancy of a capture from its poses, depth and class images."""
+    from .evaluation import replicaocc
+    from .evaluation.ground_truth import save_ground_truth
+
+    if protocol != "replicaocc":
+        raise typer.BadParameter(f"'{protocol}' is not a protocol; there is replicaocc.", param_hint="--protocol")
+    if output.exists() and not overwrite:
+        raise ExportError(f"{output} exists: choose another name, or replace it with --overwrite.")
+    progress = ConsoleProgress()
+    try:
+        truth = replicaocc.build(capture, overrides or [], progress)
+    finally:
+        progress.close()
+    save_ground_truth(truth, output, overwrite)
+    print(replicaocc.to_text(truth, output))
 
 
 @app.command()

@@ -122,6 +122,11 @@ def depth_sigma(depth_m: Array) -> Array:
     return np.asarray(0.0012 + 0.0019 * (depth_m - 0.4) ** 2, np.float32)
 
 
+_STRAIGHT = 0.005
+"""Points whose second principal spread is a smaller share of the first lie on a line: what turns them about it is a
+trajectory's jitter, not its shape."""
+
+
 def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Array, Array]:
     """The similarity (s, R, t) that minimises sum |target - (s R source + t)|^2 over (N, 3) point pairs.
 
@@ -135,9 +140,11 @@ def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Arra
     centred_source, centred_target = source - mean_source, target - mean_target
     variance = (centred_source**2).sum() / len(source)  # eq. 36
     covariance = centred_target.T @ centred_source / len(source)  # eq. 38
+    for points in (centred_source, centred_target):
+        spread = np.linalg.svd(points, compute_uv=False)
+        if spread[1] <= _STRAIGHT * spread[0]:
+            raise FreeOccError("Alignment is not determined: the camera centres are identical or lie on one line.")
     U, D, Vt = np.linalg.svd(covariance)
-    if D[1] <= 1e-9 * max(D[0], 1e-12):
-        raise FreeOccError("Alignment is not determined: the camera centres are identical or lie on one line.")
     S = np.eye(3)
     if np.linalg.det(U) * np.linalg.det(Vt) < 0:
         S[2, 2] = -1.0  # eq. 39

@@ -124,7 +124,7 @@ def reconstruct(
     """
     progress = progress or Progress()
     resolved = config.resolve(settings or {})
-    _check_ranges(resolved)
+    check(resolved)
     output = Path(output)
     work = WorkFolder.open(output, overwrite, resume)
     try:
@@ -358,9 +358,9 @@ def _load_backend(settings: Config, section: str, key: str, capture: Capture) ->
     return module.load(registry.build_options(module, settings[section].get(name, {})), capture)
 
 
-def _check_ranges(settings: Config) -> None:
+def check(settings: Config) -> None:
     """Build the options of every layer and of the chosen backends, so that a value out of range is told before any
-    work."""
+    work. Raises ConfigError, or DependencyError for a backend whose packages are not installed."""
     for section, module in (("gaussians", anchors), ("language", lift), ("occupancy", splat), ("carving", carve)):
         _options(module, config.options(settings, section))
     for section, key in (("tracking", "backend"), ("language", "encoder")):

@@ -136,6 +136,19 @@ def similarity(features: NDArray[np.floating], text: TextFeatures) -> NDArray[np
     return np.minimum(cosine if text.attainable is None else cosine / text.attainable, np.float32(1))
 
 
+def nearest_word(features: NDArray[np.float16], text: TextFeatures) -> NDArray[np.int64]:
+    """(V,) which of W words is nearest to each of (V, D) features by plain cosine, -1 where nothing is known.
+
+    Of "table" and "coffee table" the narrower word is nearer to a coffee table, though both fit.
+    """
+    nearest = np.full(len(features), -1, np.int64)
+    for start in range(0, len(features) if len(text.understood) else 0, _ROWS):
+        chunk = features[start : start + _ROWS].astype(np.float32)
+        cosines = chunk @ text.features.T
+        nearest[start : start + _ROWS] = np.where(chunk.any(axis=1), cosines.argmax(axis=1), -1)
+    return nearest
+
+
 def _in_chunks(features: NDArray[np.float16], text: TextFeatures) -> NDArray[np.float32]:
     """``similarity``, some rows at a time."""
     scores = np.zeros((len(features), len(text.understood)), np.float32)

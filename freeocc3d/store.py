@@ -141,13 +141,10 @@ class Map:
 
     @functools.cached_property
     def _class_labels(self) -> NDArray[np.uint8]:
-        words = self.vocabulary[:253]
-        features = self.occupancy.features.astype(np.float32)
-        if not words or not len(features):
-            return np.zeros(len(features), np.uint8)
-        # Plain cosines: of "table" and "coffee table" the narrower word is nearer to a coffee table, though both fit.
-        cosines = features @ self.text_encoder.encode_words(words).features.T
-        return np.where(features.any(axis=1), cosines.argmax(axis=1) + 1, 0).astype(np.uint8)
+        from . import query
+
+        text = self.text_encoder.encode_words(self.vocabulary[:253])
+        return (query.nearest_word(self.occupancy.features, text) + 1).astype(np.uint8)
 
     def labels(self) -> NDArray[np.uint8]:
         """(V,) class of each occupied voxel: 0 = nothing known, k = ``vocabulary[k - 1]``."""

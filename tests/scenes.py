@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from freeocc3d.types import Frame, Gaussians, Intrinsics, Occupancy
@@ -81,3 +83,27 @@ def occupancy_of(
     features = np.zeros((len(voxels), 2)) if features is None else np.asarray(features, float)
     colors = np.full((len(voxels), 3), 100) if colors is None else np.asarray(colors)
     return empty.replace(features=features[order].astype(np.float16), colors=colors[order].astype(np.uint8))
+
+
+def write_standard_ply(
+    path: Path, written: Gaussians, spheres: bool = False, harmonics: int = 0, labels: np.ndarray | None = None
+) -> Path:
+    """Write Gaussians as 3D Gaussian splatting systems do: logits, logarithms, spherical harmonics."""
+    n = len(written)
+    with np.errstate(invalid="ignore"):
+        columns = {
+            **{axis: written.means[:, i] for i, axis in enumerate("xyz")},
+            **{f"n{axis}": np.zeros(n) for axis in "xyz"},
+            **{f"f_dc_{i}": (written.colors[:, i] / 255 - 0.5) / 0.28209479177387814 for i in range(3)},
+            **{f"f_rest_{i}": np.zeros(n) for i in range(harmonics)},
+            "opacity": np.log(written.opacities / np.maximum(1 - written.opacities, 1e-6)),
+            **{f"scale_{i}": np.log(written.scales[:, i]) for i in range(1 if spheres else 3)},
+            **{
+                f"rot_{i}": 2.0 * written.quats_wxyz[:, i] for i in range(4)
+            },  # not of unit length, as optimisers leave it
+            **({} if labels is None else {"label": labels}),
+        }
+    header = "".join(f"property float {name}\n" for name in columns)
+    text = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{header}end_header\n"
+    path.write_bytes(text.encode() + np.stack(list(columns.values()), axis=1).astype("<f4").tobytes())
+    return path

@@ -20,7 +20,8 @@ FLOORS = (
     ("occupancy",),
     ("query",),
     ("store", "palette"),
-    ("export", "evaluation", "viewer", "work"),
+    ("export", "viewer", "work"),
+    ("evaluation",),
     ("pipeline",),
     ("cli", "__init__"),
 )

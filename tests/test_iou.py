@@ -1,20 +1,25 @@
-"""Occupied voxels against the truth, and the file that holds the truth."""
-
-from pathlib import Path
-from typing import Any
+"""Scores of cases that are counted by hand."""
 
 import numpy as np
 import pytest
-from helpers import data_folder
+from numpy.typing import NDArray
 
 from freeocc3d.errors import FreeOccError
-from freeocc3d.evaluation.iou import load_ground_truth, occupancy_iou
+from freeocc3d.evaluation.iou import Prediction, Scores, confusion
+
+NAMES = ("wall", "floor", "sofa", "lamp")
 
 
-def test_scores_of_a_case_counted_by_hand() -> None:
-    labels = np.array([1, 2, 3, 4, 0, 0, 255, 255], np.uint8).reshape(2, 2, 2)
-    occupied = np.array([1, 1, 1, 0, 1, 0, 1, 0], bool).reshape(2, 2, 2)
-    score = occupancy_iou(labels, occupied)
+def scores(labels: object, occupied: object, classes: object = None, names: tuple[str, ...] = NAMES) -> Scores:
+    """Of lists of voxels; 255 is outside the mask."""
+    true = np.array(labels, np.uint8).reshape(-1, 1, 1)
+    claimed = None if classes is None else np.array(classes, np.uint8).reshape(true.shape)
+    predicted = Prediction(np.array(occupied, bool).reshape(true.shape), claimed)
+    return Scores(confusion(true, predicted, true != 255, len(names)), names)
+
+
+def test_occupancy_counted_by_hand() -> None:
+    score = scores([1, 2, 3, 4, 0, 0, 255, 255], [1, 1, 1, 0, 1, 0, 1, 0])
     assert score.iou == pytest.approx(3 / 5)
     assert score.precision == pytest.approx(3 / 4)
     assert score.recall == pytest.approx(3 / 4)
@@ -22,115 +27,111 @@ def test_scores_of_a_case_counted_by_hand() -> None:
 
 
 def test_precision_and_recall_are_not_exchanged() -> None:
-    labels = np.array([1, 1, 1, 0], np.uint8).reshape(1, 2, 2)
-    score = occupancy_iou(labels, np.array([1, 0, 0, 0], bool).reshape(1, 2, 2))
+    score = scores([1, 1, 1, 0], [1, 0, 0, 0])
     assert (score.precision, score.recall) == (1.0, pytest.approx(1 / 3))
+
+
+def test_classes_counted_by_hand() -> None:
+    #          hit, hit, taken for floor, missed | hit, without class | invented wall | free
+    truth = [1, 1, 1, 1, 2, 2, 0, 0]
+    occupied = [1, 1, 1, 0, 1, 1, 1, 0]
+    classes = [1, 1, 2, 0, 2, 0, 1, 0]
+    score = scores(truth, occupied, classes)
+    # wall: 2 hits, of 4 true and 3 claimed; floor: 1 hit, of 2 true and 2 claimed.
+    np.testing.assert_allclose(score.class_iou, [2 / 5, 1 / 3, 0, 0])
+    assert score.miou(("wall", "floor")) == pytest.approx((2 / 5 + 1 / 3) / 2)
+    assert score.miou(NAMES) == pytest.approx((2 / 5 + 1 / 3) / 4)  # absent classes count 0
+    assert score.present == ("wall", "floor")
+    assert score.most_frequent(1) == ("wall",)
+    expected = np.zeros((5, 6), int)
+    expected[0, [0, 1]] = 1
+    expected[1, [0, 1, 2]] = 1, 2, 1
+    expected[2, [2, 5]] = 1
+    np.testing.assert_array_equal(score.matrix, expected)
+
+
+def test_pooling_adds_voxels_not_scores() -> None:
+    one, two = scores([1, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1]), scores([1, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0])
+    pooled = Scores(one.matrix + two.matrix, NAMES)
+    assert pooled.iou == pytest.approx(3 / 5)
+    assert pooled.class_iou[0] == pytest.approx(3 / 5)
+
+
+def test_a_class_claimed_where_nothing_is_occupied_does_not_count() -> None:
+    assert scores([1, 0], [0, 0], [1, 1]).class_iou[0] == 0.0
+    np.testing.assert_array_equal(scores([1, 0], [0, 0], [1, 1]).matrix[:, 1:], 0)
 
 
 def test_what_was_not_observed_does_not_count() -> None:
     rng = np.random.default_rng(0)
-    labels = rng.choice(np.array([0, 1, 255], np.uint8), (6, 7, 8))
-    occupied = rng.random((6, 7, 8)) < 0.5
-    flipped = occupied ^ (labels == 255)
-    assert occupancy_iou(labels, flipped) == occupancy_iou(labels, occupied)
+    labels = rng.choice(np.array([0, 1, 2, 255], np.uint8), 300)
+    occupied, classes = rng.random(300) < 0.5, rng.integers(0, 3, 300)
+    other = np.where(labels == 255, ~occupied, occupied)
+    np.testing.assert_array_equal(scores(labels, occupied, classes).matrix, scores(labels, other, classes).matrix)
 
 
-def test_perfect_empty_and_opposite_predictions() -> None:
-    labels = np.array([0, 1, 5, 0], np.uint8).reshape(2, 2, 1)
-    assert occupancy_iou(labels, labels > 0).iou == 1.0
-    assert occupancy_iou(labels, labels == 0).iou == 0.0
-    empty = occupancy_iou(labels, np.zeros((2, 2, 1), bool))
+def test_the_order_of_voxels_does_not_count() -> None:
+    rng = np.random.default_rng(1)
+    labels, occupied, classes = rng.integers(0, 5, 400), rng.random(400) < 0.5, rng.integers(0, 5, 400)
+    order = rng.permutation(400)
+    shuffled = scores(labels[order], occupied[order], classes[order])
+    np.testing.assert_array_equal(scores(labels, occupied, classes).matrix, shuffled.matrix)
+
+
+@pytest.mark.parametrize("names", [NAMES, ("occupied",)])
+def test_the_truth_as_prediction_scores_one_everywhere(names: tuple[str, ...]) -> None:
+    labels = np.random.default_rng(2).integers(0, len(names) + 1, 500)
+    score = scores(labels, labels > 0, labels, names)
+    assert (score.iou, score.precision, score.recall) == (1.0, 1.0, 1.0)
+    assert score.miou(score.present) == 1.0
+
+
+def test_empty_and_opposite_predictions_score_zero() -> None:
+    labels = np.array([0, 1, 3, 0])
+    assert scores(labels, labels == 0).iou == 0.0
+    empty = scores(labels, np.zeros(4))
     assert (empty.iou, empty.precision, empty.recall) == (0.0, 0.0, 0.0)
+
+
+def cube(shift: int = 0) -> NDArray[np.uint8]:
+    """A solid cube of 4 voxels' edge in a grid of 10, shifted along the first axis."""
+    labels = np.zeros((10, 10, 10), np.uint8)
+    labels[2 + shift : 6 + shift, 2:6, 2:6] = 1
+    return labels
+
+
+def test_a_shift_by_one_voxel_costs_what_the_overlap_says() -> None:
+    moved = scores(cube().ravel(), cube(1).ravel() > 0, cube(1).ravel(), ("box",))
+    # 3 of 4 slices overlap; together they are 5.
+    assert moved.iou == pytest.approx(3 / 5)
+    assert moved.precision == moved.recall == pytest.approx(3 / 4)
+    assert moved.miou(("box",)) == pytest.approx(3 / 5)
+
+
+def test_a_swapped_axis_costs_what_the_overlap_says() -> None:
+    bar = np.zeros((10, 10, 10), bool)
+    bar[1:9, 4:6, 4:6] = True
+    swapped = bar.swapaxes(0, 1)
+    # Two bars of 8 x 2 x 2 that cross in a cube of 2 x 2 x 2.
+    assert scores(bar.ravel().astype(int), swapped.ravel()).iou == pytest.approx(8 / (32 + 32 - 8))
 
 
 def test_a_prediction_on_another_lattice_is_refused() -> None:
     with pytest.raises(FreeOccError, match=r"\(2, 2, 3\)"):
-        occupancy_iou(np.zeros((2, 2, 2), np.uint8), np.zeros((2, 2, 3), bool))
+        confusion(np.zeros((2, 2, 2), np.uint8), Prediction(np.zeros((2, 2, 3), bool)), np.ones((2, 2, 2), bool), 1)
 
 
 def test_voxel_states_are_not_taken_for_a_prediction() -> None:
+    states = np.full((2, 2, 2), 255, np.uint8)
     with pytest.raises(FreeOccError, match="boolean"):
-        occupancy_iou(np.zeros((2, 2, 2), np.uint8), np.full((2, 2, 2), 255, np.uint8))  # type: ignore[arg-type]
+        confusion(np.zeros((2, 2, 2), np.uint8), Prediction(states), np.ones((2, 2, 2), bool), 1)  # type: ignore[arg-type]
 
 
 def test_a_truth_that_observed_nothing_is_refused() -> None:
     with pytest.raises(FreeOccError, match="observed no voxel"):
-        occupancy_iou(np.full((2, 2, 2), 255, np.uint8), np.zeros((2, 2, 2), bool))
+        scores([255, 255], [0, 1])
 
 
-def truth(**changes: Any) -> dict[str, Any]:
-    """Arrays of a valid ground_truth.npz, some of them replaced."""
-    labels = np.array([0, 1, 2, 255], np.uint8).reshape(2, 2, 1)
-    classes = np.array(["free", "wall", "floor"])
-    return {
-        "labels": labels, "origin": np.array([1.0, 2.0, 3.0]), "voxel_size": np.array(0.08), "classes": classes,
-    } | changes  # fmt: skip
-
-
-def test_a_ground_truth_is_read_as_it_was_written(tmp_path: Path) -> None:
-    path = tmp_path / "ground_truth.npz"
-    np.savez_compressed(path, **truth())
-    loaded = load_ground_truth(path)
-    np.testing.assert_array_equal(loaded.labels, truth()["labels"])
-    assert loaded.origin.tolist() == [1.0, 2.0, 3.0]
-    assert loaded.voxel_size == 0.08
-    assert loaded.classes == ("free", "wall", "floor")
-    assert loaded.shape == (2, 2, 1)
-
-
-@pytest.mark.parametrize("name", ["labels", "origin", "voxel_size", "classes"])
-def test_a_missing_array_is_named(tmp_path: Path, name: str) -> None:
-    arrays = truth()
-    del arrays[name]
-    np.savez(tmp_path / "gt.npz", **arrays)
-    with pytest.raises(FreeOccError, match=f"no '{name}'"):
-        load_ground_truth(tmp_path / "gt.npz")
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("labels", np.zeros((2, 2), np.uint8)),
-        ("labels", np.zeros((2, 2, 2), np.float32)),
-        ("labels", np.full((2, 2, 2), 3, np.uint8)),
-        ("origin", np.zeros(2)),
-        ("origin", np.array([0.0, np.nan, 0.0])),
-        ("voxel_size", np.array(0.0)),
-        ("voxel_size", np.array(np.inf)),
-        ("voxel_size", np.array([0.08])),
-        ("classes", np.array([1, 2, 3])),
-    ],
-)
-def test_an_unusable_array_is_named(tmp_path: Path, name: str, value: Any) -> None:
-    np.savez(tmp_path / "gt.npz", **truth(**{name: value}))
-    with pytest.raises(FreeOccError, match=f"'{name}' of"):
-        load_ground_truth(tmp_path / "gt.npz")
-
-
-def test_nothing_is_unpickled(tmp_path: Path) -> None:
-    np.savez(tmp_path / "gt.npz", **truth(classes=np.array(["free", None], dtype=object)))
-    with pytest.raises(FreeOccError, match=r"damaged or not an \.npz file of plain arrays"):
-        load_ground_truth(tmp_path / "gt.npz")
-
-
-def test_files_that_are_no_ground_truth_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FreeOccError, match="Cannot read"):
-        load_ground_truth(tmp_path / "absent.npz")
-    with pytest.raises(FreeOccError, match="Cannot read"):
-        load_ground_truth(tmp_path)
-    np.save(tmp_path / "one.npy", np.zeros(3))
-    with pytest.raises(FreeOccError, match="single array"):
-        load_ground_truth(tmp_path / "one.npy")
-    np.savez(tmp_path / "gt.npz", **truth())
-    whole = (tmp_path / "gt.npz").read_bytes()
-    for name, content in {"empty": b"", "text": b"labels: none\n", "half": whole[: len(whole) // 2]}.items():
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(FreeOccError, match="damaged"):
-            load_ground_truth(tmp_path / name)
-
-
-@pytest.mark.parametrize("capture", ["7scenes-kitchen", "house/living", "house/bedroom"])
-def test_the_ground_truths_of_the_captures_are_read(capture: str) -> None:
-    loaded = load_ground_truth(data_folder() / capture / "ground_truth.npz")
-    assert loaded.voxel_size == 0.08
-    assert occupancy_iou(loaded.labels, (loaded.labels != 0) & (loaded.labels != 255)).iou == 1.0
+def test_a_label_without_a_name_is_refused() -> None:
+    with pytest.raises(FreeOccError, match="label is 5"):
+        scores([1, 2], [1, 1], [1, 5])

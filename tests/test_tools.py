@@ -24,14 +24,9 @@ def test_reconstruct_query_export_and_view(tmp_path) -> None:
     assert document["results"][0]["matched"]  # the cupboards
     run("export", tmp_path / "map", "--format", "npz", "-o", tmp_path / "map.npz")
     run("view", tmp_path / "map", "--picture", tmp_path / "map.png")
+    score = json.loads(run("evaluate", tmp_path / "map", "--json"))
+    assert score["precision"] > 0.3
+    assert score["miou"] is None
+    run("ground_truth", kitchen, "-o", tmp_path / "gt.npz", "--set", "capture.stop=5")
     assert (tmp_path / "map.npz").stat().st_size > 0
     assert (tmp_path / "map.png").stat().st_size > 0
-
-
-def test_benchmark_measures_every_part_of_a_few_frames() -> None:
-    kitchen = data_folder() / "7scenes-kitchen"
-    figures = json.loads(run("benchmark", "--capture", kitchen, "--frames", 6, "--json"))
-    text = json.dumps(figures)
-    for part in ("slam", "reconstruct", "score", "splat", "query"):
-        assert part in text
-    assert "error" not in text

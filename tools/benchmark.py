@@ -1,11 +1,14 @@
 #!/usr/bin/env python3
-"""The project's figures on one capture, in one run, beside Open3D's dense SLAM on the same frames.
+"""Maps, ablations and the strongest peers that run here, on the same captures in one run: every figure that is claimed.
 
-    python tools/benchmark.py [--capture FOLDER] [--frames N] [--only slam reconstruct score splat query] [--json]
+    python tools/benchmark.py [--suite quick|full] [-o FOLDER] [--compare OLD/results.json]
+    python tools/benchmark.py --captures SCAN --variants rgbd dense_slam_tsdf ours_octomap
 
-Each part is measured in a process of its own, so that its threads, its memory peak and its imports are its own; this
-process imports nothing but the standard library. One capture and one run: a figure moves by some per cent with what
-else the machine does, and a ratio is only worth something when both of its sides come from the same run.
+Rows are captures x variants. A variant is an ablation of ``configs/ablations`` (mapped and scored by the command), a
+peer of ``tools/peers.py``, or a kernel. Each is measured in a process of its own, so that its threads, its memory peak
+and its imports are its own; this process imports little. Times a frame are over all frames of the capture, although the
+peers that make voxels use every second one. A time moves by some per cent with what else the machine does: compare
+ratios of one run.
 """
 
 from __future__ import annotations
@@ -20,332 +23,267 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import kernels
+import variants
+
 Figures = dict[str, Any]
-Row = tuple[str, str, str]
 
 DATA = Path(os.environ.get("FREEOCC3D_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 COMMAND = [sys.executable, "-m", "freeocc3d.cli"]
+OURS = "rgbd"
+"""The variant whose poses the peers ``ours_*`` are given, and which queries are asked of."""
 
-PEER_VOXEL_SIZE_M = 0.01
-PEER_DEPTH_MIN_M, PEER_DEPTH_MAX_M = 0.1, 3.0
-PEER_DEPTH_DIFF_M = 0.07
-PEER_TRUNCATION_VOXELS = 8.0
-PEER_BLOCKS = 40_000
-"""Open3D's examples/python/t_reconstruction_system/default_config.yml, but for the voxel size."""
+PEERS = {
+    "dense_slam_tsdf": "Open3D dense SLAM (1 cm), its poses, TSDF",
+    "dense_slam_back_projection": "Open3D dense SLAM (1 cm), its poses, points counted",
+    "ours_tsdf": "our poses, TSDF",
+    "ours_octomap": "our poses, OctoMap",
+    "true_poses_back_projection": "the capture's own poses, points counted (the ceiling)",
+    "true_poses_tsdf": "the capture's own poses, TSDF (the ceiling)",
+}
+"""``POSES_OCCUPANCY``: where the poses come from, and what makes voxels of them."""
 
-UNITS_PER_METRE = 5000.0
-"""Of the 16-bit depth that the peer is given: no rounding for captures in millimetres, 13 m at most."""
+KERNELS = ("splat", "query")
 
-SPLAT_GAUSSIANS, SPLAT_VOXEL_SIZE_M = 2_000_000, 0.08
-QUERY_WORD = "red"
+SUITES = {
+    "quick": (("house/bedroom",), (OURS, "rgbd_true_poses", "rgbd_true_poses_closed_set", *PEERS, *KERNELS)),
+    "full": (("7scenes-kitchen", "house/bedroom", "house/living"), None),
+}
+"""Captures of the data folder, and variants (None = all)."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is measured. frames: the first N, None = all.  map: a map folder, built by ``reconstruct`` or given."""
+    """One capture's runs. frames: the first N, None = all.  folder: for maps and trajectories."""
 
     capture: Path
     frames: int | None
-    map: Path
+    folder: Path
 
+    @property
+    def name(self) -> str:
+        """What rows call the capture."""
+        inside = self.capture.is_relative_to(DATA.resolve())
+        return str(self.capture.relative_to(DATA.resolve())) if inside else self.capture.name
 
-# Open3D's dense SLAM
-
-
-def measure_slam(job: Job) -> Figures:
-    """Decode, track, integrate and synthesise every frame; each step's seconds, and the trajectory's error."""
-    import numpy as np
-    import open3d as o3d
-
-    capture = _open(job)
-    first = capture[0]
-    camera = o3d.core.Tensor(first.intrinsics.matrix)
-    height, width = first.depth_m.shape
-    device = o3d.core.Device("CPU:0")
-    T_world_cam = o3d.core.Tensor(np.eye(4))
-    model = o3d.t.pipelines.slam.Model(PEER_VOXEL_SIZE_M, 16, PEER_BLOCKS, T_world_cam, device)
-    measured = o3d.t.pipelines.slam.Frame(height, width, camera, device)
-    rendered = o3d.t.pipelines.slam.Frame(height, width, camera, device)
-
-    seconds = _zeros("decode", "track", "integrate", "synthesise")
-    poses = np.full((len(capture), 4, 4), np.nan)
-    failures = 0
-    frames = range(len(capture))[: job.frames]
-    for index in frames:
-        mark = time.perf_counter()
-        frame = capture[index]
-        depth = np.rint(frame.depth_m * UNITS_PER_METRE).astype(np.uint16)
-        measured.set_data_from_image("depth", o3d.t.geometry.Image(depth))
-        measured.set_data_from_image("color", o3d.t.geometry.Image(frame.color))
-        mark = _lap(seconds, "decode", mark)
-        if index > 0:
-            try:
-                result = model.track_frame_to_model(
-                    measured, rendered, UNITS_PER_METRE, PEER_DEPTH_MAX_M, PEER_DEPTH_DIFF_M
-                )
-                T_world_cam = T_world_cam @ result.transformation
-            except RuntimeError:
-                failures += 1  # the last pose is kept
-        mark = _lap(seconds, "track", mark)
-        poses[index] = T_world_cam.numpy()
-        model.update_frame_pose(index, T_world_cam)
-        model.integrate(measured, UNITS_PER_METRE, PEER_DEPTH_MAX_M, PEER_TRUNCATION_VOXELS)
-        mark = _lap(seconds, "integrate", mark)
-        model.synthesize_model_frame(
-            rendered, UNITS_PER_METRE, PEER_DEPTH_MIN_M, PEER_DEPTH_MAX_M, PEER_TRUNCATION_VOXELS, False
-        )
-        _lap(seconds, "synthesise", mark)
-    return {
-        "frames": len(frames),
-        "seconds": seconds,
-        "seconds_without_decoding": sum(seconds.values()) - seconds["decode"],
-        "tracking_failures": failures,
-        "ate_rmse_m": _peer_error(capture, poses),
-    }
-
-
-def _peer_error(capture: Any, T_world_cam: Any) -> float:
-    """ATE of poses (N, 4, 4), NaN for frames that were not used, after SE(3) alignment."""
-    import numpy as np
-
-    from freeocc3d.evaluation.align import align_trajectory, true_poses
-    from freeocc3d.types import Trajectory
-
-    n = len(capture)
-    trajectory = Trajectory(
-        capture.timestamps, T_world_cam, np.zeros(0, np.int32), np.full(n, "tracked"), np.ones(n, np.float32)
-    )
-    return align_trajectory(trajectory, true_poses(capture), with_scale=False).ate_rmse_m
-
-
-# Reconstruction, from the capture on disk to the map on disk
-
-
-def measure_reconstruct(job: Job) -> Figures:
-    """Wall time and peak memory of the command, and its stages as the map's report states them."""
-    command = [*COMMAND, "reconstruct", str(job.capture), "-o", str(job.map), "--overwrite"]
-    if job.frames is not None:
-        command += ["--set", f"capture.stop={job.frames}"]
-    seconds, peak_bytes, _ = _timed_command(command)
-    _, _, printed = _timed_command([*COMMAND, "info", str(job.map), "--json"])
-    facts = json.loads(printed)
-    return {
-        "seconds": seconds,
-        "peak_memory_bytes": peak_bytes,
-        "stages": facts["seconds"],
-        "frames_with_pose": facts["frames_with_pose"],
-        "gaussians": facts["gaussians"],
-        "voxels": facts["voxels"],
-        "map_bytes": sum(facts["bytes"].values()),
-    }
-
-
-# Scores against the truth
-
-
-def measure_score(job: Job) -> Figures:
-    """ATE of the map's trajectory, and IoU where the capture brings a ground truth."""
-    error = map_ate(job.map)
-    truth = job.capture / "ground_truth.npz"
-    return {**error, **(map_iou(job.map, truth) if truth.is_file() else {})}
-
-
-def map_ate(map_path: Path) -> Figures:
-    """Error of the map's trajectory against the poses of the capture that it was made of, after SE(3) alignment."""
-    alignment = _map_alignment(map_path)
-    return {"ate_rmse_m": alignment.ate_rmse_m, "frames_matched": alignment.frames_matched}
-
-
-def map_iou(map_path: Path, ground_truth_path: Path) -> Figures:
-    """IoU, precision and recall of a map inside the mask of a ground truth, on the ground truth's lattice."""
-    from freeocc3d.evaluation.iou import load_ground_truth, occupancy_iou
-    from freeocc3d.evaluation.score import occupied_on_lattice
-    from freeocc3d.store import load_map
-
-    truth = load_ground_truth(ground_truth_path)
-    occupied = occupied_on_lattice(
-        load_map(map_path), _map_alignment(map_path), truth.origin, truth.shape, truth.voxel_size
-    )
-    score = occupancy_iou(truth.labels, occupied)
-    return {"iou": score.iou, "precision": score.precision, "recall": score.recall}
-
-
-def _map_alignment(map_path: Path) -> Any:
-    from freeocc3d.capture import open_capture
-    from freeocc3d.evaluation.align import align_trajectory, true_poses
-    from freeocc3d.store import load_map
-
-    loaded = load_map(map_path)
-    capture = open_capture(loaded.manifest["capture"]["path"])
-    return align_trajectory(loaded.trajectory, true_poses(capture), with_scale=False)
-
-
-# Gaussians to voxels
-
-
-def measure_splat(job: Job) -> Figures:
-    """Gaussians a second through layer 4's projection, beside what the machine needs for its arithmetic alone."""
-    import numpy as np
-
-    from freeocc3d.occupancy import splat
-    from freeocc3d.occupancy.grid import unpack
-
-    cutoff, origin = splat.Options().cutoff, np.zeros(3)
-
-    def project(gaussians: Any, seconds: dict[str, float]) -> Any:
-        mark = time.perf_counter()
-        bins = splat.bin_gaussians(gaussians, origin, SPLAT_VOXEL_SIZE_M, cutoff)
-        mark = _lap(seconds, "sort into blocks", mark)
-        splat.probability(bins, unpack(bins.packed))
-        _lap(seconds, "evaluate", mark)
-        return bins
-
-    project(surface_gaussians(1000), _zeros("sort into blocks", "evaluate"))  # compiles
-    gaussians = surface_gaussians(SPLAT_GAUSSIANS)
-    runs = []
-    for _ in range(5):
-        runs.append(_zeros("sort into blocks", "evaluate"))
-        bins = project(gaussians, runs[-1])
-    steps = sorted(runs, key=lambda run: sum(run.values()))[len(runs) // 2]  # the median run
-    seconds = sum(steps.values())
-    visits = int((bins.hi - bins.lo + 1).clip(min=0).astype(np.int64).prod(axis=1).sum())
-    bytes_touched = sum(getattr(gaussians, name).nbytes for name in ("means", "scales", "quats_wxyz", "opacities"))
-    bytes_touched += len(bins.packed) * 512 * 4
-    copy_rate, exp_rate = copy_bytes_per_second(), exps_per_second()
-    return {
-        "gaussians": len(gaussians),
-        "blocks": len(bins.packed),
-        "seconds": seconds,
-        "steps": steps,
-        "gaussians_per_second": len(gaussians) / seconds,
-        "voxel_visits": visits,
-        "copy_bytes_per_second": copy_rate,
-        "exps_per_second": exp_rate,
-        "floor_seconds": {"memory": bytes_touched / copy_rate, "exp": visits / exp_rate},
-    }
-
-
-def surface_gaussians(count: int) -> Any:
-    """Gaussians as layer 2 makes them at 8 cm, one per 4 cm of surface, on square patches of 2 m in random places and
-    directions; in the order of the patches, as neighbours in a map are neighbours in memory."""
-    import numpy as np
-
-    from freeocc3d.geometry import quats_to_rotations
-    from freeocc3d.types import Gaussians
-
-    rng = np.random.default_rng(0)
-    patch = np.arange(count) // 2500
-    patches = patch[-1] + 1
-    quats = rng.normal(size=(patches, 4))
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    edge = 2.0 * math.sqrt(patches)  # of a building two metres high that holds two metres of patch for each of floor
-    corners = rng.uniform((0, 0, 0), (edge, edge, 2.0), (patches, 3))
-    on_patch = np.concatenate((rng.uniform(0, 2.0, (count, 2)), rng.normal(0, 0.005, (count, 1))), axis=1)
-    means = corners[patch] + np.einsum("nij,nj->ni", quats_to_rotations(quats)[patch], on_patch)
-    scales = 0.025 * rng.uniform((0.8, 0.8, 0.3), (1.2, 1.2, 1.0), (count, 3))
-    return Gaussians(
-        means=means.astype(np.float32),
-        scales=scales.astype(np.float32),
-        quats_wxyz=quats[patch].astype(np.float32),
-        opacities=np.full(count, 0.9, np.float32),
-        colors=np.zeros((count, 3), np.uint8),
-        anchor_keyframe=np.zeros(count, np.int32),
-        anchor_cam=means.astype(np.float32),
-    )
-
-
-def copy_bytes_per_second() -> float:
-    """Bytes read and written a second by a NumPy copy of 256 MB on one thread."""
-    import numpy as np
-
-    source = np.ones(256_000_000, np.uint8)
-    target = np.zeros_like(source)
-    return 2 * source.nbytes / _fastest(lambda: np.copyto(target, source))
-
-
-def exps_per_second() -> float:
-    """float32 exponentials a second, NumPy's vectorised one on one thread times the number of processors."""
-    import numpy as np
-
-    values = -np.random.default_rng(0).random(1 << 20, np.float32)
-    out = np.empty_like(values)
-    return len(values) * (os.cpu_count() or 1) / _fastest(lambda: np.exp(values, out=out))
-
-
-# Queries
-
-
-def measure_query(job: Job) -> Figures:
-    """A word asked from a cold start, five times, and in a loaded map, twenty times."""
-    cold = [_timed_command([*COMMAND, "query", str(job.map), QUERY_WORD, "--json"])[0] for _ in range(5)]
-    loaded = _in_own_process("_loaded_query", job)
-    return {"cold_seconds": statistics.median(cold), **loaded}
-
-
-def measure_loaded_query(job: Job) -> Figures:
-    """Seconds to load a map with its first answer, and the median of those after it."""
-    from freeocc3d.store import load_map
-
-    mark = time.perf_counter()
-    loaded = load_map(job.map)
-    result = loaded.query(QUERY_WORD)
-    first = time.perf_counter() - mark
-    times = []
-    for _ in range(20):
-        mark = time.perf_counter()
-        loaded.query(QUERY_WORD)
-        times.append(time.perf_counter() - mark)
-    return {"first_seconds": first, "loaded_seconds": statistics.median(times), "regions": len(result.regions)}
-
-
-# Processes
-
-
-PARTS: dict[str, Callable[[Job], Figures]] = {
-    "slam": measure_slam,
-    "reconstruct": measure_reconstruct,
-    "score": measure_score,
-    "splat": measure_splat,
-    "query": measure_query,
-}
-"""In the order in which they run."""
-
-INSIDE: dict[str, Callable[[Job], Figures]] = {**PARTS, "_loaded_query": measure_loaded_query}
-"""What ``--inside`` can name: all that is measured in a process of its own."""
-
-COMMANDS_ONLY = {"reconstruct", "query"}
-"""Parts that only start other processes."""
-
-NEED_A_MAP = {"score", "query"}
+    def poses(self, source: str) -> Path:
+        """Where a run leaves its poses for others."""
+        return self.folder / f"{source}.npz"
 
 
 class PartFailed(Exception):
     """A part could not be measured; the message is one sentence."""
 
 
-def measure(part: str, job: Job) -> Figures:
-    """One part's figures, or {"error": sentence}."""
-    if part in NEED_A_MAP and not (job.map / "map.yaml").is_file():
-        return {"error": f"there is no map {job.map}: run the part 'reconstruct' too, or name a map with --map"}
-    try:
-        return PARTS[part](job) if part in COMMANDS_ONLY else _in_own_process(part, job)
-    except PartFailed as error:
-        return {"error": str(error)}
+# Maps
 
 
-def _in_own_process(part: str, job: Job) -> Figures:
-    """``INSIDE[part](job)`` in a fresh interpreter, with that process's wall time and peak memory."""
-    command = [sys.executable, __file__, "--inside", part, "--capture", str(job.capture), "--map", str(job.map)]
+def map_row(job: Job, variant: variants.Variant) -> Figures:
+    """Map the capture as the variant says, and score it. Raises PartFailed."""
+    if variant.lacking:
+        raise PartFailed(variant.lacking)
+    folder = job.folder / variant.name
+    command = [*COMMAND, "reconstruct", str(job.capture), "-o", str(folder), "--config", str(variant.path)]
     if job.frames is not None:
-        command += ["--frames", str(job.frames)]
-    seconds, peak_bytes, printed = _timed_command(command)
+        command += ["--set", f"capture.stop={job.frames}"]
+    seconds, peak_bytes, _ = _timed_command(command)
+    facts = json.loads(_timed_command([*COMMAND, "info", str(folder), "--json"])[2])
+    used = facts["frames"] - facts["frame_status"].get("unused", 0)
+    own = sum(facts["seconds"].values())
+    return {
+        **_inside("score_map", map=str(folder), capture=str(job.capture), out=str(job.poses(variant.name))),
+        "frames": used,
+        "frames_with_pose": facts["frames_with_pose"],
+        "wall_seconds": seconds,
+        "ms_per_frame": {stage: 1e3 * value / used for stage, value in facts["seconds"].items()},
+        "frames_per_second": used / own,
+        "peak_memory_bytes": peak_bytes,
+        "map_bytes": sum(facts["bytes"].values()),
+        "gaussians": facts["gaussians"],
+        "voxels": facts["voxels"],
+    }
+
+
+def score_map(map: str, capture: str, out: str) -> Figures:
+    """ATE and RPE against the capture's poses; IoU and mIoU where it brings a ground truth. Leaves the aligned poses of
+    all frames in ``out``."""
+    from freeocc3d.evaluation import evaluate
+    from freeocc3d.evaluation.align import align, estimated_poses, true_poses
+    from freeocc3d.evaluation.ground_truth import load_ground_truth
+    from freeocc3d.evaluation.trajectory import trajectory_errors
+    from freeocc3d.store import load_map
+
+    loaded = load_map(map)
+    estimated, true = estimated_poses(loaded.trajectory), true_poses(evaluate.capture_of(loaded))
+    alignment = align(estimated, true)
+    errors = trajectory_errors(estimated, true, alignment)
+    _save_poses(Path(out), alignment.poses(loaded.trajectory.T_world_cam), errors, loaded.up @ alignment.rotation.T)
+    figures: Figures = {"ate_rmse_m": errors.ate_rmse_m, "trajectory": errors.to_json()}
+    truth_path = Path(capture) / "ground_truth.npz"
+    if truth_path.is_file():
+        truth = load_ground_truth(truth_path)
+        classes = evaluate.common_classes([truth])
+        scene = evaluate.score_map(loaded, truth, classes, true)
+        scored = evaluate.Evaluation((scene,), classes.classes, "se3")
+        figures |= _scores(scored.scores, scored.miou(), scored.classes_in_miou)
+    return figures
+
+
+def _scores(scores: Any, miou: float | None, classes: Any) -> Figures:
+    return {
+        "iou": scores.iou,
+        "precision": scores.precision,
+        "recall": scores.recall,
+        "miou": miou,
+        "classes_in_miou": list(classes) if miou is not None else [],
+    }
+
+
+def _save_poses(path: Path, T_true_cam: Any, errors: Any, up: Any) -> None:
+    import numpy as np
+
+    np.savez(path, poses=T_true_cam, true=errors.true, aligned=errors.aligned, errors=errors.errors_m, up=up)
+
+
+# Peers
+
+
+def dense_slam_run(job: Job) -> Figures:
+    """Open3D's dense SLAM on the frames: its seconds a step; it leaves its poses. Raises PartFailed."""
+    figures = _inside("dense_slam", capture=str(job.capture), frames=job.frames, out=str(job.poses("dense_slam")))
+    steps = figures["seconds"]
+    return {**figures, "seconds_without_decoding": sum(steps.values()) - steps["decode"]}
+
+
+def dense_slam(capture: str, frames: int | None, out: str) -> Figures:
+    """Track every frame and leave the aligned poses in ``out``."""
+    import numpy as np
+    import peers
+
+    from freeocc3d.capture import open_capture
+    from freeocc3d.evaluation.align import Poses, align, true_poses
+    from freeocc3d.evaluation.trajectory import trajectory_errors
+
+    opened = open_capture(capture)
+    used = range(len(opened))[:frames]
+    T_world_cam, seconds, failures = peers.dense_slam(opened, used)
+    has_pose = np.isfinite(T_world_cam).all(axis=(1, 2))
+    estimated, true = Poses(opened.timestamps[has_pose], T_world_cam[has_pose]), true_poses(opened)
+    alignment = align(estimated, true)
+    errors = trajectory_errors(estimated, true, alignment)
+    first = T_world_cam[np.flatnonzero(has_pose)[0]]
+    _save_poses(Path(out), alignment.poses(T_world_cam), errors, alignment.rotation @ -first[:3, 1])
+    return {
+        "frames": len(used),
+        "seconds": seconds,
+        "tracking_failures": failures,
+        "ate_rmse_m": errors.ate_rmse_m,
+        "trajectory": errors.to_json(),
+    }
+
+
+def peer_row(job: Job, name: str, slam: Figures | None) -> Figures:
+    """One peer's occupancy. slam: of dense SLAM, whose poses ``dense_slam_*`` use. Raises PartFailed."""
+    source = next(s for s in ("dense_slam", "ours", "true_poses") if name.startswith(s))
+    poses = {"dense_slam": job.poses("dense_slam"), "ours": job.poses(OURS), "true_poses": None}[source]
+    if source == "dense_slam" and slam is not None and "error" in slam:
+        raise PartFailed(slam["error"])
+    if poses is not None and not poses.is_file():
+        raise PartFailed(f"there are no poses of {source}: name the variant that makes them, too")
+    truth = job.capture / "ground_truth.npz"
+    if not truth.is_file():
+        raise PartFailed(f"{job.name} has no ground_truth.npz to score against")
+    figures = _inside(
+        "occupancy",
+        kind=name.removeprefix(f"{source}_"),
+        capture=str(job.capture),
+        frames=job.frames,
+        poses=None if poses is None else str(poses),
+        truth=str(truth),
+    )
+    frames = figures["frames"]
+    steps = figures.pop("seconds")
+    if source == "dense_slam" and slam is not None:
+        steps = {**slam["seconds"], "voxels": sum(steps.values())}
+        figures |= {"ate_rmse_m": slam["ate_rmse_m"], "trajectory": slam["trajectory"]}
+        figures["peak_memory_bytes"] = max(figures["peak_memory_bytes"], slam["peak_memory_bytes"])
+    return {
+        **figures,
+        "wall_seconds": sum(steps.values()),
+        "ms_per_frame": {step: 1e3 * value / frames for step, value in steps.items()},
+        "frames_per_second": frames / sum(steps.values()),
+    }
+
+
+def occupancy(kind: str, capture: str, frames: int | None, poses: str | None, truth: str) -> Figures:
+    """Score what a peer calls occupied, given the capture's poses (``poses`` None) or those in a file, which are in the
+    true frame already."""
+    import numpy as np
+    import peers
+
+    from freeocc3d.capture import open_capture
+    from freeocc3d.evaluation.align import true_poses
+    from freeocc3d.evaluation.ground_truth import load_ground_truth
+    from freeocc3d.evaluation.iou import Prediction, Scores, confusion
+
+    opened, expected = open_capture(capture), load_ground_truth(truth)
+    if poses is None:
+        stated = true_poses(opened)
+        T_true_cam = np.full((len(opened), 4, 4), np.nan)
+        T_true_cam[np.searchsorted(opened.timestamps, stated.timestamps)] = stated.T_world_cam
+    else:
+        T_true_cam = np.load(poses)["poses"]
+    used = range(len(opened))[:frames]
+    T_true_cam[len(used) :] = np.nan
+    lattice = peers.Lattice(expected.origin, expected.shape, expected.voxel_size)
+    run = {
+        "tsdf": peers.tsdf_occupied,
+        "back_projection": peers.back_projected_occupied,
+        "octomap": peers.octomap_occupied,
+    }[kind]
+    occupied, seconds = run(opened, T_true_cam, lattice)
+    names = expected.classes[1:]
+    matrix = confusion(expected.labels, Prediction(occupied), expected.masks()["label"], len(names))
+    return {**_scores(Scores(matrix, names), None, ()), "seconds": seconds, "frames": len(used)}
+
+
+# Kernels
+
+
+def kernel(name: str, asked_map: Path | None) -> Figures:
+    """Speed of the projection, or of queries in a map. Raises PartFailed."""
+    if name == "splat":
+        return _inside("splat")
+    if asked_map is None or not (asked_map / "map.yaml").is_file():
+        raise PartFailed(f"there is no map to ask: name the variant {OURS}, too")
+    command = [*COMMAND, "query", str(asked_map), kernels.QUERY_WORD, "--json"]
+    cold = [_timed_command(command)[0] for _ in range(5)]
+    return {"cold_seconds": statistics.median(cold), **_inside("query", map_path=str(asked_map))}
+
+
+# Processes
+
+
+INSIDE = {
+    "score_map": score_map,
+    "dense_slam": dense_slam,
+    "occupancy": occupancy,
+    "splat": lambda: kernels.measure_splat(),
+    "query": lambda map_path: kernels.measure_query(Path(map_path)),
+}
+"""What is measured in a process of its own."""
+
+
+def _inside(part: str, **arguments: Any) -> Figures:
+    """``INSIDE[part](**arguments)`` in a fresh interpreter, with that process's peak memory. Raises PartFailed."""
+    command = [sys.executable, __file__, "--inside", part, json.dumps(arguments)]
+    _, peak_bytes, printed = _timed_command(command)
     figures: Figures = json.loads(printed.splitlines()[-1])  # libraries print to stdout too
-    return {**figures, "process_seconds": seconds, "process_peak_memory_bytes": peak_bytes}
+    return {**figures, "peak_memory_bytes": peak_bytes}
 
 
 def _timed_command(command: list[str]) -> tuple[float, int, str]:
@@ -359,147 +297,179 @@ def _timed_command(command: list[str]) -> tuple[float, int, str]:
         out.seek(0)
         err.seek(0)
         if process.returncode != 0:
-            said = err.read().strip().splitlines() or ["nothing"]
-            raise PartFailed(f"'{' '.join(command[1:5])} …' ended with {process.returncode} and said: {said[-1]}")
+            said = err.read().strip().splitlines() or [f"it ended with {process.returncode}"]
+            raise PartFailed(said[-1].removeprefix("freeocc3d: "))
         return seconds, usage.ru_maxrss * 1024, out.read()
 
 
-def _open(job: Job) -> Any:
-    from freeocc3d.capture import open_capture
-
-    return open_capture(job.capture)
+# The run
 
 
-def _zeros(*steps: str) -> dict[str, float]:
-    return dict.fromkeys(steps, 0.0)
+def run(captures: list[Path], names: list[str], frames: int | None, folder: Path) -> Figures:
+    """All rows, and the kernels' figures."""
+    known = variants.all_variants()
+    rows: list[Figures] = []
+    asked_map: Path | None = None
+    for number, capture in enumerate(captures):
+        job = Job(capture.resolve(), frames, folder / str(number))
+        job.folder.mkdir(parents=True)
+        slam = None
+        if any(name.startswith("dense_slam") for name in names):
+            slam = _tried(f"{job.name}: dense SLAM", lambda job=job: dense_slam_run(job))
+        for name in names:
+            if name in known:
+                row = _tried(f"{job.name}: {name}", lambda job=job, name=name: map_row(job, known[name]))
+                title, table = known[name].title, known[name].table
+            elif name in PEERS:
+                row = _tried(f"{job.name}: {name}", lambda job=job, name=name, slam=slam: peer_row(job, name, slam))
+                title, table = PEERS[name], "Peers"
+            else:
+                continue
+            if slam is not None and "error" not in slam and "wall_seconds" in row:
+                row["wall_over_dense_slam"] = row["wall_seconds"] / slam["seconds_without_decoding"]
+            why = row.pop("error", "")
+            rows.append(
+                {"capture": job.name, "variant": name, "title": title, "table": table, "available": not why,
+                 "why": why, **row}
+            )  # fmt: skip
+        if asked_map is None and (job.folder / OURS).is_dir():
+            asked_map = job.folder / OURS
+    measured = {name: _tried(name, lambda name=name: kernel(name, asked_map)) for name in KERNELS if name in names}
+    machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
+    return {"machine": machine, "frames": frames, "rows": rows, "kernels": measured}
 
 
-def _lap(seconds: dict[str, float], step: str, mark: float) -> float:
-    now = time.perf_counter()
-    seconds[step] += now - mark
-    return now
+def _tried(what: str, measure: Any) -> Figures:
+    """The figures, or {"error": sentence}."""
+    print(f"measuring: {what}", file=sys.stderr, flush=True)
+    try:
+        return dict(measure())
+    except PartFailed as error:
+        return {"error": str(error)}
 
 
-def _fastest(work: Callable[[], object], repeats: int = 5) -> float:
-    times = []
-    for _ in range(repeats):
-        mark = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - mark)
-    return min(times)
+# Tables
 
 
-# The table
+COLUMNS = (
+    "capture", "variant", "ATE cm", "IoU", "mIoU", "precision", "recall", "ms/frame", "fps", "memory GB", "map MB",
+    "x dense SLAM", "what",
+)  # fmt: skip
 
 
-def table(results: dict[str, Figures]) -> list[Row]:
-    """Rows of what was measured, and what is asked for."""
-    writers = {
-        "slam": slam_rows,
-        "reconstruct": reconstruct_rows,
-        "score": score_rows,
-        "splat": splat_rows,
-        "query": query_rows,
-    }
-    rows: list[Row] = []
-    for part, figures in results.items():
-        rows += writers[part](figures, results) if "error" not in figures else [(part, "failed, see below", "")]
-    return rows
-
-
-def slam_rows(figures: Figures, results: dict[str, Figures]) -> list[Row]:
-    per_frame = {step: 1e3 * value / figures["frames"] for step, value in figures["seconds"].items()}
-    steps = ", ".join(f"{step} {value:.0f}" for step, value in per_frame.items())
-    without, decode = figures["seconds_without_decoding"], figures["seconds"]["decode"]
-    return [
-        ("Open3D dense SLAM, wall time", f"{without:.1f} s ({without + decode:.1f} s with decoding)", ""),
-        ("  per frame", f"{steps} ms", ""),
-        ("  peak memory", f"{figures['process_peak_memory_bytes'] / 1e9:.2f} GB", ""),
-        ("  tracking failures", f"{figures['tracking_failures']} of {figures['frames']} frames", ""),
-        ("  ATE after SE(3) alignment", f"{100 * figures['ate_rmse_m']:.2f} cm", ""),
-    ]
-
-
-def reconstruct_rows(figures: Figures, results: dict[str, Figures]) -> list[Row]:
-    stages = ", ".join(f"{stage} {value:.1f}" for stage, value in figures["stages"].items())
-    rows = [("freeocc3d reconstruct, wall time", f"{figures['seconds']:.1f} s", "")]
-    if "seconds" in (peer := results.get("slam", {})):
-        without = peer["seconds_without_decoding"]
-        ratio, decoded = figures["seconds"] / without, figures["seconds"] / (without + peer["seconds"]["decode"])
-        rows.append(("  over dense SLAM's", f"{ratio:.2f} ({decoded:.2f} of it with its decoding)", "at most 0.5"))
-    return [
-        *rows,
-        ("  stages", f"{stages} s", ""),
-        ("  peak memory", f"{figures['peak_memory_bytes'] / 1e9:.2f} GB", "at most 4 GB"),
-        ("  gaussians, occupied voxels", f"{figures['gaussians']:,}, {figures['voxels']['occupied']:,}", ""),
-        ("  map on disk", f"{figures['map_bytes'] / 1e6:.1f} MB", ""),
-    ]
-
-
-def score_rows(figures: Figures, results: dict[str, Figures]) -> list[Row]:
-    peer = results.get("slam", {}).get("ate_rmse_m")
-    asked = f"as it is; dense SLAM's {100 * peer:.2f} cm" if peer is not None else "as it is"
-    rows = [
-        ("map, ATE after SE(3) alignment", f"{100 * figures['ate_rmse_m']:.2f} cm", asked),
-        ("  frames with a true and an own pose", f"{figures['frames_matched']}", ""),
-    ]
-    if "iou" in figures:
-        shares = ", ".join(f"{name} {100 * figures[name]:.1f}" for name in ("precision", "recall"))
-        rows.append(
-            (
-                "map, IoU",
-                f"{100 * figures['iou']:.1f} ({shares})",
-                "as it is; 65.2 on the kitchen from dense SLAM's poses, TSDF",
-            )
+def markdown(results: Figures) -> str:
+    """A table of all rows, and the kernels' lines. What was not measured is a dash, never a zero."""
+    lines = [" | ".join(("", *COLUMNS, "")).strip(), "|" + "---|" * len(COLUMNS)]
+    for row in results["rows"]:
+        cells = (
+            row["capture"],
+            row["variant"],
+            _number(row.get("ate_rmse_m"), 100, 2),
+            *(_number(row.get(name), 100, 1) for name in ("iou", "miou", "precision", "recall")),
+            _number(sum(row["ms_per_frame"].values()) if "ms_per_frame" in row else None, 1, 1),
+            _number(row.get("frames_per_second"), 1, 1),
+            _number(row.get("peak_memory_bytes"), 1e-9, 2),
+            _number(row.get("map_bytes"), 1e-6, 1),
+            _number(row.get("wall_over_dense_slam"), 1, 2),
+            row["title"] if row["available"] else f"{row['title']}: **not available**, {row['why']}",
         )
-    return rows
+        lines.append(f"| {' | '.join(cells)} |")
+    lines += [f"\nmIoU of {capture}: over {classes}" for capture, classes in _class_lists(results).items()]
+    for name, write in (("splat", kernels.splat_lines), ("query", kernels.query_lines)):
+        figures = results["kernels"].get(name)
+        if figures is not None and "error" in figures:
+            lines.append(f"\n{name}: not available, {figures['error']}")
+        elif figures is not None:
+            lines += ["", "| what | measured | asked |", "|---|---|---|"]
+            lines += [f"| {' | '.join(line)} |" for line in write(figures)]
+    return "\n".join(lines)
 
 
-def splat_rows(figures: Figures, results: dict[str, Figures]) -> list[Row]:
-    floor = figures["floor_seconds"]
-    steps = ", ".join(f"{step} {1e3 * value:.0f}" for step, value in figures["steps"].items())
-    return [
-        ("Gaussians to voxels", f"{figures['gaussians_per_second'] / 1e6:.2f} million/s", "at least 2"),
-        ("  2 million at 8 cm", f"{1e3 * figures['seconds']:.0f} ms: {steps}", ""),
-        (
-            "  floor: their exponentials alone",
-            f"{1e3 * floor['exp']:.1f} ms at {figures['exps_per_second'] / 1e9:.1f} billion/s",
-            "",
-        ),
-        (
-            "  floor: their memory alone",
-            f"{1e3 * floor['memory']:.1f} ms at {figures['copy_bytes_per_second'] / 1e9:.1f} GB/s",
-            "",
-        ),
-    ]
+def _class_lists(results: Figures) -> dict[str, str]:
+    lists = {row["capture"]: row["classes_in_miou"] for row in results["rows"] if row.get("classes_in_miou")}
+    return {capture: f"{len(names)} classes: {', '.join(names)}" for capture, names in lists.items()}
 
 
-def query_rows(figures: Figures, results: dict[str, Figures]) -> list[Row]:
-    return [
-        ("query from a cold start", f"{figures['cold_seconds']:.2f} s", "under 3 s"),
-        ("query in a loaded map", f"{1e3 * figures['loaded_seconds']:.1f} ms", "under 50 ms"),
-        ("  loading with the first answer", f"{figures['first_seconds']:.2f} s", ""),
-    ]
+def _number(value: float | None, factor: float, digits: int) -> str:
+    return "–" if value is None or not math.isfinite(value) else f"{factor * value:.{digits}f}"
 
 
-def format_table(rows: list[Row]) -> str:
-    """Aligned columns under their names."""
-    lines = [("what", "measured", "asked"), *rows]
-    widths = [max(len(line[column]) for line in lines) for column in range(2)]
-    return "\n".join(f"{a:<{widths[0]}} | {b:<{widths[1]}} | {c}".rstrip(" |") for a, b, c in lines)
+COMPARED = {
+    "ate_rmse_m": ("ATE cm", 100, 0.05),
+    "iou": ("IoU", 100, 0.1),
+    "miou": ("mIoU", 100, 0.1),
+    "precision": ("precision", 100, 0.1),
+    "recall": ("recall", 100, 0.1),
+    "wall_over_dense_slam": ("x dense SLAM", 1, 0.05),
+    "frames_per_second": ("fps", 1, 1.0),
+    "peak_memory_bytes": ("memory GB", 1e-9, 0.05),
+    "map_bytes": ("map MB", 1e-6, 0.1),
+}
+"""Figure -> (name, factor, what counts as a move)."""
+
+
+def moved(old: Figures, new: Figures) -> str:
+    """What differs between two runs' rows by more than its threshold; rows that only one of them has are named."""
+    before = {(row["capture"], row["variant"]): row for row in old["rows"]}
+    after = {(row["capture"], row["variant"]): row for row in new["rows"]}
+    lines = []
+    for key, row in after.items():
+        where = " ".join(key)
+        if key not in before:
+            lines.append(f"{where}: new")
+            continue
+        for name, (title, factor, threshold) in COMPARED.items():
+            was, now = before[key].get(name), row.get(name)
+            if (was is None) != (now is None):
+                lines.append(f"{where}: {title} {_number(was, factor, 2)} -> {_number(now, factor, 2)}")
+            elif was is not None and now is not None and abs(factor * (now - was)) > threshold:
+                lines.append(f"{where}: {title} {factor * was:.2f} -> {factor * now:.2f} ({factor * (now - was):+.2f})")
+    lines += [f"{' '.join(key)}: not measured this time" for key in before if key not in after]
+    return "\n".join(lines) or "nothing moved"
+
+
+def draw(results: Figures, folder: Path, out: Path) -> None:
+    """Plots: IoU bars, time by stage, trajectories from above with their errors."""
+    import numpy as np
+    import plots
+
+    plots.iou_bars(out / "iou.png", results["rows"])
+    plots.stage_bars(out / "stages.png", results["rows"])
+    for number, capture in enumerate(dict.fromkeys(row["capture"] for row in results["rows"])):
+        for source in (OURS, "dense_slam"):
+            path = folder / str(number) / f"{source}.npz"
+            if path.is_file():
+                saved = np.load(path)
+                name = f"trajectory_{capture.replace('/', '_')}_{source}.png"
+                plots.trajectory_plot(
+                    out / name, f"{capture}, {source}", saved["true"], saved["aligned"], saved["errors"], saved["up"]
+                )
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--capture", type=Path, default=DATA / "7scenes-kitchen", help="folder of a scan with poses")
+    parser.add_argument("--suite", choices=SUITES, default="quick", help="quick: minutes; full: all captures, variants")
+    parser.add_argument("--captures", nargs="+", type=Path, metavar="SCAN", help="folders of scans with poses")
+    parser.add_argument("--variants", nargs="+", metavar="NAME", help="ablations, peers or kernels; --list names them")
+    parser.add_argument("--list", action="store_true", help="list what --variants can name, and what runs")
     parser.add_argument("--frames", type=int, metavar="N", help="the first N frames only")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART", help=", ".join(PARTS))
-    parser.add_argument("--map", type=Path, help="keep the map here, or use the one that is here (default: temporary)")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="FOLDER", help="write results.json, table.md and plots here"
+    )
+    parser.add_argument("--compare", type=Path, metavar="OLD", help="an earlier results.json: print what moved")
     parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
-    parser.add_argument("--inside", choices=INSIDE, help=argparse.SUPPRESS)
+    parser.add_argument("--inside", nargs=2, help=argparse.SUPPRESS)
     given = parser.parse_args()
-    if not given.capture.is_dir():
-        parser.error(f"there is no capture {given.capture}: name one with --capture")
+    captures, names = SUITES[given.suite]
+    given.captures = given.captures or [DATA / name for name in captures]
+    known = [*variants.names(), *PEERS, *KERNELS]
+    given.variants = given.variants or list(names or known)
+    if unknown := [name for name in given.variants if name not in known]:
+        parser.error(f"unknown variants {', '.join(unknown)}: --list names all")
+    if not given.inside and not given.list:
+        for capture in given.captures:
+            if not capture.is_dir():
+                parser.error(f"there is no capture {capture}: name one with --captures")
     if given.frames is not None and given.frames < 3:
         parser.error("--frames needs at least 3, for fewer cannot be aligned")
     return given
@@ -508,25 +478,27 @@ def arguments() -> argparse.Namespace:
 def main() -> None:
     given = arguments()
     if given.inside:
-        print(json.dumps(INSIDE[given.inside](Job(given.capture, given.frames, given.map))))
+        part, values = given.inside
+        print(json.dumps(INSIDE[part](**json.loads(values))))
         return
+    if given.list:
+        for name, variant in variants.all_variants().items():
+            print(f"{name:<38} {variant.title}" + (f": not available, {variant.lacking}" if variant.lacking else ""))
+        for name, title in PEERS.items():
+            print(f"{name:<38} {title}")
+        print(f"{', '.join(KERNELS):<38} speed of the projection and of queries")
+        return
+    old = json.loads(given.compare.read_text(encoding="utf-8")) if given.compare else None
     with tempfile.TemporaryDirectory(prefix="freeocc3d-benchmark-") as temporary:
-        job = Job(given.capture.resolve(), given.frames, (given.map or Path(temporary) / "map").resolve())
-        results: dict[str, Figures] = {}
-        for part in PARTS:
-            if part in given.only:
-                print(f"measuring: {part}", file=sys.stderr)
-                results[part] = measure(part, job)
-    machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
-    if given.json:
-        print(json.dumps({"capture": str(job.capture), "frames": job.frames, "machine": machine, **results}))
-    else:
-        print(f"{job.capture}, {f'first {job.frames}' if job.frames else 'all'} frames, {machine['cores']} cores")
-        print(format_table(table(results)))
-    failed = {part: figures["error"] for part, figures in results.items() if "error" in figures}
-    for part, sentence in failed.items():
-        print(f"{part} failed: {sentence}", file=sys.stderr)
-    sys.exit(bool(failed))
+        results = run(given.captures, given.variants, given.frames, Path(temporary))
+        if given.output is not None:
+            given.output.mkdir(parents=True, exist_ok=True)
+            (given.output / "results.json").write_text(json.dumps(results, indent=1), encoding="utf-8")
+            (given.output / "table.md").write_text(markdown(results) + "\n", encoding="utf-8")
+            draw(results, Path(temporary), given.output)
+    print(json.dumps(results) if given.json else markdown(results))
+    if old is not None:
+        print(f"\nmoved since {given.compare}:\n{moved(old, results)}", file=sys.stderr if given.json else sys.stdout)
 
 
 if __name__ == "__main__":

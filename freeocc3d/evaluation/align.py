@@ -1,21 +1,47 @@
-"""The estimated trajectory against the true one: the best alignment, and what remains (absolute trajectory error).
+"""The estimated trajectory against the true one: which poses belong together, and the best alignment of the two worlds.
 
-Source: J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012, Sec. IV-B; the alignment is
-Umeyama's (``geometry.umeyama``) on the camera centres of the frames that have a pose in both.
+Sources: S. Umeyama, PAMI 1991 (``geometry.umeyama``) on the camera centres of the frames that have a pose in both
+(paper, "Coordinate System Alignment"); J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS
+2012, for the association by time.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..capture import open_capture
 from ..capture.base import Capture
-from ..errors import FreeOccError
-from ..geometry import umeyama
+from ..errors import CaptureError, FreeOccError, MapError
+from ..geometry import is_rigid, umeyama
+from ..store import read_tum
 from ..types import Trajectory
+
+ALIGNMENTS = ("se3", "sim3", "none")
+"""Rigid, for trajectories with a metric scale; with a scale, for monocular ones; as they are."""
+
+SAME_TIME_S = 0.02
+"""Poses whose timestamps differ by no more belong together: the tolerance of the TUM RGB-D benchmark."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses of some frames: timestamps (M,) seconds, ascending, and T_world_cam (M, 4, 4), all finite."""
+
+    timestamps: NDArray[np.float64]
+    T_world_cam: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """(M, 3) camera centres."""
+        return self.T_world_cam[:, :3, 3]
 
 
 @dataclass(frozen=True)
@@ -23,15 +49,16 @@ class Alignment:
     """The similarity that takes the estimate's world to the true one: x_true = scale * rotation @ x_est + translation.
 
     scale: 1 unless it was asked for.  rotation: (3, 3).  translation: (3,) metres.
-    ate_rmse_m: root mean square distance of the aligned camera centres from the true ones, metres.
-    frames_matched: frames that have a pose in both.
     """
 
     scale: float
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
-    ate_rmse_m: float
-    frames_matched: int
+
+    @staticmethod
+    def identity() -> Alignment:
+        """Both worlds are the same."""
+        return Alignment(1.0, np.eye(3), np.zeros(3))
 
     def to_true(self, points_est: NDArray[np.floating]) -> NDArray[np.float64]:
         """(..., 3) points of the estimate's world in the true world."""
@@ -40,6 +67,13 @@ class Alignment:
     def to_estimate(self, points_true: NDArray[np.floating]) -> NDArray[np.float64]:
         """(..., 3) points of the true world in the estimate's world: the inverse of ``to_true``."""
         return np.asarray((points_true - self.translation) @ self.rotation / self.scale)
+
+    def poses(self, T_est_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., 4, 4) camera poses of the estimate's world in the true world; rotations stay rotations."""
+        T_true_cam = T_est_cam.copy()
+        T_true_cam[..., :3, :3] = self.rotation @ T_est_cam[..., :3, :3]
+        T_true_cam[..., :3, 3] = self.to_true(T_est_cam[..., :3, 3])
+        return T_true_cam
 
     def to_json(self) -> dict[str, Any]:
         """``alignment`` of ``evaluate --json``."""
@@ -50,50 +84,78 @@ class Alignment:
         }
 
 
-def align_trajectory(
-    estimated: Trajectory, T_world_cam_true: NDArray[np.float64], with_scale: bool = False
-) -> Alignment:
-    """Align an estimate to the truth over the frames that have a pose in both.
+def align(estimated: Poses, true: Poses, how: str = "se3") -> Alignment:
+    """The alignment of the camera centres of the frames that have a pose in both.
 
-    T_world_cam_true: (N, 4, 4), row n = frame n of the capture, NaN where there is none.
-    with_scale: Sim(3), for trajectories without a metric scale; otherwise SE(3).
-    Raises FreeOccError: lengths differ, fewer than three frames match, camera centres on one line.
+    Raises FreeOccError: fewer than three frames match, their centres lie on one line, unknown ``how``.
     """
-    centers_est, centers_true = _matched_centers(estimated, T_world_cam_true)
-    scale, R, t = umeyama(centers_est, centers_true, with_scale)
-    error = _rmse(scale * centers_est @ R.T + t, centers_true)
-    return Alignment(scale, np.asarray(R, np.float64), np.asarray(t, np.float64), error, len(centers_est))
+    if how not in ALIGNMENTS:
+        raise FreeOccError(f"Trajectories are aligned by {', '.join(ALIGNMENTS)}, not by '{how}'.")
+    if how == "none":
+        return Alignment.identity()
+    rows_est, rows_true = associate(estimated.timestamps, true.timestamps)
+    scale, R, t = umeyama(estimated.centers[rows_est], true.centers[rows_true], with_scale=how == "sim3")
+    return Alignment(scale, np.asarray(R, np.float64), np.asarray(t, np.float64))
 
 
-def ate_rmse(estimated: Trajectory, T_world_cam_true: NDArray[np.float64], with_scale: bool = False) -> float:
-    """Absolute trajectory error after the best alignment, metres; arguments and errors of ``align_trajectory``."""
-    return align_trajectory(estimated, T_world_cam_true, with_scale).ate_rmse_m
+def associate(
+    times_a: NDArray[np.float64], times_b: NDArray[np.float64], tolerance: float = SAME_TIME_S
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of two ascending lists of timestamps that belong together: each of the shorter list with the nearest of the
+    longer, where they differ by no more than the tolerance, in seconds."""
+    if len(times_a) > len(times_b):
+        rows_b, rows_a = associate(times_b, times_a, tolerance)
+        return rows_a, rows_b
+    if not len(times_a):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    after = np.clip(np.searchsorted(times_b, times_a), 1, max(len(times_b) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(times_b) - 1)
+    nearest = np.where(np.abs(times_b[after] - times_a) < np.abs(times_b[before] - times_a), after, before)
+    close = np.abs(times_b[nearest] - times_a) <= tolerance
+    return np.flatnonzero(close), nearest[close]
 
 
-def true_poses(capture: Capture) -> NDArray[np.float64]:
-    """(N, 4, 4) the poses that a capture states, NaN where it has none. Raises FreeOccError if it has none at all."""
-    poses = np.full((len(capture), 4, 4), np.nan)
-    for index in range(len(capture)):
-        T_world_cam = capture.pose(index)
-        if T_world_cam is not None:
-            poses[index] = T_world_cam
-    if np.isnan(poses).all():
-        raise FreeOccError(f"{capture.path} brings no poses to compare with: name a file of true poses.")
-    return poses
+def estimated_poses(trajectory: Trajectory) -> Poses:
+    """The frames of a trajectory that have a pose."""
+    rows = np.flatnonzero(trajectory.has_pose)
+    return Poses(trajectory.timestamps[rows], trajectory.T_world_cam[rows])
 
 
-def _matched_centers(
-    estimated: Trajectory, T_world_cam_true: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(M, 3) estimated and true camera centres of the frames that have both."""
-    if T_world_cam_true.shape != (len(estimated), 4, 4):
+def true_poses(capture: Capture) -> Poses:
+    """The poses that a capture states. Raises FreeOccError if it has none at all."""
+    stated = [(index, T) for index in range(len(capture)) if (T := capture.pose(index)) is not None]
+    if not stated:
+        raise FreeOccError(f"{capture.path} brings no poses to compare with: name a file of true poses with --poses.")
+    rows, poses = zip(*stated, strict=True)
+    return Poses(capture.timestamps[list(rows)], np.stack(poses))
+
+
+def read_poses(path: str | Path) -> Poses:
+    """Poses of a capture (its folder, or ``builtin:room``) or of a file: TUM's ``timestamp tx ty tz qx qy qz qw``, or
+    12 or 16 numbers a line, the row-major camera-to-world matrix of frame 0, 1, … (KITTI, Replica), whose timestamp is
+    the frame's index. Raises FreeOccError."""
+    if str(path).startswith("builtin:") or Path(path).is_dir():
+        return true_poses(open_capture(path))
+    path = Path(path)
+    if not path.is_file():
+        raise FreeOccError(f"There is no file or capture {path} to take poses from.")
+    try:
+        columns = len(next(line for line in path.read_text().splitlines() if line.strip() and line[0] != "#").split())
+        if columns in (12, 16):
+            rows = np.loadtxt(path, ndmin=2).reshape(-1, columns // 4, 4)
+            T = np.tile(np.eye(4), (len(rows), 1, 1))
+            T[:, : columns // 4] = rows
+            times = np.arange(len(T), dtype=np.float64)
+        else:
+            times, T = read_tum(path)
+    except (OSError, ValueError, StopIteration, MapError) as error:
         raise FreeOccError(
-            f"The estimate has {len(estimated)} frames but the true poses have the shape {T_world_cam_true.shape}: "
-            "are both of the same capture?"
-        )
-    both = estimated.has_pose & np.isfinite(T_world_cam_true).all(axis=(1, 2))
-    return estimated.T_world_cam[both, :3, 3], T_world_cam_true[both, :3, 3]
-
-
-def _rmse(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    return float(np.sqrt(((a - b) ** 2).sum(axis=1).mean()))
+            f"{path} is no trajectory: 8 numbers a line (TUM: timestamp, position, quaternion xyzw), or 12 or 16 (a "
+            "matrix)."
+        ) from error
+    finite = np.isfinite(T).all(axis=(1, 2))
+    if not all(is_rigid(pose) for pose in T[finite]):
+        raise CaptureError(f"{path} holds a matrix that is no rigid camera-to-world pose.")
+    order = np.argsort(times[finite], kind="stable")
+    return Poses(times[finite][order], T[finite][order])

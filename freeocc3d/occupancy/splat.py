@@ -71,13 +71,24 @@ class Bins:
     cutoff: float
 
 
-def bin_gaussians(gaussians: Gaussians, origin: NDArray[np.float64], voxel_size: float, cutoff: float) -> Bins:
-    """Sort Gaussians into blocks of the lattice whose voxel (0, 0, 0) has its lower corner at ``origin``."""
+def bin_gaussians(
+    gaussians: Gaussians,
+    origin: NDArray[np.float64],
+    voxel_size: float,
+    cutoff: float,
+    shape: tuple[int, int, int] | None = None,
+) -> Bins:
+    """Sort Gaussians into blocks of the lattice whose voxel (0, 0, 0) has its lower corner at ``origin``.
+
+    shape: only the voxels (0, 0, 0) … shape - 1 are evaluated, however far a Gaussian reaches; all by default.
+    """
     means = ((gaussians.means.astype(np.float64) - origin) / voxel_size).astype(np.float32)
     scales = np.maximum(gaussians.scales, _SMALLEST_SCALE).astype(np.float32) / np.float32(voxel_size)
     precision, extent = _precisions(gaussians.quats_wxyz.astype(np.float32), scales)
     log_weight = np.log(np.maximum(gaussians.opacities, 1e-6)) - np.log(scales).sum(axis=1)
     lo, hi = _boxes(means, extent, np.float32(cutoff))
+    if shape is not None:
+        lo, hi = np.maximum(lo, np.int32(0)), np.minimum(hi, np.array(shape, np.int32) - 1)
     packed, start, gaussian = _sort_by_block(lo, hi)
     return Bins(packed, start, gaussian, means, precision, log_weight.astype(np.float32), lo, hi, cutoff)
 

@@ -1,0 +1,128 @@
+"""The truth about a scene: a labelled voxel grid with what was observed of it, and its file."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FreeOccError, MapError
+from ..files import write_whole
+from ..store import read_arrays
+from ..types import UNKNOWN
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """True occupancy of a scene, ``ground_truth.npz``.
+
+    labels: (X, Y, Z) uint8, 0 free, k = ``classes[k]``, 255 not observed.
+    origin: (3,) float64 lower corner of voxel (0, 0, 0) in the frame of the true poses, metres.
+    voxel_size: edge of a voxel, metres.  classes: names of the labels; ``classes[0]`` is not used.
+    frames_mask: (X, Y, Z) bool, the union of the frames' own masks, where the data set has such masks.
+    """
+
+    labels: NDArray[np.uint8]
+    origin: NDArray[np.float64]
+    voxel_size: float
+    classes: tuple[str, ...]
+    frames_mask: NDArray[np.bool_] | None = None
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Voxels along x, y and z."""
+        x, y, z = self.labels.shape
+        return x, y, z
+
+    def centers(self) -> NDArray[np.float64]:
+        """(X, Y, Z, 3) voxel centres in the frame of the true poses, metres."""
+        return self.origin + (np.moveaxis(np.indices(self.shape), 0, -1) + 0.5) * self.voxel_size
+
+    def masks(self) -> dict[str, NDArray[np.bool_]]:
+        """What may be scored, (X, Y, Z) bool each: "label", where the truth is known (label != 255), and, where the
+        data set has masks of its frames, "frames", the known voxels of their union.
+
+        EmbodiedOcc scores the second, FreeOcc's release the first.
+        """
+        known = self.labels != UNKNOWN
+        return {"label": known} | ({} if self.frames_mask is None else {"frames": known & self.frames_mask})
+
+
+def load_ground_truth(path: str | Path, classes: tuple[str, ...] | None = None) -> GroundTruth:
+    """Read ``ground_truth.npz`` or a data set's ``global_occ_package/<scene>.pkl``; arrays only, nothing is executed.
+
+    classes: names of the labels 0, 1, … of a package that does not name them.
+    Raises FreeOccError: no such file, damaged, an array is missing or has another shape or type than ``GroundTruth``
+    states, a label has no class.
+    """
+    path = Path(path)
+    if path.suffix == ".pkl":
+        from .embodiedocc import load_global_package
+
+        return load_global_package(path, classes)
+    arrays = read_grid_arrays(path)
+    labels = array(arrays, "labels", path)
+    names = array(arrays, "classes", path)
+    if labels.dtype != np.uint8 or labels.ndim != 3:
+        raise FreeOccError(f"'labels' of {path} must be uint8 (X, Y, Z), got {labels.dtype} {labels.shape}.")
+    if names.dtype.kind != "U" or names.ndim != 1:
+        raise FreeOccError(f"'classes' of {path} must be a list of names, got {names.dtype} {names.shape}.")
+    largest = int(labels.max(initial=0, where=labels != UNKNOWN))
+    if largest >= max(len(names), 1):
+        raise FreeOccError(f"'labels' of {path} hold class {largest}, but only {len(names)} classes are named.")
+    mask = arrays.get("frames_mask")
+    if mask is not None and (mask.dtype != np.bool_ or mask.shape != labels.shape):
+        raise FreeOccError(f"'frames_mask' of {path} must be bool {labels.shape}, got {mask.dtype} {mask.shape}.")
+    return GroundTruth(labels, *placed(arrays, path), tuple(names.tolist()), mask)
+
+
+def save_ground_truth(truth: GroundTruth, path: Path, overwrite: bool = False) -> None:
+    """Write ``ground_truth.npz``. Raises ExportError: it exists, or cannot be written."""
+    arrays: dict[str, Any] = {
+        "labels": truth.labels,
+        "origin": truth.origin,
+        "voxel_size": np.float64(truth.voxel_size),
+        "classes": np.array(truth.classes),
+    }
+    if truth.frames_mask is not None:
+        arrays["frames_mask"] = truth.frames_mask
+
+    def write(target: Path) -> None:
+        with target.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)
+
+    write_whole(path, write, overwrite)
+
+
+def read_grid_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """All arrays of an .npz file by name, their sizes checked first. Raises FreeOccError."""
+    if not path.is_file():
+        raise FreeOccError(f"Cannot read {path}: there is no such file.")
+    if not zipfile.is_zipfile(path):
+        raise FreeOccError(f"{path} is damaged or not an .npz file of named arrays.")
+    try:
+        return read_arrays(path, {})
+    except MapError as error:
+        raise FreeOccError(str(error)) from error
+
+
+def placed(arrays: dict[str, NDArray[Any]], path: Path) -> tuple[NDArray[np.float64], float]:
+    """Origin (3,) and voxel size of a grid, metres. Raises FreeOccError."""
+    origin = array(arrays, "origin", path)
+    size = array(arrays, "voxel_size", path)
+    if origin.dtype.kind != "f" or origin.shape != (3,) or not np.isfinite(origin).all():
+        raise FreeOccError(f"'origin' of {path} must be three finite numbers in metres.")
+    if size.dtype.kind != "f" or size.shape != () or not (np.isfinite(size) and size > 0):
+        raise FreeOccError(f"'voxel_size' of {path} must be one positive number in metres.")
+    return origin.astype(np.float64), float(size)
+
+
+def array(arrays: dict[str, NDArray[Any]], name: str, path: Path) -> NDArray[Any]:
+    """One of them. Raises FreeOccError if it is not there."""
+    if name not in arrays:
+        raise FreeOccError(f"{path} has no '{name}'; it holds {', '.join(arrays) or 'nothing'}.")
+    return arrays[name]

@@ -1,0 +1,58 @@
+"""The ablations of ``configs/ablations``: configurations that are mapped and scored by name.
+
+The first line of a file says what the variant is, ``# table:`` to which table of the paper it belongs, and ``# needs:``
+what is lacking while this version of freeocc3d does not know its options. Whether it does is found out by asking it.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+FOLDER = Path(__file__).resolve().parents[1] / "configs" / "ablations"
+
+_TRY = """
+import sys
+from pathlib import Path
+from freeocc3d import config, pipeline
+from freeocc3d.errors import FreeOccError
+for path in sys.argv[1:]:
+    try:
+        pipeline.check(config.load(Path(path)))
+        print("")
+    except FreeOccError as error:
+        print(error)
+"""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """title: what it is.  table: where the paper has it.  lacking: why it cannot run, one sentence; empty if it can."""
+
+    name: str
+    title: str
+    table: str
+    path: Path
+    lacking: str
+
+
+def names() -> list[str]:
+    """Of all ablations."""
+    return sorted(path.stem for path in FOLDER.glob("*.yaml"))
+
+
+def all_variants() -> dict[str, Variant]:
+    """Every ablation by name, in the order of the names."""
+    paths = sorted(FOLDER.glob("*.yaml"))
+    command = [sys.executable, "-c", _TRY, *map(str, paths)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    return {path.stem: _variant(path, refused) for path, refused in zip(paths, said, strict=True)}
+
+
+def _variant(path: Path, refused: str) -> Variant:
+    comments = [line[1:].strip() for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
+    facts = dict(line.split(": ", 1) for line in comments[1:] if line.startswith(("table: ", "needs: ")))
+    lacking = f"needs {facts['needs']}" if refused and "needs" in facts else refused
+    return Variant(path.stem, comments[0], facts.get("table", ""), path, lacking)
