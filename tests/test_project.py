@@ -85,6 +85,26 @@ def test_the_rooms_map_agrees_with_its_truth(room: Any) -> None:
     assert "None of the classes is known" in scored.notes[0]
 
 
+def test_the_order_of_frames_does_not_count(room: Any) -> None:
+    """Evidence is carved anew for the score; the true poses come in any order, too."""
+    from freeocc3d.occupancy import build, carve, splat
+
+    order = np.random.default_rng(0).permutation(len(room.keyframes))
+    frames, T = list(room.keyframes), room.trajectory.T_world_keyframe
+    none = np.zeros((len(room.gaussians), 0), np.float16)
+    usual, shuffled = (
+        build.build_occupancy(
+            room.gaussians, none, [frames[i] for i in rows], T[rows], splat.Options(), carve.Options(), ORIGIN
+        )
+        for rows in (np.arange(len(order)), order)
+    )
+    np.testing.assert_array_equal(usual.state, shuffled.state)
+    own = estimated_poses(room.trajectory)
+    turned = Poses(own.timestamps[::-1], own.T_world_cam[::-1])
+    scored = [evaluate.score_map(room, lattice(), NO_CLASSES, poses) for poses in (own, turned)]
+    np.testing.assert_array_equal(scored[0].predicted.occupied, scored[1].predicted.occupied)
+
+
 # Gaussians of any origin
 
 

@@ -30,10 +30,16 @@ SAME_TIME_S = 0.02
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of some frames: timestamps (M,) seconds, ascending, and T_world_cam (M, 4, 4), all finite."""
+    """Poses of some frames: timestamps (M,) seconds and T_world_cam (M, 4, 4), all finite. They are kept in the order
+    of time, in whatever order they are given."""
 
     timestamps: NDArray[np.float64]
     T_world_cam: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        order = np.argsort(self.timestamps, kind="stable")
+        object.__setattr__(self, "timestamps", self.timestamps[order])
+        object.__setattr__(self, "T_world_cam", self.T_world_cam[order])
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -157,5 +163,4 @@ def read_poses(path: str | Path) -> Poses:
     finite = np.isfinite(T).all(axis=(1, 2))
     if not all(is_rigid(pose) for pose in T[finite]):
         raise CaptureError(f"{path} holds a matrix that is no rigid camera-to-world pose.")
-    order = np.argsort(times[finite], kind="stable")
-    return Poses(times[finite][order], T[finite][order])
+    return Poses(times[finite], T[finite])
