@@ -11,7 +11,8 @@ from typing import Annotated, Any
 import typer
 
 from . import __version__
-from .errors import ExportError, FreeOccError
+from .errors import FreeOccError
+from .files import refuse_existing
 from .progress import Progress
 
 app = typer.Typer(
@@ -207,6 +208,7 @@ def evaluate(
         Path | None, typer.Option("--split", metavar="FILE", help="Score the scenes that this file lists.")
     ] = None,
     overrides: Set = None,
+    html: Annotated[Path | None, typer.Option("--html", metavar="OUT", help="Write a report page.")] = None,
     as_json: Json = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -217,6 +219,8 @@ def evaluate(
     named = [f"{option} {path}" for option, path in others.items() if path is not None]
     if len(named) + bool(maps) != 1:
         raise typer.BadParameter("give maps, or one of --gaussians, --grid and --frames.")
+    if html is not None:
+        refuse_existing(html, overwrite)
     asked = scoring.Asked(
         maps=maps or [],
         gaussians=gaussians,
@@ -231,6 +235,10 @@ def evaluate(
         overrides=overrides or [],
     )
     result = scoring.evaluate(asked)
+    if html is not None:
+        from .evaluation.report import write_report
+
+        write_report(result, html, overwrite)
     print(json.dumps(result.to_json()) if as_json else result.to_text())
 
 
@@ -248,8 +256,7 @@ def ground_truth_command(
 
     if protocol != "replicaocc":
         raise typer.BadParameter(f"'{protocol}' is not a protocol; there is replicaocc.", param_hint="--protocol")
-    if output.exists() and not overwrite:
-        raise ExportError(f"{output} exists: choose another name, or replace it with --overwrite.")
+    refuse_existing(output, overwrite)
     progress = ConsoleProgress()
     try:
         truth = replicaocc.build(capture, overrides or [], progress)

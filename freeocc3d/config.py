@@ -53,6 +53,10 @@ def load(path: Path | None, overrides: Iterable[str] = ()) -> Config:
         if loaded is not None and not isinstance(loaded, dict):
             raise ConfigError(f"{path} must hold sections such as 'tracking:', not a {type(loaded).__name__}.")
         values = loaded or {}
+        try:
+            resolve(values)
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from error
     for override in overrides:
         _apply(values, override)
     return resolve(values)

@@ -10,10 +10,15 @@ from pathlib import Path
 from .errors import ExportError
 
 
-def write_whole(path: Path, write: Callable[[Path], None], overwrite: bool = False) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then give it the name. Raises ExportError."""
+def refuse_existing(path: Path, overwrite: bool = False) -> None:
+    """Raises ExportError if the file exists: before work is done that could then not be written."""
     if path.exists() and not overwrite:
         raise ExportError(f"{path} exists: choose another name, or replace it with --overwrite.")
+
+
+def write_whole(path: Path, write: Callable[[Path], None], overwrite: bool = False) -> None:
+    """Let ``write`` fill a temporary file beside ``path``, then give it the name. Raises ExportError."""
+    refuse_existing(path, overwrite)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         write(temporary)

@@ -115,10 +115,15 @@ def test_unusable_overrides_are_refused(override: str, message: str) -> None:
         config.load(None, [override])
 
 
-def test_an_override_cannot_go_below_a_value(tmp_path: Path) -> None:
-    path = write(tmp_path / "c.yaml", "tracking: known\n")
-    with pytest.raises(ConfigError, match="'tracking' holds a value, not a section"):
-        config.load(path, ["tracking.backend=known"])
+def test_an_override_cannot_go_below_a_value() -> None:
+    with pytest.raises(ConfigError, match="'rgbd' holds a value, not a section"):
+        config.load(None, ["tracking.rgbd=3", "tracking.rgbd.x=4"])
+
+
+def test_a_file_that_does_not_fit_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "c.yaml", "trackin:\n  backend: known\n")
+    with pytest.raises(ConfigError, match=r"c\.yaml: Unknown section 'trackin'"):
+        config.load(path)
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def scene(
     )
     return Scene(
         name, GroundTruth(true, np.zeros(3), 0.1, ("free", *classes), mask), predicted, Alignment.identity(), None,
-        None, None, (),
+        None, None, np.array((0.0, 0.0, 1.0)), (),
     )  # fmt: skip
 
 
@@ -108,6 +108,13 @@ def test_the_command_scores_a_map_against_its_captures_truth(bedroom: Path, tmp_
     assert document["align"] == "se3"
     assert document["alignment"]["scale"] == 1.0
     assert document["miou"] == pytest.approx(np.mean([document["per_class"][c] for c in document["classes_in_miou"]]))
+    page = tmp_path / "report.html"
+    run("evaluate", bedroom, "--html", page)
+    written = page.read_text()
+    assert f"{100 * document['iou']:.1f} %" in written
+    assert written.count("data:image/png;base64,") == 3
+    assert f"{page} exists" in refused("evaluate", bedroom, "--html", page)
+    assert page.read_text() == written
     truth = data_folder() / "house" / "bedroom" / "ground_truth.npz"
     mapped = run("evaluate", bedroom, "--ground-truth", truth, "--classes", CLASSES).stdout
     assert "11 classes: ceiling, floor, wall" in mapped

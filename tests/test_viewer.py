@@ -12,6 +12,7 @@ from freeocc3d.palette import HIGHLIGHTS, class_colors
 from freeocc3d.query import Region
 from freeocc3d.types import Trajectory
 from freeocc3d.viewer import pictures
+from freeocc3d.viewer.scene import cut_height
 
 
 def room_map(tmp_path):
@@ -94,7 +95,8 @@ def test_an_empty_map_and_an_unwritable_place_are_told(tmp_path) -> None:
 
 def test_a_match_above_the_cut_is_drawn(tmp_path) -> None:
     room = room_map(tmp_path)
-    below = pictures._below_cut(room.occupancy, pictures._upright(room.up, room.occupancy))
+    height = room.occupancy.centers(room.occupancy.occupied_voxels()) @ room.up
+    below = height <= cut_height(height, room.occupancy.voxel_size)
     above = np.flatnonzero(~below)[:40]
 
     def strong(rows) -> int:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import __version__, config, registry
 from ..capture import base as capture_base
@@ -21,7 +22,9 @@ from ..capture.base import Capture
 from ..config import Config
 from ..errors import FreeOccError
 from ..gaussians.standard_ply import read_standard_ply
+from ..gaussians.upright import estimate_up
 from ..store import CONFIG, Map, load_map
+from ..types import UNKNOWN
 from . import project
 from .align import Alignment, Poses, align, estimated_poses, read_poses, true_poses
 from .classes import EMBODIEDOCC, SHARED, ClassMap, identity, load_class_map
@@ -41,6 +44,7 @@ class Scene:
     name: of the map, file or folder that was scored.  truth: in terms of the scored classes.
     alignment: of the estimate's world with the true one.  errors: of the trajectory, None where there is none.
     frames: of the capture, or with a true pose.  frames_with_pose: of those, with an estimated pose.
+    up: (3,) unit vector towards the ceiling in the true world, for pictures.
     notes: sentences about what should be known when the figures are read.
     """
 
@@ -51,6 +55,7 @@ class Scene:
     errors: TrajectoryErrors | None
     frames: int | None
     frames_with_pose: int | None
+    up: NDArray[np.float64]
     notes: tuple[str, ...]
 
 
@@ -85,6 +90,7 @@ def score_map(
         errors=None if poses is None else trajectory_errors(estimated, poses, alignment),
         frames=len(scan_map.trajectory),
         frames_with_pose=len(estimated),
+        up=alignment.rotation @ scan_map.up,
         notes=(note,) if note else (),
     )
 
@@ -171,8 +177,16 @@ def _other(
         errors=errors,
         frames=None if poses is None else len(poses),
         frames_with_pose=None if trajectory is None else len(trajectory),
+        up=_up(truth, poses),
         notes=tuple(notes),
     )
+
+
+def _up(truth: GroundTruth, poses: Poses | None) -> NDArray[np.float64]:
+    """(3,) where up is in the true world; without poses z, as in the published data sets."""
+    if poses is None:
+        return np.array((0.0, 0.0, 1.0))
+    return estimate_up(poses.T_world_cam, truth.centers()[(truth.labels > 0) & (truth.labels != UNKNOWN)])
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,14 @@ def exposed_faces(
     chosen: (V,) the occupied voxels to draw, as if there were no others; all by default.
     """
     voxels = occupancy.occupied_voxels()
-    row = np.arange(len(voxels)) if chosen is None else np.flatnonzero(chosen)
-    voxels = voxels[row]
+    chosen_rows = np.arange(len(voxels)) if chosen is None else np.flatnonzero(chosen)
+    corners, quads, rows = faces_of(voxels[chosen_rows])
+    vertices = (occupancy.origin + corners * occupancy.voxel_size).astype(np.float32)
+    return vertices, quads, chosen_rows[rows]
+
+
+def faces_of(voxels: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+    """The faces of (V, 3) voxel indices, |i| < 2^20: as ``exposed_faces``, but (4 F, 3) corners on the lattice."""
     index = voxels.astype(np.int64) + (1 << 20)
     keys = (index[:, 0] << 42) + (index[:, 1] << 21) + index[:, 2]
     ascending = np.sort(keys)
@@ -32,8 +38,7 @@ def exposed_faces(
             turn = [(0, 0), (1, 0), (1, 1), (0, 1)] if side else [(0, 0), (0, 1), (1, 1), (1, 0)]
             offset = np.zeros((4, 3), np.int32)
             offset[:, axis], offset[:, [b, c]] = side, turn
-            corners.append(voxels[exposed][:, None] + offset)
+            corners.append(voxels[exposed, None].astype(np.int32) + offset)
             rows.append(exposed)
     lattice = np.concatenate(corners).reshape(-1, 3)
-    vertices = (occupancy.origin + lattice * occupancy.voxel_size).astype(np.float32)
-    return vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 4), row[np.concatenate(rows)]
+    return lattice, np.arange(len(lattice), dtype=np.int32).reshape(-1, 4), np.concatenate(rows)
