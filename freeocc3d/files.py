@@ -11,7 +11,9 @@ from .errors import ExportError
 
 
 def refuse_existing(path: Path, overwrite: bool = False) -> None:
-    """Raises ExportError if the file exists: before work is done that could then not be written."""
+    """Raises ExportError if the file exists or its folder does not: before work is done that could not be written."""
+    if not path.parent.is_dir():
+        raise ExportError(f"Cannot write {path}: there is no folder {path.parent}.")
     if path.exists() and not overwrite:
         raise ExportError(f"{path} exists: choose another name, or replace it with --overwrite.")
 

@@ -264,7 +264,10 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     T = np.tile(np.eye(4), (len(table), 1, 1))
     T[:, :3, 3] = table[:, 1:4]
     quats_wxyz = table[:, [7, 4, 5, 6]]
-    T[:, :3, :3] = quats_to_rotations(quats_wxyz / np.linalg.norm(quats_wxyz, axis=1, keepdims=True))
+    lengths = np.linalg.norm(quats_wxyz, axis=1, keepdims=True)
+    if (lengths == 0).any():
+        raise MapError(f"The trajectory {path} has a quaternion of zeros, which is no rotation.")
+    T[:, :3, :3] = quats_to_rotations(quats_wxyz / lengths)
     return table[:, 0], T
 
 

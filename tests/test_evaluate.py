@@ -201,6 +201,22 @@ def test_truth_and_maps_that_do_not_fit_are_told_in_a_sentence(bedroom: Path, tm
     assert "name it with --ground-truth" in refused("evaluate", moved)
     assert run("evaluate", bedroom, "--grid", truth, code=2).stderr
     assert run("evaluate", code=2).stderr
+    (tmp_path / "zero.txt").write_text("".join(f"{i} {i} {i * i} 0 0 0 0 0\n" for i in range(20)))
+    assert "is no trajectory" in refused("evaluate", bedroom, "--poses", tmp_path / "zero.txt")
+    assert "There is no" in refused("evaluate", "--gaussians", tmp_path / "absent.ply", "--ground-truth", truth)
+    assert "there is no folder" in refused("evaluate", bedroom, "--html", tmp_path / "absent" / "page.html")
+    arrays = dict(np.load(truth))
+    np.savez(tmp_path / "fine.npz", **{**arrays, "voxel_size": np.float64(1e-9)})
+    assert "from 0.001 to 10" in refused("evaluate", bedroom, "--ground-truth", tmp_path / "fine.npz")
+
+
+def test_a_map_that_misses_the_truth_altogether_says_so(bedroom: Path, tmp_path: Path) -> None:
+    arrays = dict(np.load(data_folder() / "house" / "bedroom" / "ground_truth.npz"))
+    np.savez(tmp_path / "away.npz", **{**arrays, "origin": arrays["origin"] + 1000})
+    result = evaluate(Asked(maps=[bedroom], ground_truths=[tmp_path / "away.npz"]))
+    assert result.scores.iou == 0
+    assert any("no voxel inside the truth" in note for note in result.notes)
+    assert not any("no voxel inside the truth" in note for note in evaluate(Asked(maps=[bedroom])).notes)
 
 
 def test_the_threshold_can_be_swept_without_mapping_again(bedroom: Path) -> None:

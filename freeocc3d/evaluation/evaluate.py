@@ -228,6 +228,9 @@ def evaluate(asked: Asked) -> Evaluation:
     classes = listed or common_classes(truths)
     truths = [classes.apply(truth, str(asked.classes)) for truth in truths]
     trajectory = None if asked.trajectory is None else read_poses(asked.trajectory)
+    for other in (asked.gaussians, asked.grid, asked.frames):
+        if other is not None and not other.exists():
+            raise FreeOccError(f"There is no {other} to score.")
     if maps:
         scenes = [
             score_map(scan_map, truth, classes, true, asked.align, asked.overrides)
@@ -370,7 +373,15 @@ class Evaluation:
     @property
     def notes(self) -> tuple[str, ...]:
         """What should be known when the figures are read."""
-        return tuple(dict.fromkeys(note for scene in self.scenes for note in scene.notes))
+        apart = [
+            f"{scene.name} claims no voxel inside the truth: if they are not in one frame, name true poses in the "
+            "truth's frame with --poses."
+            for scene in self.scenes
+            if not confusion(scene.truth.labels, scene.predicted, scene.truth.masks()[PRIMARY_MASK], len(self.classes))[
+                :, 1:
+            ].any()
+        ]
+        return tuple(dict.fromkeys([*(note for scene in self.scenes for note in scene.notes), *apart]))
 
     @property
     def ate_rmse_m(self) -> float | None:

@@ -116,8 +116,8 @@ def placed(arrays: dict[str, NDArray[Any]], path: Path) -> tuple[NDArray[np.floa
     size = array(arrays, "voxel_size", path)
     if origin.dtype.kind != "f" or origin.shape != (3,) or not np.isfinite(origin).all():
         raise FreeOccError(f"'origin' of {path} must be three finite numbers in metres.")
-    if size.dtype.kind != "f" or size.shape != () or not (np.isfinite(size) and size > 0):
-        raise FreeOccError(f"'voxel_size' of {path} must be one positive number in metres.")
+    if size.dtype.kind != "f" or size.shape != () or not 1e-3 <= size <= 10:
+        raise FreeOccError(f"'voxel_size' of {path} must be one number of metres, from 0.001 to 10.")
     return origin.astype(np.float64), float(size)
 
 
