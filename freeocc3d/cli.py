@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from . import __version__
-from .errors import FreeOccError
+from .errors import ConfigError, FreeOccError
 from .files import refuse_existing
 from .progress import Progress
 
@@ -99,8 +99,15 @@ def reconstruct(
     """Turn a captured scan into a map."""
     from . import config, pipeline
 
-    on_device = [f"tracking.rgbd.device={device}"] if device else []
-    settings = config.load(config_file, [*(overrides or []), *on_device])
+    settings = config.load(config_file, overrides or [])
+    if device is not None:
+        backend = settings["tracking"]["backend"]
+        if "device" in settings["tracking"].get(backend, {}):
+            settings["tracking"][backend]["device"] = device
+        elif device != "cpu":
+            raise ConfigError(
+                f"The tracker '{backend}' runs on the CPU only: --device {device} needs tracking.backend=odometry."
+            )
     progress = ConsoleProgress()
     try:
         made = pipeline.reconstruct(capture, output, settings, overwrite=overwrite, resume=resume, progress=progress)
@@ -156,7 +163,6 @@ def export(
     """Write a map in another program's format."""
     import yaml
 
-    from .errors import ConfigError
     from .export import export_map
     from .store import load_map
 
@@ -375,6 +381,11 @@ def _info(loaded: Any) -> dict[str, Any]:
         "frame_status": report["frames"],
         "keyframes": len(manifest["keyframes"]),
         "submaps": counts["submaps"],
+        "submap_frames": [
+            {key: submap[key] for key in ("first", "last", "frames", "keyframes", "mapped")}
+            for submap in report.get("submaps", [])
+        ],
+        "color_focal": report.get("color_focal", 1.0),
         "gaussians": counts["gaussians"],
         "voxels": {"occupied": counts["voxels"]["occupied"], "free": counts["voxels"]["free"]},
         "voxel_size_m": manifest["voxel_size_m"],
@@ -407,6 +418,12 @@ def _info_text(facts: dict[str, Any]) -> str:
         f"time       {sum(facts['seconds'].values()):.1f} s: {seconds}",
         f"memory     {facts['peak_memory_bytes'] / 1e9:.2f} GB at most",
     ]
+    if facts["submaps"] > 1:
+        lines += [
+            f"submap     frames {submap['first']} to {submap['last']}: {submap['frames']} frames, "
+            f"{submap['keyframes']} keyframes, {'mapped' if submap['mapped'] else 'apart, not in the map'}"
+            for submap in facts["submap_frames"]
+        ]
     lines += [f"warning    {text}" for text in facts["warnings"]]
     return "\n".join(lines)
 

@@ -151,3 +151,10 @@ def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Arra
     R = U @ S @ Vt  # eq. 40
     scale = float((D * np.diag(S)).sum() / variance) if with_scale else 1.0  # eq. 42
     return scale, R, mean_target - scale * R @ mean_source  # eq. 41
+
+
+def apart(T_a: Array, T_b: Array) -> tuple[float, float]:
+    """How far two poses of one thing are from each other: metres and degrees."""
+    difference = invert(T_a) @ T_b
+    cosine = np.clip(0.5 * (np.trace(difference[:3, :3]) - 1.0), -1.0, 1.0)
+    return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(np.arccos(cosine)))

@@ -10,6 +10,7 @@ from typing import overload
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import MapError
 from .types import Frame, Intrinsics
@@ -52,6 +53,13 @@ class Keyframes(Sequence[Frame]):
             {"frame": frame.index, "timestamp": frame.timestamp, "width": camera.width, "height": camera.height,
              "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
         )  # fmt: skip
+
+    def only(self, frames: NDArray[np.integer]) -> Keyframes:
+        """Those of the given frames of the capture, in the same folder."""
+        chosen = Keyframes(self.folder)
+        wanted = set(frames.tolist())
+        chosen._entries = [entry for entry in self._entries if int(entry["frame"]) in wanted]
+        return chosen
 
     def truncate(self, length: int) -> None:
         """Forget all but the first ``length``; their files are overwritten when the frames come again."""

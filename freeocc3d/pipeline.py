@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from . import __version__, config, registry, store
 from .capture import Capture, check_depth_scale, open_capture, read_ahead, used_frames
 from .capture import base as capture_base
+from .capture.reregistered import Reregistered
 from .config import Config
 from .errors import CaptureError, FrameError, Interrupted, MapError, TrackingError
 from .gaussians import anchors
@@ -31,8 +32,10 @@ from .language.encoders.base import Encoder
 from .occupancy import build, carve, splat
 from .progress import Progress
 from .store import Map, load_map
+from .tracking import calibration
 from .tracking.base import Tracked, Tracker
-from .types import Frame, Gaussians, Occupancy, Trajectory
+from .types import Frame, Gaussians, Occupancy, Submap, Trajectory
+from .viewer import paths
 from .work import WorkFolder
 
 _CHECKPOINT_FRAMES = 50
@@ -50,6 +53,7 @@ class Mapper:
 
     def add(self, frame: Frame) -> Tracked:
         """Track the next frame, and keep it if it is a keyframe."""
+        frame = self.tracker.completed(frame)
         tracked = self.tracker.track(frame)
         if tracked.status == "keyframe":
             self.keyframes.append(frame)
@@ -63,13 +67,19 @@ class Mapper:
         """Poses so far, one row per frame of the capture."""
         return self.tracker.trajectory(self.capture.timestamps)
 
+    def mapped(self, trajectory: Trajectory) -> Keyframes:
+        """The keyframes that are mapped: those of the largest submap."""
+        return self.keyframes.only(trajectory.keyframes)
+
     def build_gaussians(self, progress: Progress | None = None) -> Gaussians:
-        """Layer 2 from all keyframes so far at their present poses."""
+        """Layer 2 from the mapped keyframes so far at their present poses."""
         progress = progress or Progress()
+        trajectory = self.trajectory()
+        keyframes = self.mapped(trajectory)
         options = _options(anchors, self.settings["gaussians"])
         cells = anchors.AnchoredCells(options, options.cell_size or 0.5 * self.settings["occupancy"]["voxel_size"])
-        progress.stage("gaussians", len(self.keyframes))
-        for done, (frame, T) in enumerate(zip(self.keyframes, self.trajectory().T_world_keyframe, strict=True), 1):
+        progress.stage("gaussians", len(keyframes))
+        for done, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True), 1):
             cells.add(frame, T)
             progress.advance(done)
         return cells.gaussians()
@@ -81,8 +91,10 @@ class Mapper:
         progress = progress or Progress()
         options = _options(lift, config.options(self.settings, "language"))
         fusion = lift.FeatureFusion(len(gaussians), encoder.dimension, options)
-        progress.stage("language", len(self.keyframes))
-        for done, (frame, T) in enumerate(zip(self.keyframes, self.trajectory().T_world_keyframe, strict=True), 1):
+        trajectory = self.trajectory()
+        keyframes = self.mapped(trajectory)
+        progress.stage("language", len(keyframes))
+        for done, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True), 1):
             try:
                 fusion.add(gaussians, frame, T, encoder.encode(frame))
             except FrameError as error:  # a broken class image: the other keyframes see most of what it showed
@@ -95,12 +107,14 @@ class Mapper:
     ) -> Occupancy:
         """Layer 4: voxels with probabilities, evidence, features and colours."""
         progress = progress or Progress()
-        progress.stage("occupancy", len(self.keyframes))
+        trajectory = self.trajectory()
+        keyframes = self.mapped(trajectory)
+        progress.stage("occupancy", len(keyframes))
         return build.build_occupancy(
             gaussians,
             features,
-            self.keyframes,
-            self.trajectory().T_world_keyframe,
+            keyframes,
+            trajectory.T_world_keyframe,
             _options(splat, self.settings["occupancy"]),
             _options(carve, self.settings["carving"]),
             progress=progress.advance,
@@ -130,11 +144,15 @@ def reconstruct(
     try:
         opened = _open(capture, resolved, progress, work)
         work.begin([_absolute(opened.path), len(opened), __version__], resolved)
+        with work.timed("calibration"):
+            opened = _registered(opened, resolved, progress, work)
         return _run(opened, resolved, output, work, progress)
     except TrackingError:
         work.discard()  # nothing in it is of use
         raise
-    except KeyboardInterrupt as error:
+    except (KeyboardInterrupt, SystemError) as error:
+        if not _is_interrupt(error):
+            raise
         raise Interrupted(
             f"Stopped. The work up to the last checkpoint is in {work.folder}: run the same command with --resume to "
             "go on."
@@ -147,6 +165,11 @@ def reconstruct(
         ) from error
     finally:
         work.drop_if_empty()
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether it is Ctrl-C, which leaves the call of a compiled function as a SystemError that it caused."""
+    return isinstance(error, KeyboardInterrupt) or (error is not None and _is_interrupt(error.__cause__))
 
 
 def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, progress: Progress) -> Map:
@@ -254,6 +277,22 @@ def _open(capture: str | Path, settings: Config, progress: Progress, work: WorkF
     return opened
 
 
+def _registered(capture: Capture, settings: Config, progress: Progress, work: WorkFolder) -> Capture:
+    """The capture with colour brought to the depth's pixels, if its cameras' focal lengths differ."""
+    ratio = settings["capture"]["color_focal"]
+    if ratio is None:
+        progress.stage("calibration")
+        ratio = calibration.color_focal(capture, used_frames(capture))
+        if ratio != 1:
+            text = (
+                f"Colour and depth of {capture.path} fit each other only if the colour camera's focal length is "
+                f"{ratio:.3f} of what its files say: colour is resampled so (capture.color_focal=1 leaves it as it is)."
+            )
+            work.warnings.append(text)
+            progress.warn(text)
+    return capture if ratio == 1 else Reregistered(capture, ratio)
+
+
 def _check_result(trajectory: Trajectory, progress: Progress, work: WorkFolder) -> None:
     """Warn about a run whose map shows only part of the scan."""
     if work.broken:
@@ -272,6 +311,15 @@ def _check_result(trajectory: Trajectory, progress: Progress, work: WorkFolder) 
             text += " Most of the scan is missing: was it captured slowly, with depth in most of each image?"
         work.warnings.append(text)
         progress.warn(text)
+    apart = np.flatnonzero(trajectory.status == "apart")
+    if len(apart):
+        share = len(apart) / max(int(np.count_nonzero(used)), 1)
+        text = (
+            f"{len(apart)} frames ({share:.0%}), the first is frame {apart[0]}, were tracked, but nothing ties them to "
+            "the rest: they are submaps of their own and not in the map, which is of the largest."
+        )
+        work.warnings.append(text)
+        progress.warn(text)
 
 
 def _save(
@@ -283,32 +331,37 @@ def _save(
     occupancy: Occupancy,
     encoder: Encoder,
 ) -> None:
-    capture, keyframes = mapper.capture, mapper.keyframes
+    capture, keyframes = mapper.capture, mapper.mapped(trajectory)
+    submaps = mapper.tracker.submaps()
     folder = work.folder
     with work.timed("saving"):
         codec = Codec.fit(features)
         store.write_occupancy(folder, occupancy, codec, features)
         store.write_tum(folder / store.TRAJECTORY, trajectory)
         (folder / store.CONFIG).write_text(config.dump(mapper.settings), encoding="utf-8")
+        paths.path_picture(folder / store.PATH_PICTURE, submaps, trajectory, gaussians, capture.path)
+        if len(keyframes) < len(mapper.keyframes):
+            work.forget_tracking()  # it counts those that are left out from here on
         keyframes.save_index()
         keyframes.drop_unlisted()
-    report = _report(work, capture, trajectory, gaussians, occupancy)
+    report = _report(work, capture, trajectory, gaussians, submaps)
     (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
-    store.write_manifest(folder, _manifest(capture, trajectory, gaussians, occupancy, encoder, mapper.tracker.world))
+    store.write_manifest(folder, _manifest(mapper, trajectory, gaussians, occupancy, encoder, submaps))
 
 
 def _manifest(
-    capture: Capture,
+    mapper: Mapper,
     trajectory: Trajectory,
     gaussians: Gaussians,
     occupancy: Occupancy,
     encoder: Encoder,
-    world: str,
+    submaps: list[Submap],
 ) -> dict[str, Any]:
+    capture = mapper.capture
     return {
         "freeocc3d": __version__,
         "capture": {"path": _absolute(capture.path), "format": capture.format, "frames": len(capture)},
-        "frame": world,
+        "frame": mapper.tracker.world,
         "poses": "camera to world",
         "voxel_size_m": occupancy.voxel_size,
         "origin": occupancy.origin.tolist(),
@@ -321,14 +374,14 @@ def _manifest(
             "voxels": store.counts(occupancy),
             "frames": len(trajectory),
             "frames_with_pose": int(trajectory.has_pose.sum()),
-            "submaps": 1,
+            "submaps": len(submaps),
         },
         "keyframes": trajectory.keyframes.tolist(),
     }
 
 
 def _report(
-    work: WorkFolder, capture: Capture, trajectory: Trajectory, gaussians: Gaussians, occupancy: Occupancy
+    work: WorkFolder, capture: Capture, trajectory: Trajectory, gaussians: Gaussians, submaps: list[Submap]
 ) -> dict[str, Any]:
     status, count = np.unique(trajectory.status, return_counts=True)
     peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -338,6 +391,20 @@ def _report(
         "frames": {str(s): int(n) for s, n in zip(status, count, strict=True)},
         "broken": {str(index): text for index, text in work.broken.items()},
         "warnings": work.warnings,
+        "color_focal": getattr(capture, "color_focal", 1.0),
+        "submaps": [
+            {
+                "frames": len(submap.frames),
+                "first": int(submap.frames[0]),
+                "last": int(submap.frames[-1]),
+                "keyframes": len(submap.keyframes),
+                "mapped": number == 0,
+                "closures": [
+                    [*ends, held] for ends, held in zip(submap.closures.tolist(), submap.held.tolist(), strict=True)
+                ],
+            }
+            for number, submap in enumerate(submaps)
+        ],
         "bytes_per_gaussian": 67,
         "frame_log": {
             "timestamp": trajectory.timestamps.tolist(),

@@ -1,6 +1,7 @@
 """The map folder: what is in it, saving it whole, loading it lazily.
 
-    map.yaml  config.yaml  report.json  trajectory.txt  gaussians.ply  occupancy.npz  features.npz  keyframes/
+    map.yaml  config.yaml  report.json  trajectory.txt  trajectory.png  gaussians.ply  occupancy.npz  features.npz
+    keyframes/
 
 Loading reads the manifest only; each part is read when it is first asked for, so that a query pays for nothing else.
 Nothing is unpickled, and an array's size is checked against its file's before memory is taken.
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 FORMAT_VERSION = 1
 MANIFEST, CONFIG, REPORT, TRAJECTORY = "map.yaml", "config.yaml", "report.json", "trajectory.txt"
+PATH_PICTURE = "trajectory.png"
 GAUSSIANS, OCCUPANCY, FEATURES, KEYFRAMES = "gaussians.ply", "occupancy.npz", "features.npz", "keyframes"
 
 _LARGEST_ARRAY = 8 << 30
@@ -106,7 +108,7 @@ class Map:
                 timestamps=timestamps,
                 T_world_cam=_place(timestamps, *read_tum(self.path / TRAJECTORY)),
                 keyframes=np.array(self.manifest["keyframes"], np.int32),
-                status=np.array(log["status"], dtype="<U8"),
+                status=np.array(log["status"], dtype="<U12"),
                 confidence=np.array(log["confidence"], np.float32),
             )
         except (KeyError, TypeError, ValueError) as error:
@@ -215,7 +217,7 @@ def load_map(path: str | Path) -> Map:
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Write map.yaml with the sizes of the map's files beside it. Raises OSError."""
-    parts = (CONFIG, REPORT, TRAJECTORY, GAUSSIANS, OCCUPANCY, FEATURES)
+    parts = (CONFIG, REPORT, TRAJECTORY, PATH_PICTURE, GAUSSIANS, OCCUPANCY, FEATURES)
     paths = [*(folder / name for name in parts), *sorted((folder / KEYFRAMES).iterdir())]
     files = {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
     content = {"format_version": FORMAT_VERSION, **manifest, "files": files}

@@ -68,7 +68,9 @@ class Trajectory:
     timestamps: (N,) float64 seconds.
     T_world_cam: (N, 4, 4) float64; all NaN where the frame has no pose.
     keyframes: (K,) int32, ascending indices of the frames that are keyframes.
-    status: (N,) of "keyframe", "tracked", "lost", "broken" (could not be decoded) or "unused" (not asked for).
+    status: (N,) of "keyframe", "tracked", "relocalised" (lost, and found again), "interpolated" (between neighbours),
+    "apart" (in a submap that nothing ties to the mapped one), "lost", "broken" (could not be decoded), "unused" (not
+    asked for); the last four have no pose.
     confidence: (N,) float32 in 0…1.
     """
 
@@ -90,6 +92,23 @@ class Trajectory:
     def T_world_keyframe(self) -> NDArray[np.float64]:
         """(K, 4, 4) poses of the keyframes."""
         return self.T_world_cam[self.keyframes]
+
+
+@dataclass(frozen=True)
+class Submap:
+    """A stretch of the camera's path that hangs together; one that is not tied to others has a world of its own.
+
+    frames: (F,) int32, ascending indices of its frames.  T_submap_cam: (F, 4, 4) their poses.
+    keyframes: (K,) int32, those of the frames that are keyframes.
+    closures: (C, 2) int32, pairs of keyframes' frames that were recognised as one place.  held: (C,) whether the
+    optimised path agrees with that; what does not was wrong.
+    """
+
+    frames: NDArray[np.int32]
+    T_submap_cam: NDArray[np.float64]
+    keyframes: NDArray[np.int32]
+    closures: NDArray[np.int32]
+    held: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

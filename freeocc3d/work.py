@@ -30,7 +30,7 @@ STAGES = {
 _TRACKING, _STAGE_FEATURES, _MARKS = "tracking.npz", "features.stage.npz", "stages.json"
 _OWN_FILES = {
     _TRACKING, "tracking.tmp.npz", _STAGE_FEATURES, _MARKS, f"{_MARKS}.tmp", store.MANIFEST, store.CONFIG, store.REPORT,
-    store.TRAJECTORY, store.GAUSSIANS, store.OCCUPANCY, store.FEATURES, store.KEYFRAMES,
+    store.TRAJECTORY, store.PATH_PICTURE, store.GAUSSIANS, store.OCCUPANCY, store.FEATURES, store.KEYFRAMES,
 }  # fmt: skip
 
 
@@ -116,6 +116,10 @@ class WorkFolder:
         self.warnings = log["warnings"]
         self.seconds = {name: self.seconds.get(name, 0.0) + value for name, value in log["seconds"].items()}
         return state
+
+    def forget_tracking(self) -> None:
+        """Drop layer 1's checkpoint: a run that is resumed from here on tracks anew."""
+        (self.folder / _TRACKING).unlink(missing_ok=True)
 
     def gaussians(self, compute: Callable[[], Gaussians]) -> Gaussians:
         """The saved result of layer 2, or ``compute()``, saved."""

@@ -7,9 +7,9 @@ import pytest
 from helpers import pose_matrix, write_seven_scenes
 from numpy.typing import NDArray
 
-from freeocc3d.capture import open_capture
+from freeocc3d.capture import associate, open_capture
 from freeocc3d.errors import FreeOccError
-from freeocc3d.evaluation.align import Alignment, Poses, align, associate, estimated_poses, read_poses, true_poses
+from freeocc3d.evaluation.align import Alignment, Poses, align, estimated_poses, read_poses, true_poses
 from freeocc3d.geometry import quats_to_rotations
 from freeocc3d.store import write_tum
 from freeocc3d.types import Trajectory

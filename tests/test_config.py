@@ -62,7 +62,7 @@ def test_options_of_a_backend_nest_below_its_layer() -> None:
         ),
         ({"tracking": {"keyframe_overlap": 0.5}}, r"Unknown key 'tracking\.keyframe_overlap'"),
         ({"occupancy": {"voxel_size": "8 cm"}}, r"'occupancy\.voxel_size' must be float, got '8 cm'"),
-        ({"tracking": {"rgbd": {"width": 320.5}}}, r"'tracking\.rgbd\.width' must be int"),
+        ({"tracking": {"odometry": {"width": 320.5}}}, r"'tracking\.odometry\.width' must be int"),
         ({"capture": {"intrinsics": [585, 585, 320]}}, r"'capture\.intrinsics' must be tuple"),
         ({"tracking": "known"}, r"Section 'tracking' must hold 'key: value' lines, got 'known'"),
         ({"tracking": {"known": 0.5}}, r"'tracking\.known' must hold 'key: value' lines, got 0\.5"),
@@ -77,11 +77,11 @@ def test_what_is_wrong_is_named(values: dict[Any, Any], message: str) -> None:
 
 def test_values_come_from_the_file_and_overrides_win(tmp_path: Path) -> None:
     path = write(tmp_path / "c.yaml", "occupancy:\n  voxel_size: 0.05\n  cutoff: 4\ntracking:\n  backend: known\n")
-    loaded = config.load(path, ["occupancy.voxel_size=0.1", "tracking.rgbd.width=160", "capture.stop=null"])
+    loaded = config.load(path, ["occupancy.voxel_size=0.1", "tracking.odometry.width=160", "capture.stop=null"])
     assert loaded["occupancy"]["voxel_size"] == 0.1
     assert loaded["occupancy"]["cutoff"] == 4.0
     assert loaded["tracking"]["backend"] == "known"
-    assert loaded["tracking"]["rgbd"]["width"] == 160
+    assert loaded["tracking"]["odometry"]["width"] == 160
     assert loaded["capture"]["stop"] is None
 
 
@@ -153,7 +153,7 @@ def test_dumped_and_loaded_is_the_same(tmp_path: Path) -> None:
     settings = config.resolve(
         {
             "capture": {"intrinsics": [585, 585, 320, 240], "stop": 10},
-            "tracking": {"backend": "known", "rgbd": {"iterations": [4, 3, 2]}},
+            "tracking": {"backend": "known", "odometry": {"iterations": [4, 3, 2]}},
             "occupancy": {"voxel_size": 0.05},
         }
     )

@@ -43,7 +43,7 @@ def test_the_room_becomes_a_map_with_every_layer(room) -> None:
     assert len(room.keyframes) == len(room.trajectory.keyframes)
     assert {p.name for p in room.path.iterdir()} == {
         "map.yaml", "config.yaml", "report.json", "trajectory.txt", "gaussians.ply", "occupancy.npz", "features.npz",
-        "keyframes",
+        "keyframes", "trajectory.png",
     }  # fmt: skip
 
 
@@ -120,7 +120,7 @@ def test_a_run_is_not_resumed_with_other_options_and_loses_nothing_by_the_attemp
     with pytest.raises(Interrupted):
         freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper("tracking", 12))
     before = listing(work)
-    for other in ({"tracking": {"backend": "known"}}, {"tracking": {"rgbd": {"width": -1}}}):
+    for other in ({"tracking": {"backend": "known"}}, {"tracking": {"rgbd": {"neighbours": -1}}}):
         with pytest.raises(FreeOccError):
             freeocc3d.reconstruct("builtin:room", output, {**ROOM, **other}, resume=True)
     with pytest.raises(CaptureError):
@@ -221,7 +221,7 @@ def test_a_full_disk_is_told_and_what_was_done_is_kept(tmp_path, monkeypatch) ->
     ("settings", "message"),
     [
         ({"traking": {}}, "tracking"),
-        ({"tracking": {"rgbd": {"itertions": [1, 1, 1]}}}, "iterations"),
+        ({"tracking": {"odometry": {"itertions": [1, 1, 1]}}}, "iterations"),
         ({"occupancy": {"voxel_size": "big"}}, "must be float"),
         ({"tracking": {"backend": "rgdb"}}, "rgbd"),
         ({"language": {"encoder": "color"}}, "colour"),
@@ -302,3 +302,81 @@ def test_labels_of_the_capture_answer_by_class(tmp_path) -> None:
     bed = truth["classes"].tolist().index("bed")
     assert (labels == bed).sum() > 0.7 * ((labels != 255) & (labels != 0)).sum()
     assert not made.query("bathtub").matched
+
+
+@pytest.fixture(scope="module")
+def glued(tmp_path_factory):
+    """A folder that holds two places: 15 frames of the bedroom, then 8 of the living room."""
+    folder = tmp_path_factory.mktemp("glued") / "scan"
+    (folder / "results").mkdir(parents=True)
+    house = data_folder() / "house"
+    shutil.copy(house / "bedroom" / "cam_params.json", folder)
+    shown = [*((house / "bedroom", i) for i in range(0, 60, 4)), *((house / "living", i) for i in range(0, 32, 4))]
+    for n, (source, i) in enumerate(shown):
+        for kind in ("frame{:06d}.jpg", "depth{:06d}.png"):
+            shutil.copy(source / "results" / kind.format(i), folder / "results" / kind.format(n))
+    return folder
+
+
+def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -> None:
+    from freeocc3d.cli import _info, _info_text
+
+    made = freeocc3d.reconstruct(glued, tmp_path / "map")
+    assert made.manifest["counts"]["submaps"] == 2
+    assert made.manifest["counts"]["frames_with_pose"] == 15
+    assert made.report["frames"]["apart"] == 8
+    assert [(s["first"], s["last"], s["mapped"]) for s in made.report["submaps"]] == [(0, 14, True), (15, 22, False)]
+    assert (made.trajectory.status[15:] == "apart").all()
+    assert any("8 frames" in text and "frame 15" in text for text in made.report["warnings"])
+    assert len(made.keyframes) == len(made.trajectory.keyframes) == len(made.manifest["keyframes"])
+    assert [frame.index for frame in made.keyframes] == made.trajectory.keyframes.tolist()
+    assert len(list((made.path / "keyframes").glob("*.color.jpg"))) == len(made.keyframes)
+    assert made.gaussians.anchor_keyframe.max() < len(made.keyframes)
+    text = _info_text(_info(made))
+    assert "2 submaps" in text
+    assert "frames 15 to 22: 8 frames" in text
+    assert "apart, not in the map" in text
+    assert cv2.imread(str(made.path / "trajectory.png")).shape[2] == 3
+
+
+def test_a_run_with_two_submaps_resumes_to_the_same(tmp_path, glued, monkeypatch) -> None:
+    def full(*arguments) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    whole = freeocc3d.reconstruct(glued, tmp_path / "whole")
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "write_manifest", full)
+        with pytest.raises(MapError, match="disk is full"):
+            freeocc3d.reconstruct(glued, tmp_path / "map")
+    resumed = freeocc3d.reconstruct(glued, tmp_path / "map", resume=True)
+    np.testing.assert_allclose(resumed.trajectory.T_world_cam, whole.trajectory.T_world_cam, atol=1e-6)
+    assert resumed.trajectory.keyframes.tolist() == whole.trajectory.keyframes.tolist()
+    np.testing.assert_array_equal(resumed.occupancy.state, whole.occupancy.state)
+
+
+def test_poses_of_another_system_make_a_map(tmp_path) -> None:
+    capture = data_folder() / "house" / "bedroom"
+    poses = np.stack([open_capture(capture).pose(i) for i in range(40)])
+    np.savetxt(tmp_path / "kitti.txt", poses.reshape(40, 16)[:, :12])
+    settings = {
+        "capture": {"stop": 40, "stride": 4},
+        "tracking": {"backend": "file", "file": {"path": str(tmp_path / "kitti.txt")}},
+    }
+    made = freeocc3d.reconstruct(capture, tmp_path / "map", settings)
+    assert made.manifest["counts"]["frames_with_pose"] == 10
+    np.testing.assert_allclose(made.trajectory.T_world_cam[8], poses[8], atol=1e-5)
+    assert made.manifest["frame"].startswith("world frame of the trajectory file")
+
+
+def test_a_color_camera_of_another_focal_length_is_told_and_corrected(tmp_path) -> None:
+    kitchen = data_folder() / "7scenes-kitchen"
+    given = {"capture": {"stop": 8, "color_focal": 0.9}}
+    made = freeocc3d.reconstruct(kitchen, tmp_path / "given", given)
+    assert made.report["color_focal"] == 0.9
+    assert not made.report["warnings"]
+    left = freeocc3d.reconstruct(kitchen, tmp_path / "left", {"capture": {"stop": 8, "color_focal": 1.0}})
+    assert np.abs(made.keyframes[0].color.astype(int) - left.keyframes[0].color).mean() > 5
+    np.testing.assert_array_equal(made.keyframes[0].depth_m, left.keyframes[0].depth_m)
+    found = freeocc3d.reconstruct(kitchen, tmp_path / "found", {"capture": {"stop": 250, "stride": 10}})
+    assert found.report["color_focal"] == pytest.approx(0.903, abs=0.02)
+    assert any("0.9" in text and "capture.color_focal=1" in text for text in found.report["warnings"])

@@ -14,6 +14,7 @@ ratios of one run.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import os
@@ -34,8 +35,11 @@ Figures = dict[str, Any]
 
 DATA = Path(os.environ.get("FREEOCC3D_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 COMMAND = [sys.executable, "-m", "freeocc3d.cli"]
+LAYER_1_STAGES = ("calibration", "tracking", "refinement")
 OURS = "rgbd"
 """The variant whose poses the peers ``ours_*`` are given, and which queries are asked of."""
+
+TRUE_POSES = "rgbd_true_poses"
 
 PEERS = {
     "dense_slam_tsdf": "Open3D dense SLAM (1 cm), its poses, TSDF",
@@ -48,9 +52,14 @@ PEERS = {
 """``POSES_OCCUPANCY``: where the poses come from, and what makes voxels of them."""
 
 KERNELS = ("splat", "query")
+LAYER_1 = {
+    "stress": "layer 1 on altered captures: what is reached, what is lost, and whether that is told",
+    "glued": "layer 1 on two captures as if they were one, which must stay two submaps",
+    "lengths": "layer 1 on the first 250, 500 and 1000 frames: seconds, and bytes of a keyframe",
+}
 
 SUITES = {
-    "quick": (("house/bedroom",), (OURS, "rgbd_true_poses", "rgbd_true_poses_closed_set", *PEERS, *KERNELS)),
+    "quick": (("house/bedroom",), (OURS, "rgbd_true_poses", "rgbd_true_poses_closed_set", *PEERS, *KERNELS, "lengths")),
     "full": (("7scenes-kitchen", "house/bedroom", "house/living"), None),
 }
 """Captures of the data folder, and variants (None = all)."""
@@ -265,6 +274,12 @@ def kernel(name: str, asked_map: Path | None) -> Figures:
     return {"cold_seconds": statistics.median(cold), **_inside("query", map_path=str(asked_map))}
 
 
+def _stress() -> Any:
+    import stress
+
+    return stress
+
+
 # Processes
 
 
@@ -272,6 +287,11 @@ INSIDE = {
     "score_map": score_map,
     "dense_slam": dense_slam,
     "occupancy": occupancy,
+    "stress": lambda **given: _stress().stress(**given),
+    "stress_names": lambda: {"names": list(_stress().sequences(100))},
+    "glued": lambda **given: _stress().glued(**given),
+    "lengths": lambda **given: _stress().lengths(**given),
+    "warm_up": lambda **given: _stress().warm_up(**given),
     "splat": lambda: kernels.measure_splat(),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
 }
@@ -310,6 +330,7 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
     known = variants.all_variants()
     rows: list[Figures] = []
     asked_map: Path | None = None
+    _tried("nothing yet, everything is compiled first", lambda: _inside("warm_up", capture=str(captures[0].resolve())))
     for number, capture in enumerate(captures):
         job = Job(capture.resolve(), frames, folder / str(number))
         job.folder.mkdir(parents=True)
@@ -332,11 +353,58 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
                 {"capture": job.name, "variant": name, "title": title, "table": table, "available": not why,
                  "why": why, **row}
             )  # fmt: skip
+        for row in rows:
+            if slam is not None and "error" not in slam and row["capture"] == job.name and "ms_per_frame" in row:
+                own = sum(row["ms_per_frame"].get(stage, 0.0) for stage in LAYER_1_STAGES) * 1e-3 * row["frames"]
+                if own:
+                    row["layer_1_over_dense_slam"] = own / slam["seconds_without_decoding"]
         if asked_map is None and (job.folder / OURS).is_dir():
             asked_map = job.folder / OURS
     measured = {name: _tried(name, lambda name=name: kernel(name, asked_map)) for name in KERNELS if name in names}
+    layer_1 = measure_layer_1([capture.resolve() for capture in captures], names)
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
-    return {"machine": machine, "frames": frames, "rows": rows, "kernels": measured}
+    return {"machine": machine, "frames": frames, "rows": rows, "kernels": measured, "layer_1": layer_1}
+
+
+def measure_layer_1(captures: list[Path], names: list[str]) -> Figures:
+    """Rows of "stress" (glued ones among them), and "lengths" of the longest capture."""
+    named = {capture: Job(capture, None, capture).name for capture in captures}
+    figures: Figures = {}
+    rows: list[Figures] = []
+    if "stress" in names:
+        for capture in captures:
+            for sequence in stress_names():
+                row = _tried(
+                    f"{named[capture]}: {sequence}",
+                    lambda capture=capture, sequence=sequence: _inside("stress", capture=str(capture), name=sequence),
+                )
+                rows.append({"capture": named[capture], "sequence": sequence, **row})
+    if "glued" in names:
+        for first, second in itertools.pairwise(captures):
+            both = f"{named[first]} + {named[second]}"
+            row = _tried(
+                f"glued: {both}",
+                lambda first=first, second=second: _inside("glued", captures=[str(first), str(second)]),
+            )
+            rows.append({"capture": both, "sequence": "glued", **row})
+    if rows:
+        figures["stress"] = rows
+    if "lengths" in names:
+        measured = [
+            _tried(f"{named[capture]}: lengths", lambda capture=capture: _inside("lengths", capture=str(capture)))
+            for capture in captures
+        ]
+        figures["lengths"] = [
+            {"capture": named[capture], **row}
+            for capture, found in zip(captures, measured, strict=True)
+            for row in found.get("rows", [])
+        ]
+    return figures
+
+
+def stress_names() -> tuple[str, ...]:
+    """Of the altered sequences."""
+    return tuple(_inside("stress_names")["names"])
 
 
 def _tried(what: str, measure: Any) -> Figures:
@@ -353,7 +421,7 @@ def _tried(what: str, measure: Any) -> Figures:
 
 COLUMNS = (
     "capture", "variant", "ATE cm", "IoU", "mIoU", "precision", "recall", "ms/frame", "fps", "memory GB", "map MB",
-    "x dense SLAM", "what",
+    "x dense SLAM", "layer 1 x", "what",
 )  # fmt: skip
 
 
@@ -371,6 +439,7 @@ def markdown(results: Figures) -> str:
             _number(row.get("peak_memory_bytes"), 1e-9, 2),
             _number(row.get("map_bytes"), 1e-6, 1),
             _number(row.get("wall_over_dense_slam"), 1, 2),
+            _number(row.get("layer_1_over_dense_slam"), 1, 2),
             row["title"] if row["available"] else f"{row['title']}: **not available**, {row['why']}",
         )
         lines.append(f"| {' | '.join(cells)} |")
@@ -382,7 +451,28 @@ def markdown(results: Figures) -> str:
         elif figures is not None:
             lines += ["", "| what | measured | asked |", "|---|---|---|"]
             lines += [f"| {' | '.join(line)} |" for line in write(figures)]
-    return "\n".join(lines)
+    return "\n".join([*lines, *_layer_1_lines(results.get("layer_1") or {}), *_pose_lines(results["rows"])])
+
+
+def _layer_1_lines(figures: Figures) -> list[str]:
+    """Tables of "stress" and "lengths"."""
+    lines = []
+    for part, table_of in (("stress", "stress_table"), ("lengths", "length_table")):
+        if rows := figures.get(part):
+            table = getattr(_stress(), table_of)(rows)
+            lines += ["", *(f"| {' | '.join(line)} |" for line in (table[0], ["---"] * len(table[0]), *table[1:]))]
+    return lines
+
+
+def _pose_lines(rows: list[Figures]) -> list[str]:
+    """IoU with estimated poses over IoU with the capture's, where both were measured."""
+    iou = {(row["capture"], row["variant"]): row.get("iou") for row in rows}
+    lines = []
+    for capture in dict.fromkeys(row["capture"] for row in rows):
+        ours, given = iou.get((capture, OURS)), iou.get((capture, TRUE_POSES))
+        if ours and given:
+            lines.append(f"\n{capture}: IoU with our poses is {ours / given:.3f} of that with the capture's poses")
+    return lines
 
 
 def _class_lists(results: Figures) -> dict[str, str]:
@@ -401,6 +491,7 @@ COMPARED = {
     "precision": ("precision", 100, 0.1),
     "recall": ("recall", 100, 0.1),
     "wall_over_dense_slam": ("x dense SLAM", 1, 0.05),
+    "layer_1_over_dense_slam": ("layer 1 x dense SLAM", 1, 0.03),
     "frames_per_second": ("fps", 1, 1.0),
     "peak_memory_bytes": ("memory GB", 1e-9, 0.05),
     "map_bytes": ("map MB", 1e-6, 0.1),
@@ -462,7 +553,7 @@ def arguments() -> argparse.Namespace:
     given = parser.parse_args()
     captures, names = SUITES[given.suite]
     given.captures = given.captures or [DATA / name for name in captures]
-    known = [*variants.names(), *PEERS, *KERNELS]
+    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1]
     given.variants = given.variants or list(names or known)
     if unknown := [name for name in given.variants if name not in known]:
         parser.error(f"unknown variants {', '.join(unknown)}: --list names all")
@@ -485,6 +576,8 @@ def main() -> None:
         for name, variant in variants.all_variants().items():
             print(f"{name:<38} {variant.title}" + (f": not available, {variant.lacking}" if variant.lacking else ""))
         for name, title in PEERS.items():
+            print(f"{name:<38} {title}")
+        for name, title in LAYER_1.items():
             print(f"{name:<38} {title}")
         print(f"{', '.join(KERNELS):<38} speed of the projection and of queries")
         return

@@ -3,5 +3,16 @@
 from .base import Capture, Options
 from .opening import check_depth_scale, open_capture, used_frames
 from .readahead import read_ahead
+from .trajectories import PoseFile, associate, read_trajectory
 
-__all__ = ["Capture", "Options", "check_depth_scale", "open_capture", "read_ahead", "used_frames"]
+__all__ = [
+    "Capture",
+    "Options",
+    "PoseFile",
+    "associate",
+    "check_depth_scale",
+    "open_capture",
+    "read_ahead",
+    "read_trajectory",
+    "used_frames",
+]

@@ -36,6 +36,9 @@ class Options:
     """Depth beyond this many metres counts as not measured."""
     intrinsics: tuple[float, float, float, float] | None = None
     """fx, fy, cx, cy of the colour image in pixels, in place of what the files say."""
+    color_focal: float | None = None
+    """Focal length of the colour camera over what the files say, where depth fits them and colour does not (7-Scenes'
+    Kinect: 0.90); null = asked of the scan itself, 1 = as the files say."""
     max_broken: float = 0.1
     """Share of the frames that may be unreadable before the run stops."""
 
@@ -74,6 +77,10 @@ class Capture(ABC):
         """(H, W) depth as stored (0 = no measurement) and its units per metre, or None where depth is not stored as
         integers. Read by ``check_depth_scale`` alone. Raises FrameError."""
         return None
+
+    def name(self, index: int) -> str:
+        """File name of the frame's colour image, by which other systems' poses may know it; "" where there is none."""
+        return ""
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """(4, 4) T_world_cam that the capture states for the frame, or None. Read by the ``known`` tracker and by

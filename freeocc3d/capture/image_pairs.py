@@ -82,6 +82,10 @@ class ImagePairs(Capture):
         timestamp = float(self.timestamps[index])
         return Frame(index, timestamp, grid.color(color), grid.depth(depth_m), grid.intrinsics)
 
+    def name(self, index: int) -> str:
+        path = self._pairs.color[index]
+        return path.name if path else ""
+
     def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float]:
         return self._stored_depth(self._files(index)[1]), self._units_per_metre
 

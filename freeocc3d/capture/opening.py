@@ -109,6 +109,8 @@ def _check(options: Options) -> None:
         raise ConfigError(f"capture.max_depth must be positive, got {options.max_depth:g}.")
     if options.depth_scale is not None and not (options.depth_scale > 0 and math.isfinite(options.depth_scale)):
         raise ConfigError(f"capture.depth_scale must be a positive number, got {options.depth_scale:g}.")
+    if options.color_focal is not None and not 0.5 <= options.color_focal <= 2:
+        raise ConfigError(f"capture.color_focal must lie in 0.5…2, got {options.color_focal:g}.")
     if not 0 <= options.max_broken <= 1:
         raise ConfigError(f"capture.max_broken must lie in 0…1, got {options.max_broken:g}.")
     if options.stride < 1 or options.start < 0:

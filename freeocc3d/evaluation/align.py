@@ -14,18 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import open_capture
+from ..capture import associate, open_capture, read_trajectory
 from ..capture.base import Capture
-from ..errors import CaptureError, FreeOccError, MapError
-from ..geometry import is_rigid, umeyama
-from ..store import read_tum
+from ..errors import CaptureError, FreeOccError
+from ..geometry import umeyama
 from ..types import Trajectory
 
 ALIGNMENTS = ("se3", "sim3", "none")
 """Rigid, for trajectories with a metric scale; with a scale, for monocular ones; as they are."""
-
-SAME_TIME_S = 0.02
-"""Poses whose timestamps differ by no more belong together: the tolerance of the TUM RGB-D benchmark."""
 
 
 @dataclass(frozen=True)
@@ -104,24 +100,6 @@ def align(estimated: Poses, true: Poses, how: str = "se3") -> Alignment:
     return Alignment(scale, np.asarray(R, np.float64), np.asarray(t, np.float64))
 
 
-def associate(
-    times_a: NDArray[np.float64], times_b: NDArray[np.float64], tolerance: float = SAME_TIME_S
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of two ascending lists of timestamps that belong together: each of the shorter list with the nearest of the
-    longer, where they differ by no more than the tolerance, in seconds."""
-    if len(times_a) > len(times_b):
-        rows_b, rows_a = associate(times_b, times_a, tolerance)
-        return rows_a, rows_b
-    if not len(times_a):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    after = np.clip(np.searchsorted(times_b, times_a), 1, max(len(times_b) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(times_b) - 1)
-    nearest = np.where(np.abs(times_b[after] - times_a) < np.abs(times_b[before] - times_a), after, before)
-    close = np.abs(times_b[nearest] - times_a) <= tolerance
-    return np.flatnonzero(close), nearest[close]
-
-
 def estimated_poses(trajectory: Trajectory) -> Poses:
     """The frames of a trajectory that have a pose."""
     rows = np.flatnonzero(trajectory.has_pose)
@@ -138,29 +116,21 @@ def true_poses(capture: Capture) -> Poses:
 
 
 def read_poses(path: str | Path) -> Poses:
-    """Poses of a capture (its folder, or ``builtin:room``) or of a file: TUM's ``timestamp tx ty tz qx qy qz qw``, or
-    12 or 16 numbers a line, the row-major camera-to-world matrix of frame 0, 1, … (KITTI, Replica), whose timestamp is
-    the frame's index. Raises FreeOccError."""
-    if str(path).startswith("builtin:") or Path(path).is_dir():
+    """Poses of a capture (its folder, or ``builtin:room``) or of a file in any of the forms that
+    ``capture.read_trajectory`` knows; one that states no times counts frames. Raises FreeOccError."""
+    if str(path).startswith("builtin:"):
         return true_poses(open_capture(path))
-    path = Path(path)
-    if not path.is_file():
+    if not Path(path).exists():
         raise FreeOccError(f"There is no file or capture {path} to take poses from.")
-    try:
-        columns = len(next(line for line in path.read_text().splitlines() if line.strip() and line[0] != "#").split())
-        if columns in (12, 16):
-            rows = np.loadtxt(path, ndmin=2).reshape(-1, columns // 4, 4)
-            T = np.tile(np.eye(4), (len(rows), 1, 1))
-            T[:, : columns // 4] = rows
-            times = np.arange(len(T), dtype=np.float64)
-        else:
-            times, T = read_tum(path)
-    except (OSError, ValueError, StopIteration, MapError) as error:
-        raise FreeOccError(
-            f"{path} is no trajectory: 8 numbers a line (TUM: timestamp, position, quaternion xyzw), or 12 or 16 (a "
-            "matrix)."
-        ) from error
-    finite = np.isfinite(T).all(axis=(1, 2))
-    if not all(is_rigid(pose) for pose in T[finite]):
-        raise CaptureError(f"{path} holds a matrix that is no rigid camera-to-world pose.")
-    return Poses(times[finite], T[finite])
+    if Path(path).is_dir():
+        try:
+            return true_poses(open_capture(path))
+        except CaptureError as no_capture:
+            try:
+                found = read_trajectory(path)
+            except CaptureError:
+                raise no_capture from None
+    else:
+        found = read_trajectory(path)
+    finite = np.isfinite(found.T_world_cam).all(axis=(1, 2))
+    return Poses(found.times()[finite], found.T_world_cam[finite])

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import query, registry
+from ..capture import associate
 from ..config import Config
 from ..errors import FreeOccError
 from ..gaussians import anchors
@@ -26,7 +27,7 @@ from ..occupancy import build, carve, splat
 from ..occupancy.grid import unpack
 from ..store import Map
 from ..types import BLOCK, OCCUPIED, UNKNOWN, Frame, Gaussians
-from .align import Alignment, Poses, associate
+from .align import Alignment, Poses
 from .classes import ClassMap
 from .ground_truth import GroundTruth, array, placed, read_grid_arrays
 from .iou import Prediction

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..capture import associate
 from ..errors import FreeOccError
 from ..geometry import invert
-from .align import Alignment, Poses, associate
+from .align import Alignment, Poses
 
 DISTANCES_M = (0.1, 0.5, 1.0, 2.0)
 """Travelled distances of the relative errors."""

@@ -14,7 +14,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Frame, Trajectory
+from ..types import Frame, Submap, Trajectory
+from .pose_graph import Edge, edges_to_arrays
+from .records import Records
 
 
 @dataclass(frozen=True)
@@ -22,14 +24,14 @@ class Options:
     """Layer 1."""
 
     backend: str = "rgbd"
-    """Where poses come from: "rgbd" estimates them, "known" takes the capture's own."""
+    """Where poses come from: "rgbd" estimates them, "known" takes the capture's own, "file" those of another system."""
 
 
 @dataclass(frozen=True)
 class Tracked:
     """What became of one frame.
 
-    status: "keyframe", "tracked" or "lost".
+    status: "keyframe", "tracked", "relocalised" or "lost".
     T_world_cam: (4, 4) the current estimate, None if lost; a later optimisation may still move it.
     confidence: 0…1.
     """
@@ -45,6 +47,15 @@ class Tracker(ABC):
     world: ClassVar[str] = "OpenCV camera axes of the first keyframe, metres"
     """The frame that poses and maps are in, for the map's manifest."""
 
+    def __init__(self) -> None:
+        self.records = Records()
+        self.edges: list[Edge] = []
+
+    def completed(self, frame: Frame) -> Frame:
+        """The frame with what the tracker knows of its depth beyond what was measured; ``track`` is given this one, and
+        keyframes keep it."""
+        return frame
+
     @abstractmethod
     def track(self, frame: Frame) -> Tracked:
         """Take the next frame."""
@@ -55,13 +66,17 @@ class Tracker(ABC):
         (trackers that are given poses keep theirs)."""
 
     @abstractmethod
-    def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
-        """Poses of all frames of the capture; frames that were never given to ``track`` are "unused"."""
-
-    @abstractmethod
-    def state(self) -> dict[str, NDArray[np.generic]]:
-        """Everything needed to go on later, as plain arrays."""
-
-    @abstractmethod
     def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
         """Take up a saved ``state``; ``keyframes`` gives the keyframes' images, in order."""
+
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        """Everything needed to go on later, as plain arrays."""
+        return {**self.records.to_arrays(), **edges_to_arrays(self.edges)}
+
+    def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
+        """Poses of all frames of the capture; frames that were never given to ``track`` are "unused"."""
+        return self.records.trajectory(timestamps)
+
+    def submaps(self) -> list[Submap]:
+        """The pieces of the path that hang together, the one that is mapped first."""
+        return self.records.submaps(self.edges)

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+from ..geometry import invert, nearest_rigid
+
+_ENOUGH = 2
+"""Closures between two submaps that tie them."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +29,60 @@ class Edge:
     T_target_source: NDArray[np.float64]
     information: NDArray[np.float64]
     uncertain: bool
+
+
+def pieces(count: int, submap: Sequence[int], edges: Sequence[Edge]) -> list[list[int]]:
+    """Rows of the keyframes that hang together, the largest piece first.
+
+    Keyframes of one submap do. Two submaps do if closures tie them that agree with each other: one alone may be wrong.
+    """
+    ties: dict[tuple[int, int], int] = {}
+    for edge in edges:
+        ends = sorted((submap[edge.source], submap[edge.target]))
+        if ends[0] != ends[1]:
+            ties[ends[0], ends[1]] = ties.get((ends[0], ends[1]), 0) + (1 if edge.uncertain else _ENOUGH)
+    root = {name: name for name in submap}
+    for (a, b), number in ties.items():
+        if number >= _ENOUGH:
+            old, new = root[b], root[a]
+            root = {name: new if value == old else value for name, value in root.items()}
+    rows: dict[int, list[int]] = {}
+    for k in range(count):
+        rows.setdefault(root[submap[k]], []).append(k)
+    return sorted(rows.values(), key=lambda piece: (-len(piece), piece[0]))
+
+
+def optimize_piece(
+    poses: Sequence[NDArray[np.float64]], edges: Sequence[Edge], rows: Sequence[int]
+) -> list[NDArray[np.float64]]:
+    """Poses of the keyframes ``rows``, which hang together, in the frame of the first: ``optimize`` on these alone,
+    from poses that are laid along the edges where submaps meet."""
+    place = {row: k for k, row in enumerate(rows)}
+    own = [
+        Edge(place[e.source], place[e.target], e.T_target_source, e.information, e.uncertain)
+        for e in edges
+        if e.source in place and e.target in place
+    ]
+    return optimize(_laid_out([poses[row] for row in rows], own), own)
+
+
+def _laid_out(poses: list[NDArray[np.float64]], edges: Sequence[Edge]) -> list[NDArray[np.float64]]:
+    """Poses along the edges from the first keyframe, over uncertain edges only where no certain one leads on."""
+    if len(poses) < 2:
+        return poses
+    measured = {}
+    for e in sorted(edges, key=lambda e: not e.uncertain):  # of two edges between the same keyframes the certain one
+        measured[e.source, e.target] = (e.uncertain, e.T_target_source)
+    ends = np.array(list(measured))
+    weights = [1000.0 if uncertain else 1.0 for uncertain, _ in measured.values()]
+    graph = coo_matrix((weights, (ends[:, 0], ends[:, 1])), shape=(len(poses), len(poses)))
+    order, before = breadth_first_order(minimum_spanning_tree(graph.tocsr()), 0, directed=False)
+    laid = [np.array(pose) for pose in poses]
+    for k in order[1:].tolist():
+        b = int(before[k])
+        T_b_k = measured[k, b][1] if (k, b) in measured else invert(measured[b, k][1])
+        laid[k] = nearest_rigid(laid[b] @ T_b_k)
+    return laid
 
 
 def optimize(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArray[np.float64]]:
@@ -53,3 +115,22 @@ def optimize(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArra
             ),
         )
     return [np.asarray(node.pose) for node in graph.nodes]
+
+
+def edges_to_arrays(edges: Sequence[Edge]) -> dict[str, NDArray[np.generic]]:
+    """Plain arrays, for saving."""
+    return {
+        "edge_nodes": np.array([(e.source, e.target, e.uncertain) for e in edges], np.int64).reshape(-1, 3),
+        "edge_T_target_source": np.array([e.T_target_source for e in edges]).reshape(-1, 4, 4),
+        "edge_information": np.array([e.information for e in edges]).reshape(-1, 6, 6),
+    }
+
+
+def edges_from_arrays(arrays: Mapping[str, NDArray[np.generic]]) -> list[Edge]:
+    """The inverse of ``edges_to_arrays``."""
+    return [
+        Edge(int(source), int(target), np.asarray(T), np.asarray(information), bool(uncertain))
+        for (source, target, uncertain), T, information in zip(
+            arrays["edge_nodes"].tolist(), arrays["edge_T_target_source"], arrays["edge_information"], strict=True
+        )
+    ]

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
-from ..types import Trajectory
+from ..geometry import apart, invert
+from ..types import Submap, Trajectory
+from .pose_graph import Edge
 
-STATUSES = ("unused", "lost", "tracked", "keyframe")
+STATUSES = ("unused", "lost", "tracked", "keyframe", "relocalised", "interpolated", "apart")
+
+_LONGEST_GAP = 3
+"""Lost frames in a row between two with a pose that get one by interpolation."""
+
+_HELD_M, _HELD_DEG = 0.1, 5.0
 
 
 @dataclass
 class Records:
     """Per frame seen: index in the capture, row of its keyframe (-1 = lost), T_keyframe_cam, status and confidence.
-    Frames hang on keyframes, so that a pose graph that moves a keyframe moves its frames with it."""
+    Frames hang on keyframes, so that a pose graph that moves a keyframe moves its frames with it.
+
+    submap: of each keyframe, the stretch of the path that was tracked without a break.  pieces: rows of the keyframes
+    that hang together after all, the largest first; only that one has a place in the world. Empty: each submap for
+    itself."""
 
     index: list[int] = field(default_factory=list)
     keyframe: list[int] = field(default_factory=list)
@@ -24,16 +38,22 @@ class Records:
     confidence: list[float] = field(default_factory=list)
     keyframe_index: list[int] = field(default_factory=list)
     T_world_keyframe: list[NDArray[np.float64]] = field(default_factory=list)
+    submap: list[int] = field(default_factory=list)
+    pieces: list[list[int]] = field(default_factory=list)
 
-    def add_keyframe(self, index: int, T_world_cam: NDArray[np.float64], confidence: float) -> None:
+    def add_keyframe(self, index: int, T_world_cam: NDArray[np.float64], confidence: float, submap: int = 0) -> None:
         """The frame becomes the next keyframe."""
+        self.submap.append(submap)
+        self.pieces = []
         self.keyframe_index.append(index)
         self.T_world_keyframe.append(T_world_cam)
         self._add(index, len(self.keyframe_index) - 1, np.eye(4), "keyframe", confidence)
 
-    def add_tracked(self, index: int, keyframe: int, T_keyframe_cam: NDArray[np.float64], confidence: float) -> None:
+    def add_tracked(
+        self, index: int, keyframe: int, T_keyframe_cam: NDArray[np.float64], confidence: float, status: str = "tracked"
+    ) -> None:
         """The frame hangs on a keyframe."""
-        self._add(index, keyframe, T_keyframe_cam, "tracked", confidence)
+        self._add(index, keyframe, T_keyframe_cam, status, confidence)
 
     def add_lost(self, index: int) -> None:
         """The frame has no pose."""
@@ -46,22 +66,70 @@ class Records:
         self.status.append(STATUSES.index(status))
         self.confidence.append(confidence)
 
+    def largest_first(self) -> list[list[int]]:
+        """Rows of the keyframes that hang together, the largest piece first."""
+        if self.pieces:
+            return self.pieces
+        rows: dict[int, list[int]] = {}
+        for row, name in enumerate(self.submap):
+            rows.setdefault(name, []).append(row)
+        return sorted(rows.values(), key=lambda piece: (-len(piece), piece[0]))
+
     def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
-        """Poses of all frames of the capture, composed with the keyframes' present poses."""
+        """Poses of all frames of the capture, composed with the keyframes' present poses; frames of other pieces than
+        the largest are "apart" and have none."""
         n = len(timestamps)
         T_world_cam = np.full((n, 4, 4), np.nan)
-        status = np.full(n, "unused", dtype="<U8")
+        status = np.full(n, "unused", dtype="<U12")
         confidence = np.zeros(n, np.float32)
+        pieces = self.largest_first()
+        mapped = np.array(sorted(pieces[0]) if pieces else [], np.int64)
         if self.index:
-            rows = np.array(self.index)
+            rows, keyframe = np.array(self.index), np.array(self.keyframe)
             status[rows] = np.array(STATUSES)[self.status]
             confidence[rows] = self.confidence
-            posed = np.array(self.keyframe) >= 0
-            keyframes = np.array(self.keyframe)[posed]
-            if len(keyframes):
-                T_world_keyframe = np.stack(self.T_world_keyframe)[keyframes]
+            posed = np.isin(keyframe, mapped)
+            status[rows[(keyframe >= 0) & ~posed]] = "apart"
+            confidence[rows[~posed]] = 0.0
+            if posed.any():
+                T_world_keyframe = np.stack(self.T_world_keyframe)[keyframe[posed]]
                 T_world_cam[rows[posed]] = T_world_keyframe @ np.stack(self.T_keyframe_cam)[posed]
-        return Trajectory(timestamps, T_world_cam, np.array(self.keyframe_index, np.int32), status, confidence)
+                _fill_gaps(T_world_cam, status, confidence, rows)
+        keyframes = np.array(self.keyframe_index, np.int32)[mapped]
+        return Trajectory(timestamps, T_world_cam, keyframes, status, confidence)
+
+    def submaps(self, edges: Sequence[Edge] = ()) -> list[Submap]:
+        """The pieces that hang together, the mapped one first, each in the frame that its keyframes are in.
+
+        edges: measurements between keyframes, of which the uncertain ones are closures.
+        """
+        if not self.index:
+            return []
+        order = np.argsort(self.index, kind="stable")
+        index, keyframe = np.array(self.index, np.int32)[order], np.array(self.keyframe)[order]
+        T_keyframe_cam = np.stack(self.T_keyframe_cam)[order]
+        found = []
+        for rows in self.largest_first():
+            inside = np.isin(keyframe, rows)
+            T_submap_keyframe = np.stack(self.T_world_keyframe)[keyframe[inside]]
+            closed = [e for e in edges if e.uncertain and e.source in rows and e.target in rows]
+            named = np.array(self.keyframe_index, np.int32)
+            found.append(
+                Submap(
+                    index[inside],
+                    T_submap_keyframe @ T_keyframe_cam[inside],
+                    named[sorted(rows)],
+                    named[[(e.source, e.target) for e in closed]] if closed else np.zeros((0, 2), np.int32),
+                    np.array([self._holds(e) for e in closed], bool),
+                )
+            )
+        return found
+
+    def _holds(self, edge: Edge) -> bool:
+        """Whether the keyframes' present poses agree with a measurement."""
+        T = invert(self.T_world_keyframe[edge.target]) @ self.T_world_keyframe[edge.source]
+        metres, degrees = apart(T, edge.T_target_source)
+        return metres <= _HELD_M and degrees <= _HELD_DEG
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Plain arrays, for saving."""
@@ -73,6 +141,7 @@ class Records:
             "confidence": np.array(self.confidence, np.float64),
             "keyframe_index": np.array(self.keyframe_index, np.int64),
             "T_world_keyframe": np.array(self.T_world_keyframe, np.float64).reshape(-1, 4, 4),
+            "submap": np.array(self.submap, np.int64),
         }
 
     @classmethod
@@ -86,4 +155,28 @@ class Records:
             confidence=arrays["confidence"].tolist(),
             keyframe_index=arrays["keyframe_index"].tolist(),
             T_world_keyframe=list(np.asarray(arrays["T_world_keyframe"], np.float64)),
+            submap=arrays["submap"].tolist(),
         )
+
+
+def _fill_gaps(
+    T_world_cam: NDArray[np.float64],
+    status: NDArray[np.str_],
+    confidence: NDArray[np.float32],
+    rows: NDArray[np.int64],
+) -> None:
+    """Poses for short runs of lost frames, in place: on the geodesic between the poses before and after."""
+    known = np.flatnonzero(np.isfinite(T_world_cam[rows, 0, 0]))
+    for before, after in pairwise(known.tolist()):
+        between = after - before - 1
+        if not 0 < between <= _LONGEST_GAP or (status[rows[before + 1 : after]] != "lost").any():
+            continue
+        share = np.arange(1, between + 1) / (between + 1)
+        ends = T_world_cam[rows[[before, after]]]
+        inside = rows[before + 1 : after]
+        turns = Slerp([0, 1], Rotation.from_matrix(ends[:, :3, :3]))(share)
+        T_world_cam[inside] = np.eye(4)
+        T_world_cam[inside, :3, :3] = turns.as_matrix()
+        T_world_cam[inside, :3, 3] = (1 - share[:, None]) * ends[0, :3, 3] + share[:, None] * ends[1, :3, 3]
+        status[inside] = "interpolated"
+        confidence[inside] = 0.5 * min(confidence[rows[before]], confidence[rows[after]])

@@ -1,258 +1,246 @@
-"""Estimates poses from colour and depth: hybrid odometry against keyframes, pose graph over keyframes."""
+"""Estimates poses from colour and depth: dense tracking, relocalisation, loop closures, a joint refinement."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..capture.base import Capture
-from ..errors import ConfigError
-from ..geometry import invert, nearest_rigid
+from ..geometry import apart, invert
 from ..registry import require_positive
-from ..types import Frame, Intrinsics, Trajectory
-from . import pose_graph
+from ..types import Frame
+from . import dense, joint, loops, pose_graph
 from .base import Tracked, Tracker
-from .overlap import DepthView, mutual_overlap, sample_points
+from .keyframe_view import KeyframeView, Registered, keyframe_view, register_by_features, surface_of
+from .overlap import DepthView, mutual_overlap
 from .pose_graph import Edge
 from .records import Records
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 
+_LEAST_COVERED = 0.05  # share of the pixels that show a surface, or there is nothing to track
+_LEAST_OVERLAP, _LEAST_INLIERS, _LEAST_CORRELATION = 0.3, 0.6, 0.5  # or the frame is lost
+_CONFIRMED_OVERLAP, _CONFIRMED_M, _CONFIRMED_DEG = 0.15, 0.15, 8.0  # features and surfaces say the same
+_RECOGNISED_OVERLAP = 0.5
+_SURE_INLIERS, _SURE_CORRELATION = 0.75, 0.96  # or features are asked
+_LIKELY_CORRELATION = 0.8
+_JUMP_M, _JUMP_DEG = 0.10, 6.0  # from where the camera was going; or features are asked
+_FEATURES = 20
+_RECENT = 4  # keyframes that a lost frame is compared with, besides those that look alike
+
 
 @dataclass(frozen=True)
 class Options:
-    """Odometry and keyframes."""
+    """Tracking, loop closure and refinement."""
 
-    device: str = "cpu"
-    """Where the odometry runs: "cpu", or "cuda:0" and so on with an Open3D that has CUDA."""
-    width: int = 320
-    """Images are tracked at this width (a smaller one is kept)."""
-    iterations: tuple[int, int, int] = (10, 6, 4)
-    """Gauss–Newton iterations per pyramid level, coarse to fine."""
-    depth_difference: float = 0.07
-    """Pixels whose depths differ by more than this many metres are no correspondence."""
-    keyframe_overlap: float = 0.85
+    keyframe_overlap: float = 0.8
     """A frame that shares less than this of its keyframe's view becomes a keyframe."""
-    min_fitness: float = 0.3
-    """Share of pixels that must find a correspondence."""
-    max_residual: float = 0.03
-    """Largest root mean square of the odometry's residual (metres and grey levels, 0…1, mixed)."""
-    min_information: float = 1e-3
-    """Smallest eigenvalue of the information matrix, per correspondence, that still counts as constrained."""
-    overlap_edges: int = 6
-    """Earlier keyframes that a new one is registered to, beyond the last: those that share most of its view."""
-    min_edge_overlap: float = 0.4
-    """Share of the view that such a keyframe must have in common."""
+    close_loops: bool = True
+    """Recognise places that were seen before, and make the path agree with them."""
+    refine: bool = True
+    """Align all overlapping keyframes jointly at the end."""
+    neighbours: int = 16
+    """Earlier keyframes that each is aligned with in the refinement."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "width", "depth_difference", "keyframe_overlap", "min_fitness", "max_residual")
-        if min(self.iterations) < 0 or max(self.iterations) == 0:
-            raise ConfigError(f"'iterations' must not be negative, nor all zero, got {self.iterations}.")
-
-
-@dataclass(frozen=True)
-class _View(DepthView):
-    """A frame as the odometry needs it, at tracking size."""
-
-    rgbd: object
-
-
-@dataclass(frozen=True)
-class _Match:
-    T_target_source: NDArray[np.float64]
-    information: NDArray[np.float64]
-    fitness: float
-    ok: bool
+        require_positive(self, "keyframe_overlap", "neighbours")
 
 
 def load(options: Options, capture: Capture) -> RgbdTracker:
-    """The tracker; ``capture`` is not read. Raises ConfigError for a device that is not there."""
+    """The tracker; ``capture`` is not read."""
     return RgbdTracker(options)
 
 
-class RgbdTracker(Tracker):
-    """Registers each frame to the present keyframe, starting from constant velocity; a frame that shares too little
-    with it becomes the next keyframe, and is registered to earlier keyframes that look at the same place.
+@dataclass(frozen=True)
+class _Seen:
+    """A frame as the tracker needs it; its features are detected when they are asked for."""
 
-    Odometry: J. Park, Q.-Y. Zhou, V. Koltun, Colored Point Cloud Registration Revisited, ICCV 2017, in Open3D's tensor
-    implementation (hybrid photometric and geometric residual, multi-scale).
+    frame: Frame
+    view: dense.View
+    surface: DepthView
+    _full: list[KeyframeView] = field(default_factory=list)
+
+    @property
+    def full(self) -> KeyframeView:
+        if not self._full:
+            self._full.append(keyframe_view(self.frame, self.view))
+        return self._full[0]
+
+
+class RgbdTracker(Tracker):
+    """Aligns each frame densely to a keyframe, starting from constant velocity; when the result is in doubt, from the
+    pose that matched features give. A frame that shares too little with its keyframe becomes the next one. A frame that
+    cannot be placed is looked for in the keyframes so far; if none shows what it shows, it begins a submap.
+
+    ``optimize`` closes loops, ties submaps together where they show the same place, and aligns all keyframes jointly.
+    The largest piece that hangs together is what is mapped.
     """
 
     def __init__(self, options: Options):
+        super().__init__()
         self.options = options
-        self.device = _device(options.device)
-        self.records = Records()
-        self.edges: list[Edge] = []
-        self._keyframes: list[_View] = []
-        self._T_keyframe_last: NDArray[np.float64] | None = None  # last tracked frame, in the present keyframe
+        self.keyframes: list[KeyframeView] = []
+        self._current = -1  # row of the keyframe that frames are aligned to
+        self._T_keyframe_last = np.eye(4)  # last tracked frame, in that keyframe
         self._velocity = np.eye(4)  # T_previous_last
         self._frames_lost = 0
+        self._last: _Seen | None = None  # not kept over an interruption: keyframes are enough to go on
 
     def track(self, frame: Frame) -> Tracked:
-        view = self._view(frame)
-        if not self._keyframes:
-            return self._start(frame.index, view)
-        match = self._register_to_keyframe(view)
-        if match is None:
-            self._frames_lost += 1
-            self.records.add_lost(frame.index)
-            return Tracked("lost", None, 0.0)
-        self._update_velocity(match.T_target_source)
-        T_world_cam = self.records.T_world_keyframe[-1] @ match.T_target_source
-        confidence = self._confidence(match)
-        if self._is_keyframe(view, match):
-            self._add_keyframe(frame.index, view, match, confidence)
-            return Tracked("keyframe", T_world_cam, confidence)
-        self.records.add_tracked(frame.index, len(self._keyframes) - 1, match.T_target_source, confidence)
-        return Tracked("tracked", T_world_cam, confidence)
+        view = dense.view_of(frame)
+        if view.covered < _LEAST_COVERED:
+            return self._lose(frame.index)
+        seen = _Seen(frame, view, surface_of(view))
+        if not self.keyframes:
+            return self._begin_submap(seen)
+        aligned = self._follow(seen)
+        if aligned is None:
+            return self._relocalise(seen) or self._begin_submap(seen)
+        T = aligned.T_target_source
+        self._velocity = invert(self._T_keyframe_last) @ T if self._frames_lost == 0 else np.eye(4)
+        return self._place(seen, aligned, "tracked")
 
     def optimize(self) -> None:
-        self.records.T_world_keyframe = pose_graph.optimize(self.records.T_world_keyframe, self.edges)
+        T = self.records.T_world_keyframe
+        self.edges = [edge for edge in self.edges if not edge.uncertain]
+        if self.options.close_loops and len(T) > 2:
+            self.edges += loops.find(self.keyframes, self.records.submap, T)
+        pieces = pose_graph.pieces(len(T), self.records.submap, self.edges)
+        for rows in pieces:
+            placed = pose_graph.optimize_piece(T, self.edges, rows)
+            if self.options.refine:
+                placed = joint.refine([self.keyframes[k] for k in rows], placed, self.options.neighbours)
+            for k, pose in zip(rows, placed, strict=True):
+                T[k] = pose
+        self.records.pieces = pieces
 
-    def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
-        return self.records.trajectory(timestamps)
+    def _follow(self, seen: _Seen) -> dense.Alignment | None:
+        """The alignment to the current keyframe; None if there is none that can be trusted."""
+        target = self.keyframes[self._current]
+        guess = self._T_keyframe_last @ self._velocity
+        aligned = dense.align(seen.view, target.view, guess)
+        metres, degrees = apart(guess, aligned.T_target_source)
+        if _sure(aligned) and metres <= _JUMP_M and degrees <= _JUMP_DEG and self._frames_lost == 0:
+            return aligned
+        found = register_by_features(seen.full, target)
+        if found is not None and _confirmed(found) and _score(found.aligned) >= _score(aligned):
+            return found.aligned
+        steady = metres <= _JUMP_M and degrees <= _JUMP_DEG and self._frames_lost == 0
+        alike = not aligned.correlation < _LIKELY_CORRELATION  # where nothing varies, nothing disagrees
+        good = alike and aligned.overlap >= _LEAST_OVERLAP and aligned.inliers >= _SURE_INLIERS
+        return aligned if good and (steady or aligned.correlation >= _SURE_CORRELATION) else None
 
-    def _start(self, index: int, view: _View) -> Tracked:
-        if np.count_nonzero(view.depth_m) < 0.05 * view.depth_m.size:
-            self.records.add_lost(index)
-            return Tracked("lost", None, 0.0)
-        self.records.add_keyframe(index, np.eye(4), 1.0)
-        self._keyframes.append(view)
-        self._T_keyframe_last = np.eye(4)
+    def _relocalise(self, seen: _Seen) -> Tracked | None:
+        """Place a frame that the current keyframe does not show, by the last frame or by the other keyframes."""
+        self._velocity = np.eye(4)
+        if self._last is not None:
+            found = register_by_features(seen.full, self._last.full)
+            if found is not None and _recognised(found):
+                T = self._T_keyframe_last @ found.aligned.T_target_source
+                return self._place(seen, replace(found.aligned, T_target_source=T), "relocalised")
+        best: tuple[dense.Alignment, int] | None = None
+        for row in self._alike(seen):
+            found = register_by_features(seen.full, self.keyframes[row])
+            if found is None or not _recognised(found):
+                continue
+            if best is None or _score(found.aligned) > _score(best[0]):
+                best = found.aligned, row
+        if best is None:
+            return None
+        self._current = best[1]
+        return self._place(seen, best[0], "relocalised")
+
+    def _alike(self, seen: _Seen) -> list[int]:
+        """Keyframes that a lost frame may show: the last ones, and those with most features in common."""
+        described = seen.full.features
+        last = len(self.keyframes) - 1
+        recent = [row for row in range(last, max(-1, last - _RECENT), -1) if row != self._current]
+        if not len(described.pixels):
+            return recent
+        older = [row for row in range(last + 1) if row not in recent and row != self._current]
+        step = max(1, len(older) // 40)
+        scored = [(loops.in_common(described, self.keyframes[row].features), row) for row in older[::step]]
+        return recent + [row for _, row in sorted(scored, reverse=True)[: loops.CANDIDATES]]
+
+    def _place(self, seen: _Seen, aligned: dense.Alignment, status: str) -> Tracked:
+        """Hang the frame on the current keyframe, or make it the next one."""
+        self._frames_lost = 0
+        self._last = seen
+        self._T_keyframe_last = aligned.T_target_source
+        T_world_cam = self.records.T_world_keyframe[self._current] @ aligned.T_target_source
+        confidence = _confidence(aligned)
+        index, target = seen.frame.index, self.keyframes[self._current]
+        shared = mutual_overlap(seen.surface, target.overlap, aligned.T_target_source)
+        if shared >= self.options.keyframe_overlap:
+            self.records.add_tracked(index, self._current, aligned.T_target_source, confidence, status)
+            return Tracked(status, T_world_cam, confidence)
+        row = len(self.keyframes)
+        self.edges.append(Edge(row, self._current, aligned.T_target_source, aligned.information, uncertain=False))
+        self._add_keyframe(seen, T_world_cam, confidence, self.records.submap[self._current])
+        return Tracked("keyframe", T_world_cam, confidence)
+
+    def _begin_submap(self, seen: _Seen) -> Tracked:
+        self._velocity, self._frames_lost, self._last = np.eye(4), 0, None
+        self._add_keyframe(seen, np.eye(4), 1.0, self.records.submap[-1] + 1 if self.records.submap else 0)
         return Tracked("keyframe", np.eye(4), 1.0)
 
-    def _register_to_keyframe(self, view: _View) -> _Match | None:
-        """The match with the present keyframe from the first starting guess that passes the failure test."""
-        assert self._T_keyframe_last is not None
-        guesses = [self._T_keyframe_last @ self._velocity, self._T_keyframe_last]
-        for guess in guesses:
-            match = self._register(view, self._keyframes[-1], guess)
-            if match.ok:
-                return match
-        return None
-
-    def _register(self, source: _View, target: _View, T_target_source: NDArray[np.float64]) -> _Match:
-        """Odometry of ``source`` against ``target`` and its failure test."""
-        import open3d as o3d
-
-        odometry = o3d.t.pipelines.odometry
-        failed = _Match(T_target_source, np.eye(6), 0.0, ok=False)
-        valid = np.count_nonzero(source.depth_m) / source.depth_m.size
-        if valid < 0.05:
-            return failed
-        K = o3d.core.Tensor(source.intrinsics.matrix)
-        try:
-            result = odometry.rgbd_odometry_multi_scale(
-                source.rgbd, target.rgbd, K, o3d.core.Tensor(T_target_source), 1.0, 1000.0,
-                [odometry.OdometryConvergenceCriteria(n) for n in self.options.iterations],
-                odometry.Method.Hybrid,
-                odometry.OdometryLossParams(self.options.depth_difference, 0.05, 0.1),
-            )  # fmt: skip
-        except RuntimeError:  # a singular system: nothing to align
-            return failed
-        T = result.transformation.cpu().numpy()
-        fitness, residual = result.fitness / valid, result.inlier_rmse
-        if not np.isfinite(T).all() or fitness < self.options.min_fitness or residual > self.options.max_residual:
-            return failed
-        information = odometry.compute_odometry_information_matrix(
-            source.rgbd.depth, target.rgbd.depth, K, result.transformation,  # type: ignore[attr-defined]
-            self.options.depth_difference, 1.0, 1000.0,
-        ).cpu().numpy()  # fmt: skip
-        weakest = np.linalg.eigvalsh(information)[0] / max(information[5, 5], 1.0)
-        return _Match(nearest_rigid(T), information, fitness, ok=bool(weakest >= self.options.min_information))
-
-    def _update_velocity(self, T_keyframe_cam: NDArray[np.float64]) -> None:
-        assert self._T_keyframe_last is not None
-        moved = invert(self._T_keyframe_last) @ T_keyframe_cam
-        self._velocity = moved if self._frames_lost == 0 else np.eye(4)
-        self._T_keyframe_last = T_keyframe_cam
-        self._frames_lost = 0
-
-    def _is_keyframe(self, view: _View, match: _Match) -> bool:
-        return mutual_overlap(view, self._keyframes[-1], match.T_target_source) < self.options.keyframe_overlap
-
-    def _confidence(self, match: _Match) -> float:
-        return float(np.clip(match.fitness, 0.0, 1.0))
-
-    def _add_keyframe(self, index: int, view: _View, match: _Match, confidence: float) -> None:
-        row = len(self._keyframes)
-        self.records.add_keyframe(index, self.records.T_world_keyframe[-1] @ match.T_target_source, confidence)
-        self.edges.append(Edge(row, row - 1, match.T_target_source, match.information, uncertain=False))
-        self._keyframes.append(view)
+    def _add_keyframe(self, seen: _Seen, T_world_cam: NDArray[np.float64], confidence: float, submap: int) -> None:
+        self.records.add_keyframe(seen.frame.index, T_world_cam, confidence, submap)
+        self.keyframes.append(seen.full)
+        self._current = len(self.keyframes) - 1
         self._T_keyframe_last = np.eye(4)
-        self._add_overlap_edges(row)
 
-    def _add_overlap_edges(self, row: int) -> None:
-        """Register keyframe ``row`` to the earlier ones that share most of its view by the present poses."""
-        view, T_cam_world = self._keyframes[row], invert(self.records.T_world_keyframe[row])
-        shared = [
-            mutual_overlap(other, view, T_cam_world @ self.records.T_world_keyframe[k])
-            for k, other in enumerate(self._keyframes[: row - 1])
-        ]
-        best = np.argsort(shared)[::-1][: self.options.overlap_edges]
-        for k in (int(k) for k in best if shared[k] >= self.options.min_edge_overlap):
-            guess = invert(self.records.T_world_keyframe[k]) @ self.records.T_world_keyframe[row]
-            match = self._register(view, self._keyframes[k], guess)
-            if match.ok:
-                self.edges.append(Edge(row, k, match.T_target_source, match.information, uncertain=True))
-
-    def _view(self, frame: Frame) -> _View:
-        import open3d as o3d
-
-        camera, color, depth = frame.intrinsics, frame.color, frame.depth_m
-        step = max(1, round(camera.width / self.options.width))
-        if step > 1:
-            # Depth is picked, never averaged across an edge; colour is averaged around the same pixels, by a window of
-            # odd size, so that both stay registered and the principal point moves with them exactly.
-            first = step // 2
-            color = cv2.blur(color, (step | 1, step | 1))[first::step, first::step]
-            depth = depth[first::step, first::step]
-            camera = Intrinsics(
-                depth.shape[1], depth.shape[0], camera.fx / step, camera.fy / step,
-                (camera.cx - first) / step, (camera.cy - first) / step,
-            )  # fmt: skip
-        depth = np.ascontiguousarray(depth)
-        rgbd = o3d.t.geometry.RGBDImage(
-            o3d.t.geometry.Image(np.ascontiguousarray(color)), o3d.t.geometry.Image(depth[..., None])
-        ).to(self.device)
-        return _View(depth, camera, sample_points(depth, camera), rgbd)
+    def _lose(self, index: int) -> Tracked:
+        self._frames_lost += 1
+        self.records.add_lost(index)
+        return Tracked("lost", None, 0.0)
 
     def state(self) -> dict[str, NDArray[np.generic]]:
-        last = self._T_keyframe_last if self._T_keyframe_last is not None else np.eye(4)
         return {
-            **self.records.to_arrays(),
-            "last": np.stack((last, self._velocity)),
-            "frames_lost": np.array(self._frames_lost),
-            "edge_nodes": np.array([(e.source, e.target, e.uncertain) for e in self.edges], np.int64).reshape(-1, 3),
-            "edge_T_target_source": np.array([e.T_target_source for e in self.edges]).reshape(-1, 4, 4),
-            "edge_information": np.array([e.information for e in self.edges]).reshape(-1, 6, 6),
+            **super().state(),
+            "last": np.stack((self._T_keyframe_last, self._velocity)),
+            "counters": np.array((self._current, self._frames_lost)),
         }
 
     def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
         self.records = Records.from_arrays(state)
-        self._keyframes = [self._view(frame) for frame in keyframes]
+        self.keyframes = [keyframe_view(frame) for frame in keyframes]
         self._T_keyframe_last, self._velocity = np.asarray(state["last"], np.float64)
-        self._frames_lost = int(state["frames_lost"])
-        self.edges = [
-            Edge(int(source), int(target), np.asarray(T), np.asarray(information), bool(uncertain))
-            for (source, target, uncertain), T, information in zip(
-                state["edge_nodes"].tolist(), state["edge_T_target_source"], state["edge_information"], strict=True
-            )
-        ]
+        self._current, self._frames_lost = state["counters"].tolist()
+        self.edges = pose_graph.edges_from_arrays(state)
 
 
-def _device(name: str) -> object:
-    """The Open3D device of a name such as "cpu" or "cuda:0". Raises ConfigError if there is none."""
-    import open3d as o3d
+def _confirmed(found: Registered) -> bool:
+    """Whether enough features agree, dense alignment stays where they say, and what is seen there agrees."""
+    aligned = found.aligned
+    metres, degrees = apart(found.by_features, aligned.T_target_source)
+    alike = not aligned.correlation < _LEAST_CORRELATION  # where nothing varies, nothing disagrees
+    seen = aligned.overlap >= _CONFIRMED_OVERLAP and aligned.inliers >= _LEAST_INLIERS
+    return found.agreeing >= _FEATURES and alike and seen and metres <= _CONFIRMED_M and degrees <= _CONFIRMED_DEG
 
-    kind, _, number = name.lower().partition(":")
-    number = number or "0"
-    if kind not in ("cpu", "cuda") or not number.isdigit():
-        raise ConfigError(f"Unknown device '{name}': use cpu or cuda:0.")
-    if kind == "cuda" and int(number) >= o3d.core.cuda.device_count():
-        raise ConfigError(f"There is no device '{name}': Open3D sees {o3d.core.cuda.device_count()} CUDA devices here.")
-    return o3d.core.Device(kind.upper(), int(number))
+
+def _recognised(found: Registered) -> bool:
+    """Whether a frame of which nothing was known is where it was found: by features and surfaces, or, where these saw
+    the way from afar only, by surfaces that share much and look the same."""
+    seen_again = _sure(found.aligned) and found.aligned.overlap >= _RECOGNISED_OVERLAP
+    return seen_again or (_confirmed(found) and _likely(found.aligned))
+
+
+def _sure(aligned: dense.Alignment) -> bool:
+    return _likely(aligned) and aligned.overlap >= _LEAST_OVERLAP and aligned.correlation >= _SURE_CORRELATION
+
+
+def _likely(aligned: dense.Alignment) -> bool:
+    return aligned.determined and aligned.inliers >= _SURE_INLIERS and aligned.correlation >= _LIKELY_CORRELATION
+
+
+def _score(aligned: dense.Alignment) -> float:
+    return aligned.inliers * max(np.nan_to_num(aligned.correlation), 0.1)
+
+
+def _confidence(aligned: dense.Alignment) -> float:
+    alike = 0.5 if np.isnan(aligned.correlation) else max(aligned.correlation, 0.0)
+    return float(np.clip(aligned.inliers * alike * (1.0 if aligned.determined else 0.5), 0.0, 1.0))

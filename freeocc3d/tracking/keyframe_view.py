@@ -1,0 +1,75 @@
+"""What the tracker keeps of a keyframe, and how two of them are registered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import Frame, Intrinsics
+from . import dense, features
+from .overlap import DepthView
+
+_OVERLAP_STEP = 5
+
+
+@dataclass(frozen=True)
+class KeyframeView:
+    """view: for dense alignment.  overlap: its surface, sparsely.  features: ORB.  rays: (N, 2) of the features.
+    points: (N, 3) where they meet the surface, z = 0 where there is none.  camera: of the colour image."""
+
+    view: dense.View
+    overlap: DepthView
+    features: features.Features
+    rays: NDArray[np.float32]
+    points: NDArray[np.float32]
+    camera: Intrinsics
+
+
+def surface_of(view: dense.View) -> DepthView:
+    """A sparse sample of a view's surface, to measure overlap with."""
+    sample = view.points[_OVERLAP_STEP // 2 :: _OVERLAP_STEP, _OVERLAP_STEP // 2 :: _OVERLAP_STEP].reshape(-1, 3)
+    return DepthView(view.points[..., 2], view.intrinsics, sample[sample[:, 2] > 0])
+
+
+def keyframe_view(frame: Frame, view: dense.View | None = None) -> KeyframeView:
+    """Prepare a frame; ``view`` if it is there already."""
+    view = view or dense.view_of(frame)
+    found = features.detect(frame)
+    rays = found.rays(frame.intrinsics)
+    return KeyframeView(view, surface_of(view), found, rays, features.lift(rays, view), frame.intrinsics)
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Features of a source that match a target's, with a depth: points_s (M, 3), rays_t (M, 2)."""
+
+    points_s: NDArray[np.float32]
+    rays_t: NDArray[np.float32]
+
+
+def matched(source: KeyframeView, target: KeyframeView) -> Matched:
+    """Match features by their descriptors."""
+    rows = features.match(source.features, target.features)
+    points = source.points[rows[:, 0]]
+    known = points[:, 2] > 0
+    return Matched(points[known], target.rays[rows[known, 1]])
+
+
+@dataclass(frozen=True)
+class Registered:
+    """T_target_source (4, 4) that features give, how many of them agree on it, and the dense alignment from there."""
+
+    by_features: NDArray[np.float64]
+    agreeing: int
+    aligned: dense.Alignment
+
+
+def register_by_features(source: KeyframeView, target: KeyframeView) -> Registered | None:
+    """Pose from features, refined densely; None where they do not tell."""
+    pairs = matched(source, target)
+    found = features.pose(pairs.points_s, pairs.rays_t, 1.0 / target.camera.fx)
+    if found is None:
+        return None
+    return Registered(found[0], len(found[1]), dense.align(source.view, target.view, found[0]))

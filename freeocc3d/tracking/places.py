@@ -1,0 +1,54 @@
+"""Place recognition: which keyframes show what another one shows, by their features alone.
+
+A vocabulary of visual words is learnt from the scan's own descriptors, a keyframe is its histogram of words, rare words
+count more, and similarity is the cosine.
+
+Source: J. Sivic, A. Zisserman, Video Google, ICCV 2003, with k-means on binary descriptors as vectors of ±1, whose dot
+product is their Hamming distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+_WORDS, _SAMPLE, _ROUNDS = 512, 20_000, 6
+
+
+class Vocabulary:
+    """Visual words, learnt from lists of (N, 32) uint8 descriptors."""
+
+    def __init__(self, descriptors: Sequence[NDArray[np.uint8]]):
+        rng = np.random.default_rng(0)
+        every = np.concatenate(descriptors)
+        sample = _signs(every[rng.permutation(len(every))[:_SAMPLE]])
+        words = sample[:_WORDS].copy()
+        for _ in range(_ROUNDS):
+            nearest = np.argmax(sample @ words.T, axis=1)
+            order = np.argsort(nearest, kind="stable")
+            used, first = np.unique(nearest[order], return_index=True)
+            words[used] = np.add.reduceat(sample[order], first, axis=0)
+            words /= np.maximum(np.linalg.norm(words, axis=1, keepdims=True), 1e-9)
+        self._words = words
+
+    def histogram(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """(W,) how often each word occurs."""
+        if not len(descriptors):
+            return np.zeros(len(self._words), np.float32)
+        nearest = np.argmax(_signs(descriptors) @ self._words.T, axis=1)
+        return np.bincount(nearest, minlength=len(self._words)).astype(np.float32)
+
+
+def similarity(histograms: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(K, K) cosine of K keyframes' (K, W) histograms, square-rooted and weighed by inverse document frequency."""
+    occurs = np.maximum((histograms > 0).sum(axis=0), 1)
+    weighed = np.sqrt(histograms) * np.log(1 + len(histograms) / occurs)
+    weighed /= np.maximum(np.linalg.norm(weighed, axis=1, keepdims=True), 1e-9)
+    return np.asarray(weighed @ weighed.T, np.float32)
+
+
+def _signs(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(N, 256) bits as ±1."""
+    return np.unpackbits(descriptors, axis=1).astype(np.float32) * 2 - 1

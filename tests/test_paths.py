@@ -1,0 +1,74 @@
+"""The picture of the camera's way: it is drawn where it was, with what is apart beside it."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from helpers import pose_matrix
+from scenes import gaussians
+
+from freeocc3d.types import Submap, Trajectory
+from freeocc3d.viewer import paths
+
+
+def submap(frames: range, keyframes: list[int], closures=(), held=()) -> Submap:
+    return Submap(
+        np.array(frames, np.int32),
+        np.stack([pose_matrix(i) for i in frames]),
+        np.array(keyframes, np.int32),
+        np.array(closures, np.int32).reshape(-1, 2),
+        np.array(held, bool),
+    )
+
+
+def trajectory(status: list[str]) -> Trajectory:
+    posed = np.array([name not in ("lost", "apart", "unused") for name in status])
+    T = np.where(posed[:, None, None], np.stack([pose_matrix(i) for i in range(len(status))]), np.nan)
+    keyframes = np.array([n for n, name in enumerate(status) if name == "keyframe"], np.int32)
+    return Trajectory(np.arange(len(status), dtype=float), T, keyframes, np.array(status), np.ones(len(status)))
+
+
+def drawn(
+    path: Path, submaps: list[Submap], status: list[str], points=((0, 0, 2), (1, 0, 2), (0.5, 0.2, 3))
+) -> np.ndarray:
+    paths.path_picture(path, submaps, trajectory(status), gaussians(points, 0.02), Path("scan"))
+    picture = cv2.imread(str(path))[:, :, ::-1]
+    assert picture.shape == (paths.SIZE[1], paths.SIZE[0], 3)
+    return picture
+
+
+def pixels(picture: np.ndarray, color: tuple[int, int, int]) -> int:
+    return int((np.abs(picture.astype(int) - color).max(axis=-1) < 8).sum())
+
+
+STATUS = ["keyframe", "tracked", "relocalised", "keyframe", "interpolated", "tracked", "keyframe"]
+
+
+def test_the_way_its_keyframes_and_closures_are_drawn(tmp_path) -> None:
+    with_closures = submap(range(7), [0, 3, 6], [(6, 0), (3, 0)], [True, False])
+    picture = drawn(tmp_path / "a.png", [with_closures], STATUS)
+    plain = drawn(tmp_path / "b.png", [submap(range(7), [0, 3, 6])], STATUS)
+    for color in (paths._TRACKED, paths._KEYFRAME, paths._FOUND, paths._BETWEEN):
+        assert pixels(plain, color) > 50
+    assert pixels(picture, paths._HELD) > pixels(plain, paths._HELD) + 50
+    assert pixels(picture, paths._WRONG) > pixels(plain, paths._WRONG) + 50
+
+
+def test_submaps_apart_stand_beside_it(tmp_path) -> None:
+    status = [*STATUS, "apart", "apart"]
+    one = [submap(range(7), [0, 3, 6])]
+    alone = drawn(tmp_path / "a.png", one, status)
+    both = drawn(tmp_path / "b.png", [*one, submap(range(7, 9), [7])], status)
+    right = (slice(100, 900), slice(-paths._ASIDE, None))
+    assert pixels(both[right], paths._KEYFRAME) > 0
+    label = (slice(paths._BAR, paths._BAR + 30), slice(-paths._ASIDE, None))
+    assert (alone[label] > 120).all()
+    assert (both[label] < 120).any()
+    many = [submap(range(7, 9), [7])] * 6
+    drawn(tmp_path / "c.png", [*one, *many], status)
+
+
+def test_a_camera_that_never_moved_is_drawn_too(tmp_path) -> None:
+    still = submap(range(1), [0])
+    assert pixels(drawn(tmp_path / "a.png", [still], ["keyframe"]), paths._KEYFRAME) > 0
+    assert pixels(drawn(tmp_path / "b.png", [still], ["keyframe"], points=[(0, 0, 1)]), paths._KEYFRAME) > 0

@@ -1,0 +1,235 @@
+"""Layer 1 alone, on captures that are altered: frames dropped, darkened, turned round, glued; and of growing length."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from freeocc3d.capture import open_capture, used_frames
+from freeocc3d.capture.base import Capture, Options
+from freeocc3d.capture.readahead import read_ahead
+from freeocc3d.capture.reregistered import Reregistered
+from freeocc3d.evaluation.align import Poses, align
+from freeocc3d.evaluation.trajectory import trajectory_errors
+from freeocc3d.tracking import calibration, rgbd
+from freeocc3d.types import Frame, Trajectory
+
+Figures = dict[str, Any]
+Change = Callable[[int, Frame], Frame]
+
+LENGTHS = (250, 500, 1000)
+_GAP, _BLACK = 30, 20
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Frames of a capture in the order in which they are shown, and what becomes of each."""
+
+    frames: Sequence[int]
+    change: Change = lambda position, frame: frame
+    lost: frozenset[int] = frozenset()
+    """Positions of frames that show nothing, and have to be reported lost."""
+
+
+def sequences(count: int) -> dict[str, Shown]:
+    """By name, for a capture of ``count`` frames."""
+    middle = count // 2
+    every, black = range(count), frozenset(range(middle, middle + _BLACK))
+    return {
+        "full": Shown(every),
+        "every 3rd frame": Shown(range(0, count, 3)),
+        "30 frames cut out": Shown([i for i in every if not middle <= i < middle + _GAP]),
+        "20 black frames": Shown(every, lambda n, frame: _colored(frame, 0.0) if n in black else frame),
+        "20 frames without anything": Shown(every, lambda n, frame: _blank(frame) if n in black else frame, black),
+        "half the depth missing": Shown(every, _holes),
+        "left half of the depth missing": Shown(every, _left_missing),
+        "brightness x 0.5 to 1.6": Shown(every, lambda n, frame: _colored(frame, 1.05 + 0.55 * np.sin(n / 15.4))),
+        "reversed": Shown(range(count - 1, -1, -1)),
+        "there and back": Shown([*every, *range(count - 2, -1, -1)]),
+    }
+
+
+def _colored(frame: Frame, gain: float) -> Frame:
+    return replace(frame, color=np.clip(frame.color * gain, 0, 255).astype(np.uint8))
+
+
+def _blank(frame: Frame) -> Frame:
+    return replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m))
+
+
+def _holes(position: int, frame: Frame) -> Frame:
+    """Every second square of 16 pixels, at random."""
+    height, width = frame.depth_m.shape
+    missing = np.random.default_rng(position).random((height // 16 + 1, width // 16 + 1)) < 0.5
+    holes = np.kron(missing, np.ones((16, 16), bool))[:height, :width]
+    return replace(frame, depth_m=np.where(holes, np.float32(0), frame.depth_m))
+
+
+def _left_missing(position: int, frame: Frame) -> Frame:
+    depth = frame.depth_m.copy()
+    depth[:, : depth.shape[1] // 2] = 0
+    return replace(frame, depth_m=depth)
+
+
+def opened(capture: str) -> Capture:
+    """A capture as the pipeline would give it to layer 1, which is not told its poses."""
+    plain = open_capture(capture, Options())
+    ratio = calibration.color_focal(plain, used_frames(plain))
+    return plain if ratio == 1 else Reregistered(plain, ratio)
+
+
+def tracked(captures: Iterable[tuple[Capture, Shown]]) -> tuple[rgbd.RgbdTracker, Trajectory, float]:
+    """The tracker after all of the sequences, one after the other, its trajectory by position, and its seconds."""
+    tracker = rgbd.RgbdTracker(rgbd.Options())
+    position, seconds = 0, 0.0
+    for capture, sequence in captures:
+        for _, frame in read_ahead(capture, sequence.frames):
+            assert isinstance(frame, Frame), frame
+            changed = replace(sequence.change(position, frame), index=position)
+            mark = time.perf_counter()
+            tracker.track(changed)
+            seconds += time.perf_counter() - mark
+            position += 1
+    mark = time.perf_counter()
+    tracker.optimize()
+    seconds += time.perf_counter() - mark
+    return tracker, tracker.trajectory(np.arange(position, dtype=np.float64)), seconds
+
+
+def stress(capture: str, name: str) -> Figures:
+    """One sequence of a capture: ATE against its poses, and what became of its frames."""
+    scan = opened(capture)
+    sequence = sequences(len(scan))[name]
+    tracker, trajectory, seconds = tracked([(scan, sequence)])
+    stated = [scan.pose(index) for index in sequence.frames]
+    known = [n for n, pose in enumerate(stated) if pose is not None and trajectory.has_pose[n]]
+    estimated = Poses(trajectory.timestamps[known], trajectory.T_world_cam[known])
+    true = Poses(trajectory.timestamps[known], np.stack([stated[n] for n in known]))
+    errors = trajectory_errors(estimated, true, align(estimated, true))
+    lost = set(np.flatnonzero(trajectory.status == "lost").tolist())
+    figures = {
+        "ate_rmse_m": errors.ate_rmse_m,
+        "ate_max_m": float(errors.errors_m.max()),
+        "frames": len(sequence.frames),
+        "expected_lost": len(sequence.lost),
+        "missed_losses": len(sequence.lost - lost),
+        "other_losses": len(lost - sequence.lost),
+        "seconds": seconds,
+        **_pieces(tracker, trajectory),
+    }
+    if name == "there and back":
+        ends = trajectory.T_world_cam[[0, -1], :3, 3]
+        figures["gap_m"] = float(np.linalg.norm(ends[1] - ends[0]))
+    return figures
+
+
+def glued(captures: list[str]) -> Figures:
+    """Two captures of different places as if they were one: which frames the submaps hold."""
+    scans = [opened(capture) for capture in captures]
+    tracker, trajectory, seconds = tracked([(scan, Shown(range(len(scan)))) for scan in scans])
+    expected = [list(range(len(scans[0]))), list(range(len(scans[0]), sum(map(len, scans))))]
+    found = [submap.frames.tolist() for submap in tracker.submaps()]
+    return {
+        "frames": len(trajectory),
+        "seconds": seconds,
+        "apart_as_they_are": sorted(found) == expected,
+        **_pieces(tracker, trajectory),
+    }
+
+
+def lengths(capture: str) -> Figures:
+    """Seconds of layer 1 on the first 250, 500, 1000 frames, and what it keeps of a keyframe."""
+    rows = []
+    for count in LENGTHS:
+        mark = time.perf_counter()
+        plain = open_capture(capture, Options(stop=count))
+        if len(plain) < count:
+            break
+        ratio = calibration.color_focal(plain, used_frames(plain))
+        calibrated = time.perf_counter() - mark
+        scan = plain if ratio == 1 else Reregistered(plain, ratio)
+        tracker, _, seconds = tracked([(scan, Shown(range(count)))])
+        views = tracker.keyframes
+        size = sum(_bytes(view) for view in views) / len(views)
+        rows.append(
+            {"frames": count, "seconds": calibrated + seconds, "keyframes": len(views), "bytes_per_keyframe": size}
+        )
+    return {"rows": rows}
+
+
+def _bytes(value: Any) -> int:
+    """Bytes of the arrays that an object holds."""
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, tuple | list):
+        return sum(map(_bytes, value))
+    return sum(map(_bytes, vars(value).values())) if hasattr(value, "__dict__") else 0
+
+
+def _pieces(tracker: rgbd.RgbdTracker, trajectory: Trajectory) -> Figures:
+    submaps = tracker.submaps()
+    status, counts = np.unique(trajectory.status, return_counts=True)
+    return {
+        "with_pose": int(trajectory.has_pose.sum()),
+        "status": dict(zip(status.tolist(), counts.tolist(), strict=True)),
+        "submaps": [[int(s.frames[0]), int(s.frames[-1]), len(s.frames)] for s in submaps],
+        "keyframes": sum(len(s.keyframes) for s in submaps),
+        "closures": sum(len(s.closures) for s in submaps),
+        "refused": int(sum((~s.held).sum() for s in submaps)),
+    }
+
+
+def stress_table(rows: list[Figures]) -> list[tuple[str, ...]]:
+    """A header and a line for each altered sequence."""
+    full = {row["capture"]: row["ate_rmse_m"] for row in rows if row["sequence"] == "full" and "ate_rmse_m" in row}
+    lines: list[tuple[str, ...]] = [("capture", "sequence", "ATE cm", "x full", "with a pose", "lost", "submaps")]
+    for row in rows:
+        if "error" in row:
+            lines.append((row["capture"], row["sequence"], f"not available, {row['error']}", "–", "–", "–", "–"))
+            continue
+        ate, base = row.get("ate_rmse_m"), full.get(row["capture"])
+        lost = row["status"].get("lost", 0)
+        expected = f" ({row['expected_lost']} show nothing)" if row.get("expected_lost") else ""
+        submaps = ", ".join(f"{first}–{last}" for first, last, _ in row["submaps"])
+        gap = f"; back at its start {100 * row['gap_m']:.2f} cm off" if "gap_m" in row else ""
+        lines.append(
+            (
+                row["capture"],
+                row["sequence"] + gap,
+                "–" if ate is None else f"{100 * ate:.2f}",
+                "–" if ate is None or not base else f"{ate / base:.2f}",
+                f"{row['with_pose']} of {row['frames']}",
+                f"{lost}{expected}",
+                f"{len(row['submaps'])}: {submaps}",
+            )
+        )
+    return lines
+
+
+def length_table(rows: list[Figures]) -> list[tuple[str, ...]]:
+    """A header and a line for each length."""
+    lines: list[tuple[str, ...]] = [("capture", "frames", "layer 1, s", "ms/frame", "keyframes", "kB a keyframe")]
+    return lines + [
+        (
+            row["capture"],
+            str(row["frames"]),
+            f"{row['seconds']:.1f}",
+            f"{1e3 * row['seconds'] / row['frames']:.1f}",
+            str(row["keyframes"]),
+            f"{1e-3 * row['bytes_per_keyframe']:.0f}",
+        )
+        for row in rows
+    ]
+
+
+def warm_up(capture: str) -> Figures:
+    """Have everything compiled, so that no measurement pays for it."""
+    plain = open_capture(Path(capture), Options())
+    few = range(0, min(len(plain), 40), 8)
+    tracked([(plain, Shown(few))])
+    return {}
