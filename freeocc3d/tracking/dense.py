@@ -434,7 +434,7 @@ def _descend(
             D[1, 1] += 1e-9
             brightness += np.linalg.solve(D, -g[6:] - np.ascontiguousarray(H[6:, :6]) @ step)
             move(T, step)
-            if np.abs(step).max() < 2e-5:
+            if np.abs(step).max() < 2e-4:
                 break
 
 

@@ -18,7 +18,7 @@ from ..types import Frame, Intrinsics
 from .dense import View
 
 COUNT = 800
-_MIN_INLIERS, _ITERATIONS = 12, 1000
+_MIN_INLIERS = 12
 _FARTHEST_PX, _AGREES_PX = 12.0, 4.0
 
 
@@ -70,15 +70,19 @@ def match(a: Features, b: Features) -> NDArray[np.int64]:
 
 
 def pose(
-    points_s: NDArray[np.float32], rays_t: NDArray[np.float32], pixel: float, threshold_px: float = 3.0
+    points_s: NDArray[np.float32],
+    rays_t: NDArray[np.float32],
+    pixel: float,
+    threshold_px: float = 3.0,
+    iterations: int = 300,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """T_target_source (4, 4) from (M, 3) source points seen along (M, 2) target rays, and the rows that agree with it;
-    None if too few do. pixel: size of a pixel on the rays, 1 / f."""
+    None if too few do. pixel: size of a pixel on the rays, 1 / f.  iterations: draws of RANSAC at most."""
     if len(points_s) < _MIN_INLIERS:
         return None
     cv2.setRNGSeed(1)
     good, rotation, translation, inliers = cv2.solvePnPRansac(
-        points_s.astype(np.float64), rays_t.astype(np.float64), np.eye(3), None, iterationsCount=_ITERATIONS,
+        points_s.astype(np.float64), rays_t.astype(np.float64), np.eye(3), None, iterationsCount=iterations,
         reprojectionError=threshold_px * pixel, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
     )  # fmt: skip
     if not good or inliers is None or len(inliers) < _MIN_INLIERS:

@@ -28,6 +28,7 @@ from .overlap import mutual_overlap
 
 _STRIDE = 2  # source pixels that are skipped: neighbouring ones say nearly the same
 _LEAST_SHARE, _LEAST_CORRELATION = 0.5, 0.5
+_STILL, _FAR_M = 5e-5, 0.02  # a step that moves nothing any more, and one after which other pairs may overlap
 _PRIOR = 1.0  # information that holds a keyframe which no pair holds
 
 
@@ -52,7 +53,7 @@ def refine(
     """T_world_keyframe of K keyframes, refined; the first keeps its pose.
 
     neighbours: earlier keyframes that each is paired with, those that share most of its view.  rounds: how often pairs
-    are chosen anew.
+    are chosen at most; anew only if keyframes moved far since.
     """
     T = [np.array(pose) for pose in poses]
     if len(T) < 2:
@@ -60,6 +61,7 @@ def refine(
     made: dict[tuple[int, int], _Pair] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for _ in range(rounds):
+            before = np.stack(T)
             chosen = overlapping_pairs(keyframes, T, neighbours, least_overlap)
             new = [pair for pair in chosen if pair not in made]
             matches = pool.map(lambda pair: matched(keyframes[pair[0]], keyframes[pair[1]]), new)
@@ -71,8 +73,10 @@ def refine(
                               [term for term in terms if term is not None], len(T))  # fmt: skip
                 for k, xi in enumerate(step):
                     dense.move(T[k], xi)
-                if np.abs(step).max() < 1e-5:
+                if np.abs(step).max() < _STILL:
                     break
+            if np.abs(np.stack(T) - before)[:, :3, 3].max() < _FAR_M:
+                break
     return [nearest_rigid(pose) for pose in T]
 
 

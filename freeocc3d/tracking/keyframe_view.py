@@ -66,10 +66,10 @@ class Registered:
     aligned: dense.Alignment
 
 
-def register_by_features(source: KeyframeView, target: KeyframeView) -> Registered | None:
-    """Pose from features, refined densely; None where they do not tell."""
+def register_by_features(source: KeyframeView, target: KeyframeView, iterations: int = 300) -> Registered | None:
+    """Pose from features, refined densely; None where they do not tell. iterations: draws of RANSAC at most."""
     pairs = matched(source, target)
-    found = features.pose(pairs.points_s, pairs.rays_t, 1.0 / target.camera.fx)
+    found = features.pose(pairs.points_s, pairs.rays_t, 1.0 / target.camera.fx, iterations=iterations)
     if found is None:
         return None
     return Registered(found[0], len(found[1]), dense.align(source.view, target.view, found[0]))

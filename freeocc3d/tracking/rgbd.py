@@ -29,6 +29,7 @@ _SURE_INLIERS, _SURE_CORRELATION = 0.75, 0.96  # or features are asked
 _LIKELY_CORRELATION = 0.8
 _JUMP_M, _JUMP_DEG = 0.10, 6.0  # from where the camera was going; or features are asked
 _FEATURES = 20
+_DRAWS = 1000  # of RANSAC for a lost frame, which is worth more of them
 _RECENT = 4  # keyframes that a lost frame is compared with, besides those that look alike
 
 
@@ -137,13 +138,13 @@ class RgbdTracker(Tracker):
         """Place a frame that the current keyframe does not show, by the last frame or by the other keyframes."""
         self._velocity = np.eye(4)
         if self._last is not None:
-            found = register_by_features(seen.full, self._last.full)
+            found = register_by_features(seen.full, self._last.full, _DRAWS)
             if found is not None and _recognised(found):
                 T = self._T_keyframe_last @ found.aligned.T_target_source
                 return self._place(seen, replace(found.aligned, T_target_source=T), "relocalised")
         best: tuple[dense.Alignment, int] | None = None
         for row in self._alike(seen):
-            found = register_by_features(seen.full, self.keyframes[row])
+            found = register_by_features(seen.full, self.keyframes[row], _DRAWS)
             if found is None or not _recognised(found):
                 continue
             if best is None or _score(found.aligned) > _score(best[0]):
