@@ -420,8 +420,8 @@ def _info_text(facts: dict[str, Any]) -> str:
     ]
     if facts["submaps"] > 1:
         lines += [
-            f"submap     frames {submap['first']} to {submap['last']}: {submap['frames']} frames, "
-            f"{submap['keyframes']} keyframes, {'mapped' if submap['mapped'] else 'apart, not in the map'}"
+            f"submap     frames {submap['first']} to {submap['last']}: {submap['frames']} with a pose, of these "
+            f"{submap['keyframes']} as keyframes; {'mapped' if submap['mapped'] else 'apart, not in the map'}"
             for submap in facts["submap_frames"]
         ]
     lines += [f"warning    {text}" for text in facts["warnings"]]

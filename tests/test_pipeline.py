@@ -334,7 +334,7 @@ def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -
     assert made.gaussians.anchor_keyframe.max() < len(made.keyframes)
     text = _info_text(_info(made))
     assert "2 submaps" in text
-    assert "frames 15 to 22: 8 frames" in text
+    assert "frames 15 to 22: 8 with a pose" in text
     assert "apart, not in the map" in text
     assert cv2.imread(str(made.path / "trajectory.png")).shape[2] == 3
 

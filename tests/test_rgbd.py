@@ -142,6 +142,16 @@ def test_a_submap_is_merged_when_its_place_is_seen_again(bedroom, kitchen) -> No
     assert worst(trajectory, bedroom, indices)[0] < 0.01
 
 
+def test_every_place_is_a_submap_of_its_own_however_the_path_went(bedroom, kitchen) -> None:
+    """Bedroom, kitchen, the bedroom again (where it is found), and another place."""
+    living = open_capture(data_folder() / "house" / "living")
+    shown = [*(bedroom[i] for i in range(0, 16, 4)), kitchen[0], *(bedroom[i] for i in range(8, 24, 4)), living[0]]
+    t, trajectory = follow(shown)
+    assert trajectory.has_pose[[*range(4), *range(5, 9)]].all()
+    assert trajectory.status[[4, 9]].tolist() == ["apart", "apart"]
+    assert sorted(submap.frames.tolist() for submap in t.submaps()) == [[0, 1, 2, 3, 5, 6, 7, 8], [4], [9]]
+
+
 def test_the_first_usable_frame_starts_the_map() -> None:
     t = tracker()
     wall = wall_frame(2.0)

@@ -185,7 +185,7 @@ class RgbdTracker(Tracker):
 
     def _begin_submap(self, seen: _Seen) -> Tracked:
         self._velocity, self._frames_lost, self._last = np.eye(4), 0, None
-        self._add_keyframe(seen, np.eye(4), 1.0, self.records.submap[-1] + 1 if self.records.submap else 0)
+        self._add_keyframe(seen, np.eye(4), 1.0, max(self.records.submap, default=-1) + 1)
         return Tracked("keyframe", np.eye(4), 1.0)
 
     def _add_keyframe(self, seen: _Seen, T_world_cam: NDArray[np.float64], confidence: float, submap: int) -> None:
