@@ -17,7 +17,7 @@ from .pose_graph import Edge
 STATUSES = ("unused", "lost", "tracked", "keyframe", "relocalised", "interpolated", "apart")
 
 _LONGEST_GAP = 3
-"""Lost frames in a row between two with a pose that get one by interpolation."""
+"""Frames in a row that cannot be placed and are taken for a gap: between two with a pose they are interpolated."""
 
 _HELD_M, _HELD_DEG = 0.1, 5.0
 
@@ -75,21 +75,29 @@ class Records:
             rows.setdefault(name, []).append(row)
         return sorted(rows.values(), key=lambda piece: (-len(piece), piece[0]))
 
+    def _worth_telling(self) -> list[list[int]]:
+        """Of ``largest_first``, the first, and of the others those of more than a few frames: a blurred frame or a hand
+        before the camera is a gap, not a place."""
+        frames = np.bincount(np.array([k for k in self.keyframe if k >= 0], np.int64), minlength=len(self.submap))
+        first, *others = self.largest_first() or [[]]
+        return [first, *(piece for piece in others if frames[piece].sum() > _LONGEST_GAP)]
+
     def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
         """Poses of all frames of the capture, composed with the keyframes' present poses; frames of other pieces than
-        the largest are "apart" and have none."""
+        the largest are "apart", or lost if they are few, and have none."""
         n = len(timestamps)
         T_world_cam = np.full((n, 4, 4), np.nan)
         status = np.full(n, "unused", dtype="<U12")
         confidence = np.zeros(n, np.float32)
-        pieces = self.largest_first()
-        mapped = np.array(sorted(pieces[0]) if pieces else [], np.int64)
+        pieces = self._worth_telling()
+        mapped = np.array(sorted(pieces[0]), np.int64)
         if self.index:
             rows, keyframe = np.array(self.index), np.array(self.keyframe)
             status[rows] = np.array(STATUSES)[self.status]
             confidence[rows] = self.confidence
             posed = np.isin(keyframe, mapped)
-            status[rows[(keyframe >= 0) & ~posed]] = "apart"
+            status[rows[~posed]] = "lost"
+            status[rows[np.isin(keyframe, [k for piece in pieces[1:] for k in piece])]] = "apart"
             confidence[rows[~posed]] = 0.0
             if posed.any():
                 T_world_keyframe = np.stack(self.T_world_keyframe)[keyframe[posed]]
@@ -103,13 +111,13 @@ class Records:
 
         edges: measurements between keyframes, of which the uncertain ones are closures.
         """
-        if not self.index:
+        if not self.keyframe_index:
             return []
         order = np.argsort(self.index, kind="stable")
         index, keyframe = np.array(self.index, np.int32)[order], np.array(self.keyframe)[order]
         T_keyframe_cam = np.stack(self.T_keyframe_cam)[order]
         found = []
-        for rows in self.largest_first():
+        for rows in self._worth_telling():
             inside = np.isin(keyframe, rows)
             T_submap_keyframe = np.stack(self.T_world_keyframe)[keyframe[inside]]
             closed = [e for e in edges if e.uncertain and e.source in rows and e.target in rows]
