@@ -155,13 +155,26 @@ def test_one_wrong_closure_does_not_bend_a_map(wrong) -> None:
     assert worst(placed, [invert(true[0]) @ T for T in true] if np.allclose(placed[0], np.eye(4)) else true)[0] < 0.02
 
 
-def test_one_closure_does_not_tie_two_submaps_and_two_do() -> None:
+def test_two_submaps_are_tied_by_closures_that_agree() -> None:
     information = np.eye(6)
     submap = [0, 0, 0, 1, 1]
-    tie = Edge(3, 1, np.eye(4), information, uncertain=True)
-    assert pose_graph.pieces(5, submap, []) == [[0, 1, 2], [3, 4]]
-    assert pose_graph.pieces(5, submap, [tie]) == [[0, 1, 2], [3, 4]]
-    assert pose_graph.pieces(5, submap, [tie, Edge(4, 2, np.eye(4), information, uncertain=True)]) == [[0, 1, 2, 3, 4]]
+    poses = [motion(0, 0.1 * k) for k in range(3)] + [motion(0, 0.1 * k) for k in range(2)]
+    one = Edge(3, 1, motion(0, 0.5), information, uncertain=True)  # submap 1 begins at x = 0.6
+    other = Edge(2, 4, motion(0, -0.5), information, uncertain=True)  # says the same, from the other side
+    wrong = Edge(4, 2, motion(60, 3.0), information, uncertain=True)
+    within = Edge(2, 0, motion(0, 0.2), information, uncertain=True)
+    certain = Edge(3, 2, motion(0, 1.0), information, uncertain=False)
+    for edges, kept in (
+        ([], []),
+        ([one], []),
+        ([one, wrong], []),
+        ([one, wrong, other, within], [one, other, within]),
+        ([certain, wrong], [certain]),
+    ):
+        found = pose_graph.agreeing(poses, submap, edges)
+        assert found == kept
+        tied = any(edge is not within for edge in kept)
+        assert pose_graph.pieces(submap, found) == ([[0, 1, 2, 3, 4]] if tied else [[0, 1, 2], [3, 4]])
 
 
 def test_a_tied_submap_is_laid_where_its_closures_say() -> None:

@@ -12,7 +12,7 @@ objective replaced.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -48,7 +48,6 @@ def refine(
     least_overlap: float = 0.35,
     rounds: int = 2,
     iterations: int = 5,
-    progress: Callable[[int], None] = lambda done: None,
 ) -> list[NDArray[np.float64]]:
     """T_world_keyframe of K keyframes, refined; the first keeps its pose.
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from ..geometry import invert, nearest_rigid
+from ..geometry import apart, invert, nearest_rigid
 
-_ENOUGH = 2
-"""Closures between two submaps that tie them."""
+_AGREE_M, _AGREE_DEG = 0.3, 10.0
+"""How far two closures may place a submap from each other: as far as its own path may have drifted between them."""
 
 
 @dataclass(frozen=True)
@@ -31,24 +31,36 @@ class Edge:
     uncertain: bool
 
 
-def pieces(count: int, submap: Sequence[int], edges: Sequence[Edge]) -> list[list[int]]:
-    """Rows of the keyframes that hang together, the largest piece first.
+def agreeing(poses: Sequence[NDArray[np.float64]], submap: Sequence[int], edges: Sequence[Edge]) -> list[Edge]:
+    """The edges without closures between two submaps that no other closure of the two agrees with: nothing else speaks
+    for them, and one alone may be wrong. poses: of the keyframes, each in its submap's frame."""
+    between: dict[tuple[int, int], list[tuple[int, NDArray[np.float64]]]] = {}
+    kept = set()
+    for n, e in enumerate(edges):
+        a, b = submap[e.target], submap[e.source]
+        if a == b or not e.uncertain:
+            kept.add(n)
+            continue
+        T_a_b = poses[e.target] @ e.T_target_source @ invert(poses[e.source])
+        ends, T = ((a, b), T_a_b) if a < b else ((b, a), invert(T_a_b))
+        for other, T_other in between.setdefault(ends, []):
+            metres, degrees = apart(T_other, T)
+            if metres <= _AGREE_M and degrees <= _AGREE_DEG:
+                kept |= {n, other}
+        between[ends].append((n, T))
+    return [edge for n, edge in enumerate(edges) if n in kept]
 
-    Keyframes of one submap do. Two submaps do if closures tie them that agree with each other: one alone may be wrong.
-    """
-    ties: dict[tuple[int, int], int] = {}
-    for edge in edges:
-        ends = sorted((submap[edge.source], submap[edge.target]))
-        if ends[0] != ends[1]:
-            ties[ends[0], ends[1]] = ties.get((ends[0], ends[1]), 0) + (1 if edge.uncertain else _ENOUGH)
+
+def pieces(submap: Sequence[int], edges: Sequence[Edge]) -> list[list[int]]:
+    """Rows of the keyframes that hang together, the largest piece first: those of one submap, and of submaps that an
+    edge ties."""
     root = {name: name for name in submap}
-    for (a, b), number in ties.items():
-        if number >= _ENOUGH:
-            old, new = root[b], root[a]
-            root = {name: new if value == old else value for name, value in root.items()}
+    for edge in edges:
+        old, new = root[submap[edge.source]], root[submap[edge.target]]
+        root = {name: new if value == old else value for name, value in root.items()}
     rows: dict[int, list[int]] = {}
-    for k in range(count):
-        rows.setdefault(root[submap[k]], []).append(k)
+    for k, name in enumerate(submap):
+        rows.setdefault(root[name], []).append(k)
     return sorted(rows.values(), key=lambda piece: (-len(piece), piece[0]))
 
 

@@ -108,8 +108,9 @@ class RgbdTracker(Tracker):
         T = self.records.T_world_keyframe
         self.edges = [edge for edge in self.edges if not edge.uncertain]
         if self.options.close_loops and len(T) > 2:
-            self.edges += loops.find(self.keyframes, self.records.submap, T)
-        pieces = pose_graph.pieces(len(T), self.records.submap, self.edges)
+            found = loops.find(self.keyframes, self.records.submap, T)
+            self.edges = pose_graph.agreeing(T, self.records.submap, [*self.edges, *found])
+        pieces = pose_graph.pieces(self.records.submap, self.edges)
         for rows in pieces:
             placed = pose_graph.optimize_piece(T, self.edges, rows)
             if self.options.refine:
