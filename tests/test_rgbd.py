@@ -10,7 +10,8 @@ from scenes import wall_frame
 from freeocc3d.capture import open_capture
 from freeocc3d.errors import ConfigError
 from freeocc3d.geometry import apart, invert
-from freeocc3d.tracking import rgbd
+from freeocc3d.tracking import loops, pose_graph, rgbd
+from freeocc3d.tracking.pose_graph import Edge
 from freeocc3d.types import Frame, Trajectory
 
 
@@ -227,3 +228,26 @@ def test_optimising_twice_moves_nothing(bedroom) -> None:
 def test_options_out_of_range_are_refused() -> None:
     with pytest.raises(ConfigError, match="neighbours"):
         rgbd.Options(neighbours=0)
+
+
+def test_one_wrong_closure_does_not_bend_a_real_path(bedroom) -> None:
+    t = tracker()
+    for n, i in enumerate(range(0, 261, 6)):
+        t.track(replace(bedroom[i], index=n))
+    path, odometry = [T.copy() for T in t.records.T_world_keyframe], list(t.edges)
+    closures = loops.find(t.keyframes, t.records.submap, path)
+    assert len(closures) > 5
+    rows = range(len(path))
+    right = pose_graph.optimize_piece(path, [*odometry, *closures], rows)
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        target, source = sorted(rng.choice(len(path), 2, replace=False).tolist())
+        away = np.eye(4)
+        away[:3, 3] = rng.choice((0.15, 0.4, 1.5)) * rng.normal(size=3) / np.sqrt(3)
+        T = invert(path[target]) @ path[source] @ away
+        wrong = Edge(source, target, T, closures[0].information, uncertain=True)
+        placed = pose_graph.optimize_piece(path, [*odometry, wrong, *closures], rows)
+        off = max(apart(a, b)[0] for a, b in zip(placed, right, strict=True))
+        if np.linalg.norm(away[:3, 3]) > 0.2:
+            assert off < 1e-3
+        assert off < 0.12  # what is wrong by little may be shared out along the path

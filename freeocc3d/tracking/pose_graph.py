@@ -12,6 +12,9 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from ..geometry import apart, invert, nearest_rigid
 
+_SWEEPS = 6
+_HELD_M, _HELD_DEG = 0.1, 5.0
+
 _AGREE_M, _AGREE_DEG = 0.3, 10.0
 """How far two closures may place a submap from each other: as far as its own path may have drifted between them."""
 
@@ -99,6 +102,28 @@ def _laid_out(poses: list[NDArray[np.float64]], edges: Sequence[Edge]) -> list[N
 
 def optimize(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArray[np.float64]]:
     """Keyframe poses T_world_keyframe that agree best with the edges; the first keeps its pose.
+
+    A closure that the line process switches off may have bent the path before: what does not hold is left out, and the
+    path is optimised from its start again, until the closures that hold are those that were used.
+    """
+    used = edges
+    for _ in range(_SWEEPS):
+        placed = _optimized(poses, used)
+        holding = [edge for edge in edges if not edge.uncertain or holds(placed, edge)]
+        if len(holding) == len(used) and all(a is b for a, b in zip(holding, used, strict=True)):
+            break
+        used = holding
+    return placed
+
+
+def holds(poses: Sequence[NDArray[np.float64]], edge: Edge) -> bool:
+    """Whether poses T_world_keyframe agree with a measurement."""
+    metres, degrees = apart(invert(poses[edge.target]) @ poses[edge.source], edge.T_target_source)
+    return metres <= _HELD_M and degrees <= _HELD_DEG
+
+
+def _optimized(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArray[np.float64]]:
+    """Levenberg-Marquardt and line process, once.
 
     Source: S. Choi, Q.-Y. Zhou, V. Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015.
     """

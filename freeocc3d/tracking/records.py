@@ -10,16 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..geometry import apart, invert
 from ..types import Submap, Trajectory
-from .pose_graph import Edge
+from .pose_graph import Edge, holds
 
 STATUSES = ("unused", "lost", "tracked", "keyframe", "relocalised", "interpolated", "apart")
 
 _LONGEST_GAP = 3
 """Frames in a row that cannot be placed and are taken for a gap: between two with a pose they are interpolated."""
-
-_HELD_M, _HELD_DEG = 0.1, 5.0
 
 
 @dataclass
@@ -128,16 +125,10 @@ class Records:
                     T_submap_keyframe @ T_keyframe_cam[inside],
                     named[sorted(rows)],
                     named[[(e.source, e.target) for e in closed]] if closed else np.zeros((0, 2), np.int32),
-                    np.array([self._holds(e) for e in closed], bool),
+                    np.array([holds(self.T_world_keyframe, e) for e in closed], bool),
                 )
             )
         return found
-
-    def _holds(self, edge: Edge) -> bool:
-        """Whether the keyframes' present poses agree with a measurement."""
-        T = invert(self.T_world_keyframe[edge.target]) @ self.T_world_keyframe[edge.source]
-        metres, degrees = apart(T, edge.T_target_source)
-        return metres <= _HELD_M and degrees <= _HELD_DEG
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Plain arrays, for saving."""
