@@ -10,6 +10,7 @@ from scipy.linalg import expm
 from freeocc3d.capture import open_capture
 from freeocc3d.geometry import apart, invert, quats_to_rotations
 from freeocc3d.tracking import dense, features
+from freeocc3d.tracking.views import View, view_of
 from freeocc3d.types import Frame, Intrinsics
 
 
@@ -34,7 +35,7 @@ def relative(capture, source: int, target: int) -> np.ndarray:
     return invert(capture.pose(target)) @ capture.pose(source)
 
 
-def with_pyramid(view: dense.View) -> tuple:
+def with_pyramid(view: View) -> tuple:
     return view.points, view.normals, view.gray[0]
 
 
@@ -47,7 +48,7 @@ def test_a_plane_is_fitted_exactly_where_the_views_camera_says(width) -> None:
     v, u = np.mgrid[: camera.height, : camera.width]
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     depth = (2.0 / (1.0 + 0.4 * x - 0.3 * y)).astype(np.float32)  # the plane z + 0.4 x - 0.3 y = 2
-    view = dense.view_of(Frame(0, 0.0, np.zeros((*depth.shape, 3), np.uint8), depth, camera))
+    view = view_of(Frame(0, 0.0, np.zeros((*depth.shape, 3), np.uint8), depth, camera))
     assert view.covered > 0.95
     seen = view.points[..., 2] > 0
     np.testing.assert_allclose(view.points[seen] @ (0.4, -0.3, 1.0), 2.0, atol=1e-4)
@@ -61,12 +62,12 @@ def test_a_plane_is_fitted_exactly_where_the_views_camera_says(width) -> None:
 
 
 def test_fitting_takes_noise_away_and_keeps_edges() -> None:
-    flat = dense.view_of(wall_frame(2.0, seed=1))
+    flat = view_of(wall_frame(2.0, seed=1))
     raw = wall_frame(2.0, seed=1).depth_m
     assert flat.points[..., 2][flat.points[..., 2] > 0].std() < 0.5 * raw.std()
     depth = np.full((120, 160), 2.0, np.float32)
     depth[:, 80:] = 3.0
-    view = dense.view_of(Frame(0, 0.0, np.zeros((120, 160, 3), np.uint8), depth, CAMERA))
+    view = view_of(Frame(0, 0.0, np.zeros((120, 160, 3), np.uint8), depth, CAMERA))
     z = view.points[..., 2]
     assert set(np.unique(z.round(3)).tolist()) <= {0.0, 2.0, 3.0}
 
@@ -75,10 +76,10 @@ def test_holes_and_depth_that_is_missing_altogether() -> None:
     frame = wall_frame(2.0)
     depth = frame.depth_m.copy()
     depth[:, :80] = 0
-    half = dense.view_of(replace(frame, depth_m=depth))
+    half = view_of(replace(frame, depth_m=depth))
     assert 0.4 < half.covered < 0.55
     assert (half.points[half.points[..., 2] == 0] == 0).all()
-    assert dense.view_of(replace(frame, depth_m=np.zeros_like(depth))).covered == 0
+    assert view_of(replace(frame, depth_m=np.zeros_like(depth))).covered == 0
 
 
 # Alignment
@@ -87,7 +88,7 @@ def test_holes_and_depth_that_is_missing_altogether() -> None:
 @pytest.mark.parametrize(("source", "target"), [(1, 0), (13, 12), (31, 30), (47, 45)])
 def test_the_pose_of_a_view_in_another_is_found(room, source, target) -> None:
     true = relative(room, source, target)
-    a, b = dense.view_of(room[source]), dense.view_of(room[target])
+    a, b = view_of(room[source]), view_of(room[target])
     aligned = dense.align(a, b, small_pose() @ true)
     metres, degrees = apart(true, aligned.T_target_source)
     assert metres < 0.003
@@ -100,9 +101,9 @@ def test_the_pose_of_a_view_in_another_is_found(room, source, target) -> None:
 def test_another_exposure_moves_nothing(room) -> None:
     true = relative(room, 13, 12)
     darker = replace(room[13], color=(0.6 * room[13].color + 10).astype(np.uint8))
-    b = dense.view_of(room[12])
-    plain = dense.align(dense.view_of(room[13]), b, true)
-    dark = dense.align(dense.view_of(darker), b, true)
+    b = view_of(room[12])
+    plain = dense.align(view_of(room[13]), b, true)
+    dark = dense.align(view_of(darker), b, true)
     metres, degrees = apart(plain.T_target_source, dark.T_target_source)
     assert metres < 5e-4
     assert degrees < 0.02
@@ -114,7 +115,7 @@ def test_holes_are_not_counted_as_disagreement(room) -> None:
     depth = target.depth_m.copy()
     depth[::2] = 0
     depth[:, : depth.shape[1] // 2] = 0
-    aligned = dense.align(dense.view_of(room[13]), dense.view_of(replace(target, depth_m=depth)), true)
+    aligned = dense.align(view_of(room[13]), view_of(replace(target, depth_m=depth)), true)
     assert aligned.inliers > 0.9
     assert max(apart(true, aligned.T_target_source)) < 0.2
 
@@ -128,7 +129,7 @@ def test_a_bare_wall_tells_its_distance_and_not_a_slide_along_it() -> None:
     ]
     guess = np.eye(4)
     guess[:3, 3] = 0.03, -0.02, 0.0
-    aligned = dense.align(dense.view_of(blank[1]), dense.view_of(blank[0]), guess)
+    aligned = dense.align(view_of(blank[1]), view_of(blank[0]), guess)
     assert not aligned.determined
     assert np.isnan(aligned.correlation)
     np.testing.assert_allclose(aligned.T_target_source[:3, 3], (0.03, -0.02, -0.05), atol=0.004)
@@ -136,7 +137,7 @@ def test_a_bare_wall_tells_its_distance_and_not_a_slide_along_it() -> None:
 
 
 def test_what_is_wrong_has_few_inliers_or_looks_different(room) -> None:
-    a, b = dense.view_of(room[30]), dense.view_of(room[0])
+    a, b = view_of(room[30]), view_of(room[0])
     aligned = dense.align(a, b, np.eye(4))
     assert aligned.inliers < 0.6 or aligned.correlation < 0.8 or aligned.overlap < 0.3
 
@@ -144,7 +145,7 @@ def test_what_is_wrong_has_few_inliers_or_looks_different(room) -> None:
 def test_results_are_rigid_and_the_guess_is_left_alone(room) -> None:
     guess = small_pose() @ relative(room, 13, 12)
     kept = guess.copy()
-    T = dense.align(dense.view_of(room[13]), dense.view_of(room[12]), guess).T_target_source
+    T = dense.align(view_of(room[13]), view_of(room[12]), guess).T_target_source
     np.testing.assert_array_equal(guess, kept)
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
 
@@ -198,7 +199,7 @@ def reference(source, target, T, brightness, scales, photometric, stride):
 
 @pytest.mark.parametrize("stride", [1, 2])
 def test_normal_equations_are_those_of_a_plain_computation(room, stride) -> None:
-    a, b = dense.view_of(room[13]), dense.view_of(room[12])
+    a, b = view_of(room[13]), view_of(room[12])
     T = small_pose(0.5, 0.01) @ relative(room, 13, 12)
     brightness, scales = np.array((0.9, 0.05)), np.array((2.0, 4.0))
     H, g, counts = reference(a, b, T, brightness, scales, 0.2, stride)
@@ -267,7 +268,7 @@ def test_reprojection_is_the_derivative_of_its_error() -> None:
 
 def test_features_find_a_pose_that_is_far_away(room) -> None:
     a, b = room[17], room[12]
-    view_a, view_b = dense.view_of(a), dense.view_of(b)
+    view_a, view_b = view_of(a), view_of(b)
     fa, fb = features.detect(a), features.detect(b)
     rows = features.match(fa, fb)
     points = features.lift(fa.rays(a.intrinsics), view_a)[rows[:, 0]]

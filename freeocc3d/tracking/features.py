@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..types import Frame, Intrinsics
-from .dense import View
+from .views import View
 
 COUNT = 800
 _MIN_INLIERS = 12

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..types import Frame, Intrinsics
 from . import dense, features
 from .overlap import DepthView
+from .views import View, view_of
 
 _OVERLAP_STEP = 5
 
@@ -19,7 +20,7 @@ class KeyframeView:
     """view: for dense alignment.  overlap: its surface, sparsely.  features: ORB.  rays: (N, 2) of the features.
     points: (N, 3) where they meet the surface, z = 0 where there is none.  camera: of the colour image."""
 
-    view: dense.View
+    view: View
     overlap: DepthView
     features: features.Features
     rays: NDArray[np.float32]
@@ -27,15 +28,15 @@ class KeyframeView:
     camera: Intrinsics
 
 
-def surface_of(view: dense.View) -> DepthView:
+def surface_of(view: View) -> DepthView:
     """A sparse sample of a view's surface, to measure overlap with."""
     sample = view.points[_OVERLAP_STEP // 2 :: _OVERLAP_STEP, _OVERLAP_STEP // 2 :: _OVERLAP_STEP].reshape(-1, 3)
     return DepthView(view.points[..., 2], view.intrinsics, sample[sample[:, 2] > 0])
 
 
-def keyframe_view(frame: Frame, view: dense.View | None = None) -> KeyframeView:
+def keyframe_view(frame: Frame, view: View | None = None) -> KeyframeView:
     """Prepare a frame; ``view`` if it is there already."""
-    view = view or dense.view_of(frame)
+    view = view or view_of(frame)
     found = features.detect(frame)
     rays = found.rays(frame.intrinsics)
     return KeyframeView(view, surface_of(view), found, rays, features.lift(rays, view), frame.intrinsics)

@@ -18,6 +18,7 @@ from .keyframe_view import KeyframeView, Registered, keyframe_view, register_by_
 from .overlap import DepthView, mutual_overlap
 from .pose_graph import Edge
 from .records import Records
+from .views import View, view_of
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 
@@ -60,7 +61,7 @@ class _Seen:
     """A frame as the tracker needs it; its features are detected when they are asked for."""
 
     frame: Frame
-    view: dense.View
+    view: View
     surface: DepthView
     _full: list[KeyframeView] = field(default_factory=list)
 
@@ -91,7 +92,7 @@ class RgbdTracker(Tracker):
         self._last: _Seen | None = None  # not kept over an interruption: keyframes are enough to go on
 
     def track(self, frame: Frame) -> Tracked:
-        view = dense.view_of(frame)
+        view = view_of(frame)
         if view.covered < _LEAST_COVERED:
             return self._lose(frame.index)
         seen = _Seen(frame, view, surface_of(view))
