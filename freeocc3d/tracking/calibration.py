@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture.base import Capture
-from ..errors import FrameError
 from ..geometry import apart
 from . import dense, features
-from .keyframe_view import KeyframeView, keyframe_view, matched
+from .keyframe_view import KeyframeView, decoded_view, matched
 
 PAIRS = 36
 """Pairs of frames that are looked at."""
@@ -62,9 +61,9 @@ def _pairs(capture: Capture, frames: range) -> list[_Pair]:
 
 def _pair(capture: Capture, frames: range) -> _Pair | None:
     """The first frame with the farthest of a few further on that still shows most of the same."""
-    target = _view(capture, frames[0])
+    target = decoded_view(capture, frames[0])
     for gap in _GAPS:
-        source = _view(capture, frames[gap]) if target is not None and gap < len(frames) else None
+        source = decoded_view(capture, frames[gap]) if target is not None and gap < len(frames) else None
         if target is None or source is None:
             continue
         found = matched(source, target)
@@ -76,13 +75,6 @@ def _pair(capture: Capture, frames: range) -> _Pair | None:
         if aligned.determined and aligned.overlap > 0.6 and aligned.inliers > 0.75 and moved > 0.02:
             return source, target, aligned.T_target_source, features.match(source.features, target.features)
     return None
-
-
-def _view(capture: Capture, index: int) -> KeyframeView | None:
-    try:
-        return keyframe_view(capture[index])
-    except FrameError:
-        return None
 
 
 def _error(pairs: list[_Pair], ratio: float) -> float:

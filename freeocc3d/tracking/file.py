@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from ..capture import read_trajectory
 from ..capture.base import Capture
-from ..errors import CaptureError, ConfigError, FrameError, TrackingError
+from ..errors import CaptureError, ConfigError, TrackingError
 from ..geometry import invert, project, transform
 from ..registry import require_positive
 from ..types import Frame
 from . import features
 from .given import GivenTracker
-from .keyframe_view import KeyframeView, keyframe_view
+from .keyframe_view import decoded_view
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 
@@ -157,9 +157,9 @@ def depth_scale(T_world_cam: NDArray[np.float64], capture: Capture) -> float | N
 
 
 def _pair_scale(T_world_cam: NDArray[np.float64], capture: Capture, frames: NDArray[np.int64]) -> float | None:
-    target = _view(capture, int(frames[0]))
+    target = decoded_view(capture, int(frames[0]))
     for gap in (12, 6, 3, 1):
-        source = _view(capture, int(frames[gap])) if target is not None and gap < len(frames) else None
+        source = decoded_view(capture, int(frames[gap])) if target is not None and gap < len(frames) else None
         if target is None or source is None:
             continue
         rows = features.match(source.features, target.features)
@@ -177,10 +177,3 @@ def _pair_scale(T_world_cam: NDArray[np.float64], capture: Capture, frames: NDAr
         if scale > 0 and far and agrees.mean() > 0.5:
             return scale
     return None
-
-
-def _view(capture: Capture, index: int) -> KeyframeView | None:
-    try:
-        return keyframe_view(capture[index])
-    except FrameError:
-        return None

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..capture.base import Capture
+from ..errors import FrameError
 from ..types import Frame, Intrinsics
 from . import dense, features
 from .overlap import DepthView
@@ -40,6 +42,14 @@ def keyframe_view(frame: Frame, view: View | None = None) -> KeyframeView:
     found = features.detect(frame)
     rays = found.rays(frame.intrinsics)
     return KeyframeView(view, surface_of(view), found, rays, features.lift(rays, view), frame.intrinsics)
+
+
+def decoded_view(capture: Capture, index: int) -> KeyframeView | None:
+    """A frame of a capture, prepared; None if it cannot be read."""
+    try:
+        return keyframe_view(capture[index])
+    except FrameError:
+        return None
 
 
 @dataclass(frozen=True)
