@@ -39,6 +39,7 @@ class _Pair:
     matched: Matched
     brightness: NDArray[np.float64] = field(default_factory=lambda: np.array((1.0, 0.0)))
     scales: NDArray[np.float64] = field(default_factory=lambda: np.array((3.0, 5.0)))
+    photometric: float = dense.PHOTOMETRIC
 
 
 def refine(
@@ -113,11 +114,16 @@ def _terms(
     H8, g8, stats = np.zeros((8, 8)), np.zeros(8), np.zeros(dense.STATS)
     dense.linearise(
         a.points, a.normals, a.gray[0], b.points, b.normals, b.gray[0], b.camera, T_ts, _STRIDE, pair.brightness,
-        pair.scales, dense.PHOTOMETRIC, H8, g8, stats,
+        pair.scales, pair.photometric, H8, g8, stats,
     )  # fmt: skip
     few = stats[1] * _STRIDE**2 < 0.05 * a.points[..., 0].size
-    if few or dense.inliers(stats) < _LEAST_SHARE or dense.correlation(stats) < _LEAST_CORRELATION:
+    correlation = dense.correlation(stats)
+    if few or dense.inliers(stats) < _LEAST_SHARE or correlation < _LEAST_CORRELATION:
         return None
+    # Intensities that agree less well (colour that lies beside its depth, reflections) say less of the pose.
+    if not np.isnan(correlation):  # flat ones say nothing, at any weight
+        agreement = (correlation - _LEAST_CORRELATION) / (1 - _LEAST_CORRELATION)
+        pair.photometric = dense.PHOTOMETRIC * agreement**4
     pair.brightness += np.linalg.solve(H8[6:, 6:] + 1e-9 * np.eye(2), -g8[6:])
     H, g, _ = dense.constrained(*dense.marginal(H8, g8))
     features.reprojection(pair.matched.points_s, pair.matched.rays_t, T_ts, target.camera.fx, H, g)
