@@ -9,6 +9,7 @@ from scenes import random_gaussians, write_standard_ply
 from freeocc3d.errors import FreeOccError
 from freeocc3d.gaussians.cloud import write_ply
 from freeocc3d.gaussians.standard_ply import read_standard_ply
+from freeocc3d.gaussians.standard_ply import write_standard_ply as write_ours
 
 
 @pytest.mark.parametrize("spheres", [False, True])
@@ -61,3 +62,23 @@ def test_files_that_hold_no_gaussians_are_refused(tmp_path: Path) -> None:
     (tmp_path / "many.ply").write_bytes(whole.replace(b"vertex 500", b"vertex 999999999999"))
     with pytest.raises(FreeOccError, match="damaged"):
         read_standard_ply(tmp_path / "many.ply")
+
+
+def test_what_is_written_is_the_standard_and_reads_back(tmp_path: Path) -> None:
+    written = random_gaussians(200, seed=3)
+    written.colors[:3] = (255, 0, 0), (0, 255, 0), (12, 34, 56)
+    written.opacities[:2] = 0, 1
+    write_ours(written, tmp_path / "p.ply")
+    header = (tmp_path / "p.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    assert header[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 200"]
+    names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    assert header[3:] == [f"property float {name}" for name in names.split()]
+    values = np.fromfile(tmp_path / "p.ply", "<f4", offset=(tmp_path / "p.ply").stat().st_size - 200 * 17 * 4)
+    assert np.isfinite(values).all()
+    np.testing.assert_allclose(0.5 + 0.28209479177387814 * values.reshape(200, 17)[0, 6:9], (1, 0, 0), atol=1e-6)
+    read, _ = read_standard_ply(tmp_path / "p.ply")
+    np.testing.assert_array_equal(read.means, written.means)
+    np.testing.assert_allclose(read.scales, written.scales, rtol=1e-5)
+    np.testing.assert_allclose(read.quats_wxyz, written.quats_wxyz, atol=1e-6)
+    np.testing.assert_allclose(read.opacities, written.opacities, atol=1e-5)
+    np.testing.assert_array_equal(read.colors, written.colors)

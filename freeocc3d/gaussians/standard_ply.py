@@ -1,4 +1,4 @@
-"""Reads the PLY files of other 3D Gaussian splatting systems (SplaTAM, MonoGS, Photo-SLAM, the reference code, …).
+"""Reads and writes the PLY files of 3D Gaussian splatting (SplaTAM, MonoGS, Photo-SLAM, viewers, …).
 
 Format: B. Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023: ``x y z``, ``f_dc_0..2`` with rgb = 0.5 + f_dc / (2
 sqrt(pi)), ``opacity`` as a logit, ``scale_*`` as natural logarithms (one where the Gaussians are spheres), ``rot_0..3``
@@ -18,6 +18,7 @@ from ..errors import FreeOccError
 from ..types import Gaussians
 
 _SH_C0 = 0.5 / math.sqrt(math.pi)
+_LEAST_OPACITY = 1e-6  # whose logit, and that of one minus it, are finite
 _NEEDED = ("x", "y", "z", "opacity", "scale_0", "rot_0", "rot_1", "rot_2", "rot_3")
 _LONGEST_HEADER = 1 << 16
 _TYPES = {
@@ -57,6 +58,29 @@ def read_standard_ply(path: Path) -> tuple[Gaussians, NDArray[np.int64] | None]:
     for values in (gaussians.means, gaussians.scales, gaussians.quats_wxyz):
         finite &= np.isfinite(values).all(axis=1)
     return gaussians[finite], rows["label"][finite].astype(np.int64) if "label" in names else None
+
+
+def write_standard_ply(gaussians: Gaussians, path: Path) -> None:
+    """Write N Gaussians in the frame that they are in, without spherical harmonics beyond the first. Raises OSError."""
+    names = [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+    opacities = np.clip(gaussians.opacities.astype(np.float64), _LEAST_OPACITY, 1 - _LEAST_OPACITY)
+    columns = (
+        gaussians.means,
+        np.zeros((len(gaussians), 3)),
+        (gaussians.colors / 255.0 - 0.5) / _SH_C0,
+        np.log(opacities / (1 - opacities))[:, None],
+        np.log(gaussians.scales.astype(np.float64)),
+        gaussians.quats_wxyz,
+    )
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    header += [*(f"property float {name}" for name in names), "end_header"]
+    with path.open("wb") as stream:
+        stream.write(("\n".join(header) + "\n").encode("ascii"))
+        stream.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
 
 
 def _columns(rows: NDArray[np.void], names: list[str]) -> NDArray[np.float64]:
