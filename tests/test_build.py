@@ -17,7 +17,7 @@ def build_wall(distance: float, repeats: int = 2, **splatting):
     cells = anchors.AnchoredCells(anchors.Options(), 0.5 * V)
     for frame, T in zip(frames, poses, strict=True):
         cells.add(frame, T)
-    g = cells.gaussians()
+    g = cells.gaussians(frames)
     features = np.zeros((len(g), 3), np.float16)
     features[np.arange(len(g)), (g.means[:, 0] > 0).astype(int)] = 1  # left half, right half
     return build.build_occupancy(g, features, frames, poses, splat.Options(**splatting), carve.Options()), g

@@ -1,0 +1,72 @@
+"""The contract of a rasterizer, and the constants of alpha compositing that all of them share.
+
+A rasterizer is one file of this folder with ``load() -> Rasterizer``, or ``load(options)`` if it has ``Options``. It
+renders N Gaussians (paper, Eq. render) as
+
+    Sigma_2 = J R Sigma R^T J^T + BLUR I,   J the derivative of the projection at the mean
+    alpha_k(u) = min(ALPHA_MAX, o_k exp(-1/2 (u - u_k)^T Sigma_2^-1 (u - u_k))), nothing below ALPHA_MIN
+    w_k = alpha_k prod_{j<k} (1 - alpha_j), nearest mean first, until the product falls to TRANSMITTANCE_MIN
+    image = sum_k w_k c_k,   depth = sum_k w_k z_k,   alpha = sum_k w_k              (paper, Eq. ray_comp)
+
+with z_k the mean's camera-frame z. Depth is not divided by alpha.
+
+Source: B. Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023; constants as in gsplat, so that all agree.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from ...types import Intrinsics
+
+BLUR = 0.3
+"""Variance in pixels^2 that every splat is widened by: none is smaller than a pixel."""
+ALPHA_MIN, ALPHA_MAX = 1.0 / 255.0, 0.999
+TRANSMITTANCE_MIN = 1e-4
+NEAR = 0.01
+"""Metres; Gaussians whose mean is nearer are not drawn."""
+BEYOND = 0.15
+"""Share of the image's width and height, on either side, within which J is taken at the mean; beyond it at the border
+of that, where the linear projection still holds."""
+
+
+class Rendered(NamedTuple):
+    """image (H, W, 3) with the background black, depth (H, W) metres times alpha, alpha (H, W); float32."""
+
+    image: Tensor
+    depth: Tensor
+    alpha: Tensor
+
+
+class Rasterizer(Protocol):
+    """Renders on ``device``, differentiably in all five arrays of the Gaussians."""
+
+    device: torch.device
+
+    def render(
+        self,
+        means: Tensor,
+        scales: Tensor,
+        quats_wxyz: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        T_cam_world: Tensor,
+        camera: Intrinsics,
+    ) -> Rendered:
+        """means (N, 3) world metres, scales (N, 3) metres, quats_wxyz (N, 4) of any length but 0, opacities (N,) and
+        colors (N, 3) in 0…1, T_cam_world (4, 4); all float32 on ``device``."""
+        ...
+
+
+def slope_limits(camera: Intrinsics) -> tuple[float, float, float, float]:
+    """Least and greatest x/z, then y/z, at which J is taken (``BEYOND``)."""
+    beside, above = BEYOND * camera.width / camera.fx, BEYOND * camera.height / camera.fy
+    return (
+        -(camera.cx + 0.5) / camera.fx - beside,
+        (camera.width - camera.cx - 0.5) / camera.fx + beside,
+        -(camera.cy + 0.5) / camera.fy - above,
+        (camera.height - camera.cy - 0.5) / camera.fy + above,
+    )

@@ -1,0 +1,71 @@
+"""gsplat's CUDA kernels; needs an NVIDIA GPU and ``pip install freeocc3d[gsplat]``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...errors import DependencyError
+from ...types import Intrinsics
+from .base import BLUR, NEAR, Rendered
+
+REQUIRES = ("gsplat",)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Where it runs."""
+
+    device: str = "cuda:0"
+    """A CUDA device of torch's."""
+
+
+class Gsplat:
+    """Source: V. Ye et al., gsplat: An Open-Source Library for Gaussian Splatting, JMLR 2025."""
+
+    def __init__(self, device: str):
+        self.device = torch.device(device)
+
+    def render(
+        self,
+        means: Tensor,
+        scales: Tensor,
+        quats_wxyz: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        T_cam_world: Tensor,
+        camera: Intrinsics,
+    ) -> Rendered:
+        """See ``base.Rasterizer``."""
+        from gsplat import rasterization
+
+        # Pixel centres are at halves there, at integers here.
+        K = torch.tensor(
+            ((camera.fx, 0.0, camera.cx + 0.5), (0.0, camera.fy, camera.cy + 0.5), (0.0, 0.0, 1.0)), device=self.device
+        )
+        out, alpha, _ = rasterization(
+            means=means,
+            quats=quats_wxyz,
+            scales=scales,
+            opacities=opacities,
+            colors=colors,
+            viewmats=T_cam_world[None],
+            Ks=K[None],
+            width=camera.width,
+            height=camera.height,
+            near_plane=NEAR,
+            eps2d=BLUR,
+            render_mode="RGB+D",
+        )
+        return Rendered(out[0, ..., :3], out[0, ..., 3], alpha[0, ..., 0])
+
+
+def load(options: Options) -> Gsplat:
+    """The rasterizer on a CUDA device. Raises DependencyError where there is none."""
+    if not torch.cuda.is_available():
+        raise DependencyError(
+            "The rasterizer 'gsplat' needs an NVIDIA GPU and a torch built for CUDA: use fitting.rasterizer=cpu."
+        )
+    return Gsplat(options.device)

@@ -1,0 +1,73 @@
+"""Denoising: the kernel against plain NumPy, noise that averages out, and points that are no surface."""
+
+import numpy as np
+from scenes import CAMERA, wall_frame
+
+from freeocc3d.gaussians import anchors, fusion
+from freeocc3d.geometry import quats_to_rotations
+from freeocc3d.types import Frame
+
+
+def views(count: int, seed: int = 0) -> tuple[list[Frame], np.ndarray]:
+    """Depth images of nothing in particular, with holes, from random poses."""
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    quats = rng.normal(size=(count, 4)) * (0, 0.1, 0.1, 0.1) + (1, 0, 0, 0)
+    poses[:, :3, :3] = quats_to_rotations(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    poses[:, :3, 3] = rng.uniform(-0.2, 0.2, (count, 3))
+    shape = CAMERA.height, CAMERA.width
+    frames = []
+    for n in range(count):
+        depth = rng.uniform(1.8, 2.2, shape).astype(np.float32)
+        depth[rng.uniform(size=shape) < 0.2] = 0
+        frames.append(Frame(n, float(n), np.zeros((*shape, 3), np.uint8), depth, CAMERA))
+    return frames, poses
+
+
+def test_the_kernel_agrees_with_plain_numpy() -> None:
+    frames, poses = views(5)
+    points = np.random.default_rng(1).uniform((-1, -1, 1.5), (1, 1, 2.5), (4000, 3))
+    found = fusion.denoised(points, ((frame, frame.depth_m) for frame in frames), poses)
+    parts = [fusion.look_reference(points, frame, frame.depth_m, T) for frame, T in zip(frames, poses, strict=True)]
+    offset, weight, through = (sum(part[i].astype(float) for part in parts) for i in range(3))
+    shown = sum((part[1] > 0).astype(int) for part in parts)
+    assert 1000 < np.count_nonzero(weight) < 3500
+    np.testing.assert_allclose(found.weights, weight, rtol=1e-5)
+    expected = points + offset / np.where(weight > 0, weight, 1)[:, None]
+    np.testing.assert_allclose(found.points, expected, atol=1e-6)
+    np.testing.assert_array_equal(found.kept, through <= np.maximum(shown, 1))
+    best = np.argmax([part[1] for part in parts], axis=0)
+    np.testing.assert_array_equal(found.keyframe, np.where(weight > 0, best, -1))
+
+
+def test_a_noisy_wall_ends_one_layer_thick() -> None:
+    frames = [wall_frame(2.02, n, seed=n) for n in range(12)]
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    thickness, count = {}, {}
+    for denoise in (False, True):
+        cells = anchors.AnchoredCells(anchors.Options(denoise=denoise), 0.01)
+        for frame, T in zip(frames, poses, strict=True):
+            cells.add(frame, T)
+        g = cells.gaussians(frames)
+        thickness[denoise], count[denoise] = np.std(g.means[:, 2]), len(g)
+    assert thickness[True] < 0.4 * thickness[False]
+    assert count[True] < 0.7 * count[False]
+
+
+def test_what_most_images_see_through_is_left_out_and_what_none_shows_stays() -> None:
+    frames = [wall_frame(2.0, n) for n in range(3)]
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    floating, on_the_wall, behind_the_camera, behind_the_wall = (0, 0, 1.0), (0, 0, 2.005), (0, 0, -1.0), (0, 0, 2.5)
+    points = np.array([floating, on_the_wall, behind_the_camera, behind_the_wall])
+    found = fusion.denoised(points, ((frame, frame.depth_m) for frame in frames), poses)
+    np.testing.assert_array_equal(found.kept, [False, True, True, True])
+    np.testing.assert_array_equal(found.weights > 0, [False, True, False, False])
+    np.testing.assert_allclose(found.points[1], (0, 0, 2.0), atol=1e-6)
+    np.testing.assert_array_equal(found.points[2:], points[2:])
+
+
+def test_nothing_to_look_at_changes_nothing() -> None:
+    points = np.array([(0.0, 0.0, 2.0)])
+    found = fusion.denoised(points, iter(()), np.zeros((0, 4, 4)))
+    np.testing.assert_array_equal(found.points, points)
+    assert found.keyframe[0] == -1
