@@ -25,6 +25,9 @@ app = typer.Typer(
 
 MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="Map folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+_DEVICES = ("tracking", "backend"), ("fitting", "rasterizer")
+"""What may have an option ``device``."""
+
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set one option; repeatable.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what exists.")]
 
@@ -101,12 +104,14 @@ def reconstruct(
 
     settings = config.load(config_file, overrides or [])
     if device is not None:
-        backend = settings["tracking"]["backend"]
-        if "device" in settings["tracking"].get(backend, {}):
-            settings["tracking"][backend]["device"] = device
-        elif device != "cpu":
+        chosen = [(section, settings[section][key]) for section, key in _DEVICES]
+        movable = [settings[section][name] for section, name in chosen if "device" in settings[section].get(name, {})]
+        for options in movable:
+            options["device"] = device
+        if device != "cpu" and not movable:
             raise ConfigError(
-                f"The tracker '{backend}' runs on the CPU only: --device {device} needs tracking.backend=odometry."
+                f"Nothing that is chosen runs on {device}: it needs fitting.rasterizer=gsplat, or "
+                "tracking.backend=odometry."
             )
     progress = ConsoleProgress()
     try:

@@ -23,6 +23,7 @@ SECTIONS: dict[str, tuple[str, str | None]] = {
     "capture": ("capture.base", "capture"),
     "tracking": ("tracking.base", "tracking"),
     "gaussians": ("gaussians.anchors", None),
+    "fitting": ("gaussians.fit", "gaussians.rasterizers"),
     "language": ("language.lift", "language.encoders"),
     "occupancy": ("occupancy.splat", None),
     "carving": ("occupancy.carve", None),

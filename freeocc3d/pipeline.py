@@ -23,7 +23,8 @@ from .capture import base as capture_base
 from .capture.reregistered import Reregistered
 from .config import Config
 from .errors import CaptureError, FrameError, Interrupted, MapError, TrackingError
-from .gaussians import anchors
+from .gaussians import anchors, fit, images
+from .gaussians.rasterizers.base import Rasterizer
 from .gaussians.upright import estimate_up
 from .keyframes import Keyframes
 from .language import lift
@@ -35,11 +36,13 @@ from .store import Map, load_map
 from .tracking import calibration
 from .tracking.base import Tracked, Tracker
 from .types import Frame, Gaussians, Occupancy, Submap, Trajectory
-from .viewer import paths
+from .viewer import paths, renders
 from .work import WorkFolder
 
 _CHECKPOINT_FRAMES = 50
 _FEW_TRACKED = 0.5
+_MEASURED_VIEWS = 24
+"""Keyframes, at most, that are rendered to say how well the Gaussians show what was captured."""
 
 
 class Mapper:
@@ -50,6 +53,8 @@ class Mapper:
         self.capture = capture
         self.keyframes = Keyframes(folder / store.KEYFRAMES)
         self.tracker: Tracker = _load_backend(settings, "tracking", "backend", capture)
+        self.rasterizer: Rasterizer = _load_backend(settings, "fitting", "rasterizer")
+        self._fitted: tuple[Gaussians, Trajectory] | None = None
 
     def add(self, frame: Frame) -> Tracked:
         """Track the next frame, and keep it if it is a keyframe."""
@@ -72,17 +77,70 @@ class Mapper:
         return self.keyframes.only(trajectory.keyframes)
 
     def build_gaussians(self, progress: Progress | None = None) -> Gaussians:
-        """Layer 2 from the mapped keyframes so far at their present poses."""
+        """Layer 2 from the mapped keyframes so far at their present poses: anchored, and fitted to all of them."""
+        return self.fit_gaussians(self.anchor_gaussians(progress), progress)
+
+    def anchor_gaussians(self, progress: Progress | None = None) -> Gaussians:
+        """Layer 2 as it is initialised: Gaussians anchored at the surface that the mapped keyframes so far show."""
         progress = progress or Progress()
         trajectory = self.trajectory()
         keyframes = self.mapped(trajectory)
-        options = _options(anchors, self.settings["gaussians"])
-        cells = anchors.AnchoredCells(options, options.cell_size or 0.5 * self.settings["occupancy"]["voxel_size"])
+        cells = anchors.AnchoredCells(_options(anchors, self.settings["gaussians"]), self.cell_size)
         progress.stage("gaussians", len(keyframes))
         for done, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True), 1):
             cells.add(frame, T)
             progress.advance(done)
-        return cells.gaussians()
+        return cells.gaussians(keyframes)
+
+    def fit_gaussians(self, gaussians: Gaussians, progress: Progress | None = None) -> Gaussians:
+        """Layer 2 fitted to the images of all mapped keyframes so far."""
+        progress = progress or Progress()
+        trajectory, passes = self.trajectory(), self.fit_options.passes
+        progress.stage("fitting", passes * len(trajectory.keyframes))
+        return self._fit(gaussians, trajectory, passes, progress)
+
+    def update_gaussians(self) -> Gaussians:
+        """Layer 2 kept current while frames come in: what was fitted before is carried over to the keyframes' present
+        poses, new surface is added, and all is fitted to the last ``fitting.window`` keyframes."""
+        trajectory, options = self.trajectory(), self.fit_options
+        gaussians = self.anchor_gaussians()
+        if self._fitted is not None:
+            before, then = self._fitted
+            count = len(then.keyframes)
+            if np.array_equal(trajectory.keyframes[:count], then.keyframes):  # else submaps were merged: start anew
+                moved = anchors.reanchored(before, then.T_world_keyframe, trajectory.T_world_keyframe[:count])
+                gaussians = fit.carried_over(gaussians, moved, self.cell_size)
+        window = trajectory.only_keyframes(trajectory.keyframes[-options.window :])
+        gaussians = self._fit(gaussians, window, options.window_passes, Progress())
+        self._fitted = gaussians, trajectory
+        return gaussians
+
+    @property
+    def cell_size(self) -> float:
+        """Edge in metres of the cells that hold one Gaussian each."""
+        return float(self.settings["gaussians"]["cell_size"] or 0.5 * self.settings["occupancy"]["voxel_size"])
+
+    @property
+    def fit_options(self) -> fit.Options:
+        """The configuration's."""
+        options: fit.Options = _options(fit, config.options(self.settings, "fitting"))
+        return options
+
+    def views(self, trajectory: Trajectory) -> list[images.View]:
+        """The keyframes as they are rendered and compared."""
+        device, width = self.rasterizer.device, self.fit_options.width
+        posed = zip(self.mapped(trajectory), trajectory.T_world_keyframe, strict=True)
+        return [images.view_of(frame, T, width, device) for frame, T in posed]
+
+    def _fit(self, gaussians: Gaussians, trajectory: Trajectory, passes: int, progress: Progress) -> Gaussians:
+        """Fitted to the trajectory's keyframes, ``passes`` times each."""
+        options = self.fit_options
+        if passes == 0 or not len(gaussians):
+            return gaussians
+        made = fit.fitted(gaussians, self.views(trajectory), self.rasterizer, options, passes, progress.advance)
+        if options.means == "free":
+            made = anchors.anchored_where_they_are(made, self.trajectory().T_world_keyframe)
+        return made
 
     def build_features(
         self, gaussians: Gaussians, encoder: Encoder, progress: Progress | None = None
@@ -183,8 +241,7 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
         progress.stage("refinement")
         mapper.refine()
     trajectory = _with_broken(mapper.trajectory(), work.broken)
-    with work.timed("gaussians"):
-        gaussians = work.gaussians(lambda: mapper.build_gaussians(progress))
+    gaussians = work.gaussians(lambda: _layer_2(mapper, work, progress))
     if len(gaussians) == 0:
         raise TrackingError(
             f"The {len(mapper.keyframes)} keyframes of {capture.path} hold too little depth for a map: is its depth in "
@@ -204,6 +261,13 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
     _save(work, mapper, trajectory, gaussians, features, occupancy, encoder)
     work.finish(output)
     return load_map(output)
+
+
+def _layer_2(mapper: Mapper, work: WorkFolder, progress: Progress) -> Gaussians:
+    with work.timed("gaussians"):
+        anchored = mapper.anchor_gaussians(progress)
+    with work.timed("fitting"):
+        return mapper.fit_gaussians(anchored, progress)
 
 
 def _track(mapper: Mapper, work: WorkFolder, progress: Progress) -> None:
@@ -340,11 +404,16 @@ def _save(
         store.write_tum(folder / store.TRAJECTORY, trajectory)
         (folder / store.CONFIG).write_text(config.dump(mapper.settings), encoding="utf-8")
         paths.path_picture(folder / store.PATH_PICTURE, submaps, trajectory, gaussians, capture.path)
+        views = list(zip(trajectory.keyframes.tolist(), mapper.views(trajectory), strict=True))
+        shown = [views[row] for row in _evenly(len(views), renders.SHOWN)]
+        renders.render_picture(folder / store.RENDER_PICTURE, gaussians, shown, mapper.rasterizer, capture.path)
+        measured = [views[row][1] for row in _evenly(len(views), _MEASURED_VIEWS)]
+        fidelity = images.fidelity(gaussians, measured, mapper.rasterizer)
         if len(keyframes) < len(mapper.keyframes):
             work.forget_tracking()  # it counts those that are left out from here on
         keyframes.save_index()
         keyframes.drop_unlisted()
-    report = _report(work, capture, trajectory, gaussians, submaps)
+    report = {**_report(work, capture, trajectory, submaps), "rendering": dataclasses.asdict(fidelity)}
     (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
     store.write_manifest(folder, _manifest(mapper, trajectory, gaussians, occupancy, encoder, submaps))
 
@@ -380,9 +449,7 @@ def _manifest(
     }
 
 
-def _report(
-    work: WorkFolder, capture: Capture, trajectory: Trajectory, gaussians: Gaussians, submaps: list[Submap]
-) -> dict[str, Any]:
+def _report(work: WorkFolder, capture: Capture, trajectory: Trajectory, submaps: list[Submap]) -> dict[str, Any]:
     status, count = np.unique(trajectory.status, return_counts=True)
     peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
@@ -414,23 +481,24 @@ def _report(
     }
 
 
-def _load_backend(settings: Config, section: str, key: str, capture: Capture) -> Any:
-    """The backend that ``settings[section][key]`` names, made with its own options."""
+def _load_backend(settings: Config, section: str, key: str, *arguments: Any) -> Any:
+    """The backend that ``settings[section][key]`` names, made with its own options and what else its kind takes."""
     name = settings[section][key]
     folder = config.SECTIONS[section][1]
     assert folder is not None
     module = registry.load(folder, name)
     if not hasattr(module, "Options"):
-        return module.load(capture)
-    return module.load(registry.build_options(module, settings[section].get(name, {})), capture)
+        return module.load(*arguments)
+    return module.load(registry.build_options(module, settings[section].get(name, {})), *arguments)
 
 
 def check(settings: Config) -> None:
     """Build the options of every layer and of the chosen backends, so that a value out of range is told before any
     work. Raises ConfigError, or DependencyError for a backend whose packages are not installed."""
-    for section, module in (("gaussians", anchors), ("language", lift), ("occupancy", splat), ("carving", carve)):
+    layers = {"gaussians": anchors, "fitting": fit, "language": lift, "occupancy": splat, "carving": carve}
+    for section, module in layers.items():
         _options(module, config.options(settings, section))
-    for section, key in (("tracking", "backend"), ("language", "encoder")):
+    for section, key in (("tracking", "backend"), ("fitting", "rasterizer"), ("language", "encoder")):
         name = settings[section][key]
         backend = registry.load(str(config.SECTIONS[section][1]), name)
         if hasattr(backend, "Options"):
@@ -439,6 +507,11 @@ def check(settings: Config) -> None:
 
 def _options(module: Any, values: dict[str, Any]) -> Any:
     return registry.build_options(module, values)
+
+
+def _evenly(count: int, wanted: int) -> list[int]:
+    """At most ``wanted`` of ``count`` rows, evenly spread, none at the very ends if there are enough."""
+    return [int((n + 0.5) * count / min(wanted, count)) for n in range(min(wanted, count))]
 
 
 def _absolute(path: Path) -> str:

@@ -28,6 +28,7 @@ PACKAGE = Path(__file__).parent
 FOLDERS = {
     "capture": "capture reader",
     "tracking": "tracker",
+    "gaussians.rasterizers": "rasterizer",
     "language.encoders": "encoder",
     "export": "exporter",
 }

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 FORMAT_VERSION = 1
 MANIFEST, CONFIG, REPORT, TRAJECTORY = "map.yaml", "config.yaml", "report.json", "trajectory.txt"
-PATH_PICTURE = "trajectory.png"
+PATH_PICTURE, RENDER_PICTURE = "trajectory.png", "gaussians.png"
 GAUSSIANS, OCCUPANCY, FEATURES, KEYFRAMES = "gaussians.ply", "occupancy.npz", "features.npz", "keyframes"
 
 _LARGEST_ARRAY = 8 << 30
@@ -217,7 +217,7 @@ def load_map(path: str | Path) -> Map:
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Write map.yaml with the sizes of the map's files beside it. Raises OSError."""
-    parts = (CONFIG, REPORT, TRAJECTORY, PATH_PICTURE, GAUSSIANS, OCCUPANCY, FEATURES)
+    parts = (CONFIG, REPORT, TRAJECTORY, PATH_PICTURE, RENDER_PICTURE, GAUSSIANS, OCCUPANCY, FEATURES)
     paths = [*(folder / name for name in parts), *sorted((folder / KEYFRAMES).iterdir())]
     files = {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
     content = {"format_version": FORMAT_VERSION, **manifest, "files": files}

@@ -93,6 +93,10 @@ class Trajectory:
         """(K, 4, 4) poses of the keyframes."""
         return self.T_world_cam[self.keyframes]
 
+    def only_keyframes(self, keyframes: NDArray[np.int32]) -> Trajectory:
+        """The same poses with some of the keyframes."""
+        return replace(self, keyframes=keyframes)
+
 
 @dataclass(frozen=True)
 class Submap:

@@ -22,15 +22,16 @@ from .types import Gaussians
 
 STAGES = {
     "tracking": ("capture", "tracking"),
-    "gaussians": ("capture", "tracking", "gaussians", "occupancy"),
-    "language": ("capture", "tracking", "gaussians", "occupancy", "language"),
+    "gaussians": ("capture", "tracking", "gaussians", "fitting", "occupancy"),
+    "language": ("capture", "tracking", "gaussians", "fitting", "occupancy", "language"),
 }
 """Stages whose results are saved, and the configuration sections that they depend on."""
 
 _TRACKING, _STAGE_FEATURES, _MARKS = "tracking.npz", "features.stage.npz", "stages.json"
 _OWN_FILES = {
     _TRACKING, "tracking.tmp.npz", _STAGE_FEATURES, _MARKS, f"{_MARKS}.tmp", store.MANIFEST, store.CONFIG, store.REPORT,
-    store.TRAJECTORY, store.PATH_PICTURE, store.GAUSSIANS, store.OCCUPANCY, store.FEATURES, store.KEYFRAMES,
+    store.TRAJECTORY, store.PATH_PICTURE, store.RENDER_PICTURE, store.GAUSSIANS, store.OCCUPANCY, store.FEATURES,
+    store.KEYFRAMES,
 }  # fmt: skip
 
 

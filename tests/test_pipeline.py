@@ -13,9 +13,11 @@ import pytest
 from helpers import data_folder, truncate, write_scannet, write_seven_scenes
 
 import freeocc3d
-from freeocc3d import pipeline, store
+from freeocc3d import config, pipeline, registry, store
+from freeocc3d.capture import base as capture_base
 from freeocc3d.capture import open_capture
 from freeocc3d.errors import CaptureError, ConfigError, FreeOccError, Interrupted, MapError, TrackingError
+from freeocc3d.gaussians import images
 from freeocc3d.progress import Progress
 from freeocc3d.types import FREE, OCCUPIED
 
@@ -43,7 +45,7 @@ def test_the_room_becomes_a_map_with_every_layer(room) -> None:
     assert len(room.keyframes) == len(room.trajectory.keyframes)
     assert {p.name for p in room.path.iterdir()} == {
         "map.yaml", "config.yaml", "report.json", "trajectory.txt", "gaussians.ply", "occupancy.npz", "features.npz",
-        "keyframes", "trajectory.png",
+        "keyframes", "trajectory.png", "gaussians.png",
     }  # fmt: skip
 
 
@@ -56,17 +58,47 @@ def test_the_rooms_poses_are_right(room) -> None:
 
 
 def _synthetic():
-    from freeocc3d import config, registry
-    from freeocc3d.capture import base
-
     settings = config.resolve(ROOM)
-    return registry.build_options(base, config.options(settings, "capture")), settings["capture"]
+    return registry.build_options(capture_base, config.options(settings, "capture")), settings["capture"]
 
 
 def test_means_on_file_are_their_anchors_at_the_files_poses(room) -> None:
     g, T = room.gaussians, room.trajectory.T_world_keyframe
     world = np.einsum("nij,nj->ni", T[g.anchor_keyframe, :3, :3], g.anchor_cam.astype(float))
     np.testing.assert_allclose(world + T[g.anchor_keyframe, :3, 3], g.means, atol=1e-4)
+
+
+def test_the_report_says_how_well_the_map_renders(room) -> None:
+    rendering = json.loads((room.path / "report.json").read_text())["rendering"]
+    assert rendering["psnr_measured"] > 20
+    assert 0 < rendering["depth_l1_m"] < 0.15
+    assert 0.8 < rendering["covered"] <= 1
+    assert cv2.imread(str(room.path / store.RENDER_PICTURE)).std() > 10
+
+
+def test_fitting_while_frames_come_in_keeps_what_was_fitted(tmp_path) -> None:
+    """Each keyframe is fitted when it comes, then carried along; the last map renders all of them better than what
+    the same keyframes start with."""
+    capture = open_capture("builtin:room", *_synthetic())
+    settings = config.resolve({**ROOM, "fitting": {"window": 2, "window_passes": 4}})
+    mapper = pipeline.Mapper(settings, capture, tmp_path)
+    current = None
+    for index in range(24):
+        if mapper.add(capture[index]).status == "keyframe":
+            current = mapper.update_gaussians()
+    assert len(mapper.keyframes) > 3
+    mapper.refine()
+    current = mapper.update_gaussians()
+    views = mapper.views(mapper.trajectory())
+    before, after = (images.fidelity(g, views, mapper.rasterizer) for g in (mapper.anchor_gaussians(), current))
+    assert after.psnr_measured > before.psnr_measured + 0.5
+    oldest_before, oldest_after = (
+        images.fidelity(g, views[:1], mapper.rasterizer) for g in (mapper.anchor_gaussians(), current)
+    )
+    assert oldest_after.psnr_measured > oldest_before.psnr_measured
+    world = mapper.trajectory().T_world_keyframe[current.anchor_keyframe]
+    anchored = np.einsum("nij,nj->ni", world[:, :3, :3], current.anchor_cam.astype(float)) + world[:, :3, 3]
+    np.testing.assert_allclose(anchored, current.means, atol=1e-4)
 
 
 def test_a_pose_free_run_never_reads_poses_or_class_images(tmp_path, monkeypatch) -> None:

@@ -28,7 +28,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import held_out
 import kernels
+import rendering
 import variants
 
 Figures = dict[str, Any]
@@ -51,7 +53,9 @@ PEERS = {
 }
 """``POSES_OCCUPANCY``: where the poses come from, and what makes voxels of them."""
 
-KERNELS = ("splat", "query")
+UNFITTED = "rgbd_no_fitting"
+
+KERNELS = ("splat", "query", "rasterizer")
 LAYER_1 = {
     "stress": "layer 1 on altered captures: what is reached, what is lost, and whether that is told",
     "glued": "layer 1 on two captures as if they were one, which must stay two submaps",
@@ -132,6 +136,7 @@ def score_map(map: str, capture: str, out: str) -> Figures:
     errors = trajectory_errors(estimated, true, alignment)
     _save_poses(Path(out), alignment.poses(loaded.trajectory.T_world_cam), errors, loaded.up @ alignment.rotation.T)
     figures: Figures = {"ate_rmse_m": errors.ate_rmse_m, "trajectory": errors.to_json()}
+    figures["held_out"] = held_out.held_out(loaded)
     truth_path = Path(capture) / "ground_truth.npz"
     if truth_path.is_file():
         truth = load_ground_truth(truth_path)
@@ -249,15 +254,16 @@ def occupancy(kind: str, capture: str, frames: int | None, poses: str | None, tr
     used = range(len(opened))[:frames]
     T_true_cam[len(used) :] = np.nan
     lattice = peers.Lattice(expected.origin, expected.shape, expected.voxel_size)
-    run = {
-        "tsdf": peers.tsdf_occupied,
-        "back_projection": peers.back_projected_occupied,
-        "octomap": peers.octomap_occupied,
-    }[kind]
-    occupied, seconds = run(opened, T_true_cam, lattice)
+    figures: Figures = {}
+    if kind == "tsdf":
+        area, seconds = peers.surface_area(opened, T_true_cam, lattice, every=2)
+        occupied, figures["surface_m2"] = area >= peers.TSDF_MIN_AREA_M2, float(area.sum())
+    else:
+        run = {"back_projection": peers.back_projected_occupied, "octomap": peers.octomap_occupied}[kind]
+        occupied, seconds = run(opened, T_true_cam, lattice)
     names = expected.classes[1:]
     matrix = confusion(expected.labels, Prediction(occupied), expected.masks()["label"], len(names))
-    return {**_scores(Scores(matrix, names), None, ()), "seconds": seconds, "frames": len(used)}
+    return {**figures, **_scores(Scores(matrix, names), None, ()), "seconds": seconds, "frames": len(used)}
 
 
 # Kernels
@@ -265,8 +271,8 @@ def occupancy(kind: str, capture: str, frames: int | None, poses: str | None, tr
 
 def kernel(name: str, asked_map: Path | None) -> Figures:
     """Speed of the projection, or of queries in a map. Raises PartFailed."""
-    if name == "splat":
-        return _inside("splat")
+    if name in ("splat", "rasterizer"):
+        return _inside(name)
     if asked_map is None or not (asked_map / "map.yaml").is_file():
         raise PartFailed(f"there is no map to ask: name the variant {OURS}, too")
     command = [*COMMAND, "query", str(asked_map), kernels.QUERY_WORD, "--json"]
@@ -293,6 +299,7 @@ INSIDE = {
     "lengths": lambda **given: _stress().lengths(**given),
     "warm_up": lambda **given: _stress().warm_up(**given),
     "splat": lambda: kernels.measure_splat(),
+    "rasterizer": lambda: rendering.measure_rasterizer(),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
 }
 """What is measured in a process of its own."""
@@ -355,9 +362,11 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
             )  # fmt: skip
         for row in rows:
             if slam is not None and "error" not in slam and row["capture"] == job.name and "ms_per_frame" in row:
-                own = sum(row["ms_per_frame"].get(stage, 0.0) for stage in LAYER_1_STAGES) * 1e-3 * row["frames"]
-                if own:
-                    row["layer_1_over_dense_slam"] = own / slam["seconds_without_decoding"]
+                stages = {stage: 1e-3 * row["frames"] * value for stage, value in row["ms_per_frame"].items()}
+                for what, names_of in (("layer_1", LAYER_1_STAGES), ("fitting", ("fitting",))):
+                    own = sum(stages.get(stage, 0.0) for stage in names_of)
+                    if own:
+                        row[f"{what}_over_dense_slam"] = own / slam["seconds_without_decoding"]
         if asked_map is None and (job.folder / OURS).is_dir():
             asked_map = job.folder / OURS
     measured = {name: _tried(name, lambda name=name: kernel(name, asked_map)) for name in KERNELS if name in names}
@@ -420,8 +429,8 @@ def _tried(what: str, measure: Any) -> Figures:
 
 
 COLUMNS = (
-    "capture", "variant", "ATE cm", "IoU", "mIoU", "precision", "recall", "ms/frame", "fps", "memory GB", "map MB",
-    "x dense SLAM", "layer 1 x", "what",
+    "capture", "variant", "ATE cm", "IoU", "mIoU", "precision", "recall", "PSNR dB", "depth cm", "Gaussians",
+    "ms/frame", "fps", "memory GB", "map MB", "x dense SLAM", "layer 1 x", "fitting x", "what",
 )  # fmt: skip
 
 
@@ -434,24 +443,36 @@ def markdown(results: Figures) -> str:
             row["variant"],
             _number(row.get("ate_rmse_m"), 100, 2),
             *(_number(row.get(name), 100, 1) for name in ("iou", "miou", "precision", "recall")),
+            _number((row.get("held_out") or {}).get("psnr_measured"), 1, 2),
+            _number((row.get("held_out") or {}).get("depth_l1_m"), 100, 1),
+            _number(row.get("gaussians"), 1, 0),
             _number(sum(row["ms_per_frame"].values()) if "ms_per_frame" in row else None, 1, 1),
             _number(row.get("frames_per_second"), 1, 1),
             _number(row.get("peak_memory_bytes"), 1e-9, 2),
             _number(row.get("map_bytes"), 1e-6, 1),
             _number(row.get("wall_over_dense_slam"), 1, 2),
             _number(row.get("layer_1_over_dense_slam"), 1, 2),
+            _number(row.get("fitting_over_dense_slam"), 1, 2),
             row["title"] if row["available"] else f"{row['title']}: **not available**, {row['why']}",
         )
         lines.append(f"| {' | '.join(cells)} |")
     lines += [f"\nmIoU of {capture}: over {classes}" for capture, classes in _class_lists(results).items()]
-    for name, write in (("splat", kernels.splat_lines), ("query", kernels.query_lines)):
+    writers = {"splat": kernels.splat_lines, "query": kernels.query_lines, "rasterizer": rendering.rasterizer_lines}
+    for name, write in writers.items():
         figures = results["kernels"].get(name)
         if figures is not None and "error" in figures:
             lines.append(f"\n{name}: not available, {figures['error']}")
         elif figures is not None:
             lines += ["", "| what | measured | asked |", "|---|---|---|"]
             lines += [f"| {' | '.join(line)} |" for line in write(figures)]
-    return "\n".join([*lines, *_layer_1_lines(results.get("layer_1") or {}), *_pose_lines(results["rows"])])
+    return "\n".join(
+        [
+            *lines,
+            *_layer_1_lines(results.get("layer_1") or {}),
+            *_pose_lines(results["rows"]),
+            *_fit_lines(results["rows"]),
+        ]
+    )
 
 
 def _layer_1_lines(figures: Figures) -> list[str]:
@@ -472,6 +493,27 @@ def _pose_lines(rows: list[Figures]) -> list[str]:
         ours, given = iou.get((capture, OURS)), iou.get((capture, TRUE_POSES))
         if ours and given:
             lines.append(f"\n{capture}: IoU with our poses is {ours / given:.3f} of that with the capture's poses")
+    return lines
+
+
+def _fit_lines(rows: list[Figures]) -> list[str]:
+    """What fitting gains on held-out frames and in IoU, and how densely Gaussians lie."""
+    found = {(row["capture"], row["variant"]): row for row in rows}
+    lines = []
+    for capture in dict.fromkeys(row["capture"] for row in rows):
+        ours, plain = found.get((capture, OURS), {}), found.get((capture, UNFITTED), {})
+        if ours.get("held_out") and plain.get("held_out"):
+            was, now = plain["held_out"], ours["held_out"]
+            gain, everywhere = (now[name] - was[name] for name in ("psnr_measured", "psnr"))
+            iou = 100 * ((ours.get("iou") or 0) - (plain.get("iou") or 0))
+            lines.append(
+                f"\n{capture}: on {now['frames']} held-out frames fitting changes PSNR by {gain:+.2f} dB where depth "
+                f"is measured ({everywhere:+.2f} over all pixels), depth errors from {100 * was['depth_l1_m']:.1f} to "
+                f"{100 * now['depth_l1_m']:.1f} cm, and IoU by {iou:+.2f}"
+            )
+        surface = found.get((capture, "true_poses_tsdf"), {}).get("surface_m2")
+        if surface and ours.get("gaussians"):
+            lines.append(f"\n{capture}: {ours['gaussians'] / surface:.0f} Gaussians per square metre of surface")
     return lines
 
 

@@ -1,0 +1,26 @@
+"""How well a map's Gaussians show frames that they were not fitted to: every tenth of the capture."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+EVERY = 10
+
+
+def held_out(loaded: Any) -> dict[str, Any]:
+    """PSNR and depth error on every tenth frame that has a pose and is no keyframe, at the map's own poses."""
+    from freeocc3d.capture.reregistered import Reregistered
+    from freeocc3d.evaluation.evaluate import capture_of
+    from freeocc3d.gaussians import fit, images
+    from freeocc3d.gaussians.rasterizers import cpu
+
+    capture, trajectory = capture_of(loaded), loaded.trajectory
+    ratio = loaded.report.get("color_focal", 1.0)
+    if ratio != 1:
+        capture = Reregistered(capture, ratio)
+    keyframes = set(trajectory.keyframes.tolist())
+    rows = [n for n in range(0, len(trajectory), EVERY) if trajectory.has_pose[n] and n not in keyframes]
+    rasterizer, width = cpu.load(), fit.Options().width
+    views = [images.view_of(capture[n], trajectory.T_world_cam[n], width, rasterizer.device) for n in rows]
+    return {"frames": len(rows), **dataclasses.asdict(images.fidelity(loaded.gaussians, views, rasterizer))}
