@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import itertools
 import json
 import resource
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +37,7 @@ from .progress import Progress
 from .store import Map, load_map
 from .tracking import calibration
 from .tracking.base import Tracked, Tracker
-from .types import Frame, Gaussians, Occupancy, Submap, Trajectory
+from .types import Frame, Gaussians, Occupancy, PosedFrame, Submap, Trajectory
 from .viewer import paths, renders
 from .work import WorkFolder
 
@@ -76,21 +78,52 @@ class Mapper:
         """The keyframes that are mapped: those of the largest submap."""
         return self.keyframes.only(trajectory.keyframes)
 
+    def frames_used(self, trajectory: Trajectory, every: int) -> NDArray[np.int64]:
+        """Indices of the mapped keyframes and of every n-th mapped frame that was tracked (0 = none of these)."""
+        measured = np.flatnonzero(np.isin(trajectory.status, ("keyframe", "tracked", "relocalised")))
+        return np.union1d(trajectory.keyframes, measured[::every] if every else [])
+
+    def posed(self, trajectory: Trajectory, every: int) -> Iterator[PosedFrame]:
+        """Those frames. Keyframes are read as they were kept, the others from the capture; one that cannot be decoded
+        any more is left out."""
+        keyframes, own = self.mapped(trajectory), trajectory.keyframes.tolist()
+        between = np.setdiff1d(self.frames_used(trajectory, every), own)
+        stream = read_ahead(self.capture, between.tolist())
+        try:
+            following = next(stream, None)
+            for row, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True)):
+                yield PosedFrame(frame, T, row)
+                while following is not None and (row + 1 == len(own) or following[0] < own[row + 1]):
+                    index, found = following
+                    if not isinstance(found, FrameError):
+                        yield PosedFrame(self.tracker.completed(found), trajectory.T_world_cam[index], row)
+                    following = next(stream, None)
+        finally:
+            stream.close()
+
     def build_gaussians(self, progress: Progress | None = None) -> Gaussians:
         """Layer 2 from the mapped keyframes so far at their present poses: anchored, and fitted to all of them."""
         return self.fit_gaussians(self.anchor_gaussians(progress), progress)
 
-    def anchor_gaussians(self, progress: Progress | None = None) -> Gaussians:
-        """Layer 2 as it is initialised: Gaussians anchored at the surface that the mapped keyframes so far show."""
+    def anchor_gaussians(self, progress: Progress | None = None, every: int | None = None) -> Gaussians:
+        """Layer 2 as it is initialised: Gaussians anchored at the surface that the mapped frames so far show, every
+        n-th of them (0 = keyframes alone; by default what the configuration says)."""
         progress = progress or Progress()
         trajectory = self.trajectory()
-        keyframes = self.mapped(trajectory)
-        cells = anchors.AnchoredCells(_options(anchors, self.settings["gaussians"]), self.cell_size)
-        progress.stage("gaussians", len(keyframes))
-        for done, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True), 1):
-            cells.add(frame, T)
-            progress.advance(done)
-        return cells.gaussians(keyframes)
+        options: anchors.Options = _options(anchors, self.settings["gaussians"])
+        every = options.every if every is None else every
+        progress.stage("gaussians", 2 * len(self.frames_used(trajectory, every)))
+        cells = anchors.AnchoredCells(options, self.cell_size, trajectory.T_world_keyframe)
+        done = itertools.count(1)
+
+        def frames() -> Iterator[PosedFrame]:
+            for posed in self.posed(trajectory, every):
+                yield posed
+                progress.advance(next(done))
+
+        for posed in frames():
+            cells.add(posed)
+        return cells.gaussians(frames())
 
     def fit_gaussians(self, gaussians: Gaussians, progress: Progress | None = None) -> Gaussians:
         """Layer 2 fitted to the images of all mapped keyframes so far."""
@@ -103,7 +136,7 @@ class Mapper:
         """Layer 2 kept current while frames come in: what was fitted before is carried over to the keyframes' present
         poses, new surface is added, and all is fitted to the last ``fitting.window`` keyframes."""
         trajectory, options = self.trajectory(), self.fit_options
-        gaussians = self.anchor_gaussians()
+        gaussians = self.anchor_gaussians(every=0)
         if self._fitted is not None:
             before, then = self._fitted
             count = len(then.keyframes)
@@ -166,15 +199,14 @@ class Mapper:
         """Layer 4: voxels with probabilities, evidence, features and colours."""
         progress = progress or Progress()
         trajectory = self.trajectory()
-        keyframes = self.mapped(trajectory)
-        progress.stage("occupancy", len(keyframes))
+        carving: carve.Options = _options(carve, self.settings["carving"])
+        progress.stage("occupancy", len(self.frames_used(trajectory, carving.every)))
         return build.build_occupancy(
             gaussians,
             features,
-            keyframes,
-            trajectory.T_world_keyframe,
+            self.posed(trajectory, carving.every),
             _options(splat, self.settings["occupancy"]),
-            _options(carve, self.settings["carving"]),
+            carving,
             progress=progress.advance,
         )
 

@@ -7,6 +7,7 @@ coordinates of frame b to frame a; voxel (i, j, k) covers ``origin + [i, i+1) * 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +97,18 @@ class Trajectory:
     def only_keyframes(self, keyframes: NDArray[np.int32]) -> Trajectory:
         """The same poses with some of the keyframes."""
         return replace(self, keyframes=keyframes)
+
+
+class PosedFrame(NamedTuple):
+    """A frame and where it was taken.
+
+    T_world_cam: (4, 4) float64.  keyframe: row of ``Trajectory.keyframes`` of the keyframe that its pose hangs on, its
+    own if it is one.
+    """
+
+    frame: Frame
+    T_world_cam: NDArray[np.float64]
+    keyframe: int
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from freeocc3d.types import Frame, Gaussians, Intrinsics, Occupancy
+from freeocc3d.gaussians import anchors
+from freeocc3d.types import Frame, Gaussians, Intrinsics, Occupancy, PosedFrame
 
 CAMERA = Intrinsics(160, 120, 130.0, 130.0, 79.5, 59.5)
 
@@ -37,6 +38,20 @@ def random_gaussians(n: int, seed: int, extent: float = 1.0) -> Gaussians:
         quats / np.linalg.norm(quats, axis=1, keepdims=True),
         rng.uniform(0.1, 1.0, n),
     )
+
+
+def posed(frames, poses) -> list[PosedFrame]:
+    """Keyframes at their poses."""
+    return [PosedFrame(frame, T, row) for row, (frame, T) in enumerate(zip(frames, poses, strict=True))]
+
+
+def lifted(frames, poses, cell: float = 0.04, **options) -> Gaussians:
+    """Gaussians anchored to keyframes."""
+    cells = anchors.AnchoredCells(anchors.Options(**options), cell, np.stack(poses))
+    looks = posed(frames, poses)
+    for look in looks:
+        cells.add(look)
+    return cells.gaussians(looks)
 
 
 def wall_frame(distance: float, index: int = 0, camera: Intrinsics = CAMERA, seed: int | None = None) -> Frame:

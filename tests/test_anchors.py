@@ -2,21 +2,14 @@
 
 import numpy as np
 import pytest
-from scenes import CAMERA, wall_frame
+from scenes import CAMERA, lifted, wall_frame
 
-from freeocc3d.gaussians import anchors
+from freeocc3d.gaussians import anchors, edges
 from freeocc3d.geometry import depth_sigma, invert, project, quats_to_rotations, rotations_to_quats, transform
 from freeocc3d.occupancy import splat
 from freeocc3d.types import Frame
 
 CELL = 0.04
-
-
-def lifted(frames, poses, cell=CELL, **options):
-    cells = anchors.AnchoredCells(anchors.Options(**options), cell)
-    for frame, T in zip(frames, poses, strict=True):
-        cells.add(frame, T)
-    return cells.gaussians(frames)
 
 
 def random_pose(seed: int) -> np.ndarray:
@@ -133,11 +126,18 @@ def test_pixels_at_depth_edges_are_dropped() -> None:
     depth = np.full((20, 20), 2.0, np.float32)
     depth[:, 10:] = 3.0
     depth[3, 3] = 0
-    good = anchors.away_from_edges(depth, 0.05)
+    good = edges.away_from_edges(depth, 0.05)
     assert not good[:, 9:11].any()
     assert not good[3, 3]
     assert good[:3, :9].all()
     assert good[:, 11:].all()
+
+
+def test_the_compiled_edge_test_agrees_with_plain_numpy() -> None:
+    depth = np.random.default_rng(0).uniform(2.0, 2.2, (30, 40)).astype(np.float32)
+    depth[np.random.default_rng(1).uniform(size=depth.shape) < 0.2] = 0
+    compiled = [[depth[v, u] > 0 and not edges.at_edge(depth, v, u, 0.05) for u in range(40)] for v in range(30)]
+    np.testing.assert_array_equal(compiled, edges.away_from_edges(depth, 0.05))
 
 
 def test_cells_smaller_than_the_pixels_spacing_keep_the_surface() -> None:

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from scenes import CAMERA, dense, gaussians, wall_frame
+from scenes import CAMERA, dense, gaussians, lifted, posed, wall_frame
 
-from freeocc3d.gaussians import anchors
 from freeocc3d.occupancy import build, carve, splat
 from freeocc3d.types import FREE, OCCUPIED, UNKNOWN
 
@@ -14,13 +13,10 @@ V = 0.08
 def build_wall(distance: float, repeats: int = 2, **splatting):
     frames = [wall_frame(distance, i) for i in range(repeats)]
     poses = np.tile(np.eye(4), (repeats, 1, 1))
-    cells = anchors.AnchoredCells(anchors.Options(), 0.5 * V)
-    for frame, T in zip(frames, poses, strict=True):
-        cells.add(frame, T)
-    g = cells.gaussians(frames)
+    g = lifted(frames, poses, 0.5 * V)
     features = np.zeros((len(g), 3), np.float16)
     features[np.arange(len(g)), (g.means[:, 0] > 0).astype(int)] = 1  # left half, right half
-    return build.build_occupancy(g, features, frames, poses, splat.Options(**splatting), carve.Options()), g
+    return build.build_occupancy(g, features, posed(frames, poses), splat.Options(**splatting), carve.Options()), g
 
 
 def test_a_wall_is_one_voxel_thick_free_before_it_and_unknown_behind_it() -> None:
@@ -54,17 +50,15 @@ def test_what_several_images_see_through_is_not_occupied() -> None:
     poses = np.tile(np.eye(4), (8, 1, 1))
     floater = gaussians([[0.02, 0.02, 1.0]], 0.05)
     nothing = np.zeros((1, 0), np.float16)
-    contradicted = build.build_occupancy(floater, nothing, frames, poses, splat.Options(), carve.Options())
+    contradicted = build.build_occupancy(floater, nothing, posed(frames, poses), splat.Options(), carve.Options())
     assert np.count_nonzero(contradicted.state == OCCUPIED) == 0
-    kept = build.build_occupancy(floater, nothing, frames[:2], poses[:2], splat.Options(), carve.Options())
+    kept = build.build_occupancy(floater, nothing, posed(frames[:2], poses[:2]), splat.Options(), carve.Options())
     assert np.count_nonzero(kept.state == OCCUPIED) > 0
 
 
 def test_an_empty_map_has_no_voxels() -> None:
     none = gaussians(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)))
-    occupancy = build.build_occupancy(
-        none, np.zeros((0, 4), np.float16), [], np.zeros((0, 4, 4)), splat.Options(), carve.Options()
-    )
+    occupancy = build.build_occupancy(none, np.zeros((0, 4), np.float16), [], splat.Options(), carve.Options())
     assert occupancy.keys.shape == (0, 3)
     assert occupancy.features.shape == (0, 4)
 

@@ -15,11 +15,11 @@ OPTIONS = carve.Options()
 def evidence_of(frame: Frame, T=None):
     """Counts of one image over the blocks that it looks into, and the voxel centres in the world."""
     T = np.eye(4) if T is None else T
-    packed = carve.visible_blocks(frame, T, ORIGIN, V, OPTIONS.ray_step)
-    evidence = carve.Evidence(packed, ORIGIN, V, OPTIONS)
-    evidence.add(frame, T)
+    evidence = carve.Evidence(ORIGIN, V, OPTIONS)
+    packed = evidence.add(frame, T)
+    np.testing.assert_array_equal(packed, evidence.packed)
     local = np.stack((np.arange(512) // 64, np.arange(512) // 8 % 8, np.arange(512) % 8), axis=1)
-    centers = ORIGIN + ((evidence.keys[:, None] * 8 + local) + 0.5) * V
+    centers = ORIGIN + ((grid.unpack(packed)[:, None] * 8 + local) + 0.5) * V
     return evidence.free, evidence.hits, centers
 
 
@@ -63,7 +63,7 @@ def test_missing_depth_says_nothing() -> None:
     left = centers[..., 0] < -0.1
     assert free[left].sum() == hits[left].sum() == 0
     empty = Frame(0, 0.0, frame.color, np.zeros_like(frame.depth_m), CAMERA)
-    assert len(carve.visible_blocks(empty, np.eye(4), ORIGIN, V, 16)) == 0
+    assert len(carve.Evidence(ORIGIN, V, OPTIONS).add(empty, np.eye(4))) == 0
 
 
 def test_the_margin_grows_with_the_depths_uncertainty() -> None:
@@ -79,7 +79,7 @@ def test_the_margin_grows_with_the_depths_uncertainty() -> None:
 def test_no_block_is_missed_however_small_blocks_are() -> None:
     frame = wall_frame(4.0)
     for voxel_size in (0.08, 0.02):
-        found = set(carve.visible_blocks(frame, np.eye(4), ORIGIN, voxel_size, 16).tolist())
+        found = set(carve.Evidence(ORIGIN, voxel_size, OPTIONS).visible_blocks(frame, np.eye(4)).tolist())
         edge = 8 * voxel_size
         keys = np.stack(np.meshgrid(*[np.arange(-8, 8)] * 2, np.arange(1, int(3.8 / edge))), axis=-1).reshape(-1, 3)
         middles = (keys + 0.5) * edge
@@ -90,21 +90,53 @@ def test_no_block_is_missed_however_small_blocks_are() -> None:
         assert set(wanted.tolist()) <= found
 
 
+def looks(count: int) -> list[tuple[Frame, np.ndarray]]:
+    """Walls from a camera that turns and moves."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for n in range(count):
+        c, s = np.cos(0.5 * n), np.sin(0.5 * n)
+        poses[n, :3, :3] = ((c, 0, s), (0, 1, 0), (-s, 0, c))
+        poses[n, :3, 3] = 0.1 * n, 0, 0
+    return [(wall_frame(1.5 + 0.2 * n, n, seed=n), T) for n, T in enumerate(poses)]
+
+
+def counted(images) -> carve.Evidence:
+    evidence = carve.Evidence(ORIGIN, V, OPTIONS)
+    for frame, T in images:
+        evidence.add(frame, T)
+    return evidence
+
+
 def test_counts_add_up_over_images() -> None:
-    frame = wall_frame(2.0)
-    packed = carve.visible_blocks(frame, np.eye(4), ORIGIN, V, 16)
-    evidence = carve.Evidence(packed, ORIGIN, V, OPTIONS)
-    for _ in range(3):
-        evidence.add(frame, np.eye(4))
+    evidence = counted(3 * looks(1))
     assert set(np.unique(evidence.free)) == {0, 3}
     assert set(np.unique(evidence.hits)) == {0, 3}
 
 
-def test_visible_blocks_cover_every_voxel_that_gets_evidence() -> None:
-    frame = wall_frame(2.0)
-    few = carve.visible_blocks(frame, np.eye(4), ORIGIN, V, 16)
-    wide = np.unique(grid.pack((grid.unpack(few)[:, None] + np.indices((3, 3, 3)).reshape(3, -1).T - 1).reshape(-1, 3)))
-    narrow, broad = (carve.Evidence(keys, ORIGIN, V, OPTIONS) for keys in (few, wide))
-    narrow.add(frame, np.eye(4))
-    broad.add(frame, np.eye(4))
-    assert narrow.free.sum() >= 0.97 * broad.free.sum()  # the rest lies in blocks that the image's border grazes
+def test_the_order_of_images_does_not_count() -> None:
+    images = looks(6)
+    forth, back = counted(images), counted(images[::-1])
+    for name in ("packed", "free", "hits"):
+        np.testing.assert_array_equal(getattr(forth, name), getattr(back, name))
+
+
+def test_an_image_that_is_taken_out_again_leaves_nothing_behind() -> None:
+    images = looks(6)
+    evidence, without = counted(images), counted(images[:2] + images[3:])
+    touched = evidence.remove(*images[2])
+    assert len(touched) < len(evidence.packed)
+    free, hits = without.at(evidence.packed)
+    np.testing.assert_array_equal(evidence.free, free)
+    np.testing.assert_array_equal(evidence.hits, hits)
+
+
+def test_visible_blocks_hold_every_voxel_that_an_image_says_something_about() -> None:
+    for frame, T in looks(4):
+        few = carve.Evidence(ORIGIN, V, OPTIONS)
+        packed = few.add(frame, T)
+        around = (grid.unpack(packed)[:, None] + np.indices((3, 3, 3)).reshape(3, -1).T - 1).reshape(-1, 3)
+        wide = carve.Evidence(ORIGIN, V, OPTIONS)
+        wide._make_room(np.unique(grid.pack(around)))
+        wide._count(wide.packed, frame, T, 1)
+        for narrow, broad in ((few.free, wide.free), (few.hits, wide.hits)):
+            assert narrow.sum() >= 0.985 * broad.sum()  # the rest lies in blocks that the image's border grazes

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import CAMERA, random_gaussians, wall_frame
+from scenes import CAMERA, lifted, random_gaussians, wall_frame
 
 from freeocc3d.errors import ConfigError
 from freeocc3d.gaussians import anchors, fit, images
@@ -21,13 +21,6 @@ def walls(count: int = 3) -> tuple[list[Frame], np.ndarray]:
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 2, 3] = -0.1 * np.arange(count)
     return [wall_frame(2.0 + 0.1 * n, n) for n in range(count)], poses
-
-
-def lifted(frames, poses, **options):
-    cells = anchors.AnchoredCells(anchors.Options(**options), 0.04)
-    for frame, T in zip(frames, poses, strict=True):
-        cells.add(frame, T)
-    return cells.gaussians(frames)
 
 
 def seen(frames, poses) -> list[images.View]:

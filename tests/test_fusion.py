@@ -1,11 +1,11 @@
 """Denoising: the kernel against plain NumPy, noise that averages out, and points that are no surface."""
 
 import numpy as np
-from scenes import CAMERA, wall_frame
+from scenes import CAMERA, lifted, posed, wall_frame
 
 from freeocc3d.gaussians import anchors, fusion
 from freeocc3d.geometry import quats_to_rotations
-from freeocc3d.types import Frame
+from freeocc3d.types import Frame, PosedFrame
 
 
 def views(count: int, seed: int = 0) -> tuple[list[Frame], np.ndarray]:
@@ -25,13 +25,15 @@ def views(count: int, seed: int = 0) -> tuple[list[Frame], np.ndarray]:
 
 
 def test_the_kernel_agrees_with_plain_numpy() -> None:
-    frames, poses = views(5)
+    frames, poses = views(8)
     points = np.random.default_rng(1).uniform((-1, -1, 1.5), (1, 1, 2.5), (4000, 3))
-    found = fusion.denoised(points, ((frame, frame.depth_m) for frame in frames), poses)
-    parts = [fusion.look_reference(points, frame, frame.depth_m, T) for frame, T in zip(frames, poses, strict=True)]
+    directions = np.random.default_rng(2).normal((0, 0, 0.3), 1, points.shape)  # some were measured from behind
+    looks = posed(frames, poses)
+    found = fusion.denoised(points, directions, looks, 0.15)
+    parts = [fusion.look_reference(points, directions, look, 0.15) for look in looks]
     offset, weight, through = (sum(part[i].astype(float) for part in parts) for i in range(3))
     shown = sum((part[1] > 0).astype(int) for part in parts)
-    assert 1000 < np.count_nonzero(weight) < 3500
+    assert 800 < np.count_nonzero(weight) < 3500
     np.testing.assert_allclose(found.weights, weight, rtol=1e-5)
     expected = points + offset / np.where(weight > 0, weight, 1)[:, None]
     np.testing.assert_allclose(found.points, expected, atol=1e-6)
@@ -45,10 +47,7 @@ def test_a_noisy_wall_ends_one_layer_thick() -> None:
     poses = np.tile(np.eye(4), (12, 1, 1))
     thickness, count = {}, {}
     for denoise in (False, True):
-        cells = anchors.AnchoredCells(anchors.Options(denoise=denoise), 0.01)
-        for frame, T in zip(frames, poses, strict=True):
-            cells.add(frame, T)
-        g = cells.gaussians(frames)
+        g = lifted(frames, poses, 0.01, denoise=denoise)
         thickness[denoise], count[denoise] = np.std(g.means[:, 2]), len(g)
     assert thickness[True] < 0.4 * thickness[False]
     assert count[True] < 0.7 * count[False]
@@ -59,15 +58,37 @@ def test_what_most_images_see_through_is_left_out_and_what_none_shows_stays() ->
     poses = np.tile(np.eye(4), (3, 1, 1))
     floating, on_the_wall, behind_the_camera, behind_the_wall = (0, 0, 1.0), (0, 0, 2.005), (0, 0, -1.0), (0, 0, 2.5)
     points = np.array([floating, on_the_wall, behind_the_camera, behind_the_wall])
-    found = fusion.denoised(points, ((frame, frame.depth_m) for frame in frames), poses)
+    found = fusion.denoised(points, points, posed(frames, poses), 0.05)
     np.testing.assert_array_equal(found.kept, [False, True, True, True])
     np.testing.assert_array_equal(found.weights > 0, [False, True, False, False])
     np.testing.assert_allclose(found.points[1], (0, 0, 2.0), atol=1e-6)
     np.testing.assert_array_equal(found.points[2:], points[2:])
 
 
+def test_the_two_sides_of_a_board_stay_apart() -> None:
+    front, behind = np.eye(4), np.diag((-1.0, 1.0, -1.0, 1.0))
+    behind[2, 3] = 4.04  # looks back at a board of 4 cm, whose other side is 2 m away
+    looks = posed([wall_frame(2.0, 0), wall_frame(2.0, 1)], np.stack((front, behind)))
+    points = np.array([(0.1, 0.1, 2.003), (0.1, 0.1, 2.037)])
+    found = fusion.denoised(points, np.array([(0, 0, 1.0), (0, 0, -1.0)]), looks, 0.05)
+    np.testing.assert_allclose(found.points[:, 2], (2.0, 2.04), atol=1e-6)
+
+
+def test_a_frame_between_keyframes_is_anchored_to_the_one_it_hangs_on() -> None:
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, 0, 3] = 0.3
+    cells = anchors.AnchoredCells(anchors.Options(), 0.04, T[:1])
+    looks = [PosedFrame(wall_frame(2.0, n), T[n], 0) for n in range(2)]
+    for look in looks:
+        cells.add(look)
+    g = cells.gaussians(looks)
+    assert (g.anchor_keyframe == 0).all()
+    assert g.means[:, 0].max() > 1.4  # what only the second shows
+    np.testing.assert_allclose(g.anchor_cam, g.means, atol=1e-6)
+
+
 def test_nothing_to_look_at_changes_nothing() -> None:
     points = np.array([(0.0, 0.0, 2.0)])
-    found = fusion.denoised(points, iter(()), np.zeros((0, 4, 4)))
+    found = fusion.denoised(points, points, iter(()), 0.05)
     np.testing.assert_array_equal(found.points, points)
     assert found.keyframe[0] == -1

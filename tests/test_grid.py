@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from freeocc3d import hashing
 from freeocc3d.occupancy import grid
 
 
@@ -20,10 +21,10 @@ def test_packed_key_is_pack_of_one() -> None:
 
 def test_table_finds_what_is_there_and_nothing_else() -> None:
     packed = np.unique(grid.pack(np.random.default_rng(1).integers(-50, 50, (5000, 3))))
-    table, rows = grid.build_table(packed)
-    assert [grid.find(table, rows, key) for key in packed.tolist()] == list(range(len(packed)))
+    table, rows = hashing.build_table(packed, len(packed))
+    assert [hashing.find(table, rows, key) for key in packed.tolist()] == list(range(len(packed)))
     absent = grid.pack(np.array([[60, 0, 0], [0, -51, 3]]))
-    assert [grid.find(table, rows, key) for key in absent.tolist()] == [-1, -1]
+    assert [hashing.find(table, rows, key) for key in absent.tolist()] == [-1, -1]
 
 
 def test_touched_blocks_of_boxes_are_those_that_a_plain_loop_lists() -> None:
@@ -45,3 +46,15 @@ def test_blocks_along_a_ray_connect_the_camera_with_the_surface() -> None:
         grid.blocks_along_rays(np.array([[3.0, 0.1, 0.1]]), np.array([0.1, 0.1, 0.1]), np.zeros(3), 0.08)
     )
     assert sorted(map(tuple, keys.tolist())) == [(i, 0, 0) for i in range(5)]
+
+
+def test_blocks_along_rays_are_those_that_a_fine_walk_meets() -> None:
+    rng = np.random.default_rng(3)
+    points, center, origin = rng.uniform(-4, 4, (60, 3)), np.array([0.13, -0.2, 0.37]), np.array([-0.3, 0.1, 0.2])
+    points[:20, rng.integers(0, 3, 20)] = center[0]  # some run along an axis
+    found = grid.blocks_along_rays(points, center, origin, 0.05)
+    assert (np.diff(found) > 0).all()
+    samples = center + (points - center)[:, None] * np.linspace(0, 1, 20_001)[None, :, None]
+    met = np.unique(grid.pack(np.floor((samples.reshape(-1, 3) - origin) / 0.4).astype(int)))
+    assert set(met.tolist()) <= set(found.tolist())
+    assert len(found) <= 1.01 * len(met)  # corners that the walk steps over

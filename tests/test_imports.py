@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1] / "freeocc3d"
 
 FLOORS = (
     ("errors", "types"),
-    ("geometry", "registry", "progress", "files"),
+    ("geometry", "hashing", "registry", "progress", "files"),
     ("config", "keyframes"),
     ("capture",),
     ("tracking",),

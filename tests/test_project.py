@@ -18,7 +18,7 @@ from freeocc3d.evaluation.ground_truth import GroundTruth, save_ground_truth
 from freeocc3d.evaluation.iou import Prediction
 from freeocc3d.geometry import quats_to_rotations, rotations_to_quats
 from freeocc3d.occupancy.splat import Options, posterior_mean_reference, probability_reference
-from freeocc3d.types import Gaussians
+from freeocc3d.types import Gaussians, PosedFrame
 
 SHAPE = (40, 40, 48)
 ORIGIN = np.array((-1.6, -1.6, 0.0))
@@ -68,8 +68,8 @@ def test_a_map_on_its_own_lattice_is_the_map(room: Any) -> None:
     on_lattice = of_room(room, Alignment.identity(), lattice(low * 0.08, shape=tuple(high - low)))
     expected = np.zeros(tuple(high - low), bool)
     expected[tuple((voxels - low).T)] = True
-    # The map was carved in the frame of its first keyframe, where sums are rounded in another order.
-    assert agreement(on_lattice, expected) > 0.999
+    # The map was carved by every frame, the score is by its keyframes: few voxels are contradicted by one alone.
+    assert agreement(on_lattice, expected) > 0.99
 
 
 def test_the_rooms_map_agrees_with_its_truth(room: Any) -> None:
@@ -94,7 +94,12 @@ def test_the_order_of_frames_does_not_count(room: Any) -> None:
     none = np.zeros((len(room.gaussians), 0), np.float16)
     usual, shuffled = (
         build.build_occupancy(
-            room.gaussians, none, [frames[i] for i in rows], T[rows], splat.Options(), carve.Options(), ORIGIN
+            room.gaussians,
+            none,
+            [PosedFrame(frames[i], T[i], i) for i in rows],
+            splat.Options(),
+            carve.Options(),
+            ORIGIN,
         )
         for rows in (np.arange(len(order)), order)
     )

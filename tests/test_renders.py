@@ -5,20 +5,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from scenes import wall_frame
+from scenes import lifted, wall_frame
 
-from freeocc3d.gaussians import anchors, images
+from freeocc3d.gaussians import images
 from freeocc3d.gaussians.rasterizers import cpu
 from freeocc3d.viewer import renders
 
 
 def test_a_view_is_drawn_beside_what_was_captured(tmp_path: Path) -> None:
     frame = wall_frame(2.0)
-    cells = anchors.AnchoredCells(anchors.Options(), 0.04)
-    cells.add(frame, np.eye(4))
     view = images.view_of(frame, np.eye(4), 320, torch.device("cpu"))
     rows = [(7, view), (9, view)]
-    renders.render_picture(tmp_path / "g.png", cells.gaussians([frame]), rows, cpu.load(), Path("scan"))
+    renders.render_picture(tmp_path / "g.png", lifted([frame], [np.eye(4)]), rows, cpu.load(), Path("scan"))
     picture = cv2.imread(str(tmp_path / "g.png"))
     assert picture.shape[1] == 4 * 408 + 8
     top = 56 + 30
@@ -30,9 +28,7 @@ def test_a_view_is_drawn_beside_what_was_captured(tmp_path: Path) -> None:
 
 def test_a_view_without_depth_is_drawn_all_the_same(tmp_path: Path) -> None:
     frame = wall_frame(2.0)
-    cells = anchors.AnchoredCells(anchors.Options(), 0.04)
-    cells.add(frame, np.eye(4))
     turned = np.diag((-1.0, 1.0, -1.0, 1.0))  # away from the wall
     blank = images.view_of(wall_frame(0.0), turned, 320, torch.device("cpu"))
-    renders.render_picture(tmp_path / "g.png", cells.gaussians([frame]), [(0, blank)], cpu.load(), Path("scan"))
+    renders.render_picture(tmp_path / "g.png", lifted([frame], [np.eye(4)]), [(0, blank)], cpu.load(), Path("scan"))
     assert cv2.imread(str(tmp_path / "g.png")) is not None

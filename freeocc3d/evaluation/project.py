@@ -7,10 +7,9 @@ centres: nothing is resampled from a finished grid, unless a finished grid is al
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +20,11 @@ from ..config import Config
 from ..errors import FreeOccError
 from ..gaussians import anchors
 from ..gaussians.standard_ply import read_standard_ply
-from ..keyframes import Keyframes
 from ..language.encoders.base import TextEncoder, TextFeatures
 from ..occupancy import build, carve, splat
 from ..occupancy.grid import unpack
 from ..store import Map
-from ..types import BLOCK, OCCUPIED, UNKNOWN, Frame, Gaussians
+from ..types import BLOCK, OCCUPIED, UNKNOWN, Gaussians, PosedFrame
 from .align import Alignment, Poses
 from .classes import ClassMap
 from .ground_truth import GroundTruth, array, placed, read_grid_arrays
@@ -51,8 +49,7 @@ def of_map(
     occupancy = build.build_occupancy(
         gaussians,
         features,
-        _Scaled(scan_map.keyframes, alignment.scale),
-        alignment.poses(scan_map.trajectory.T_world_keyframe),
+        _scaled(scan_map, alignment),
         splatting,
         registry.build_options(carve, settings["carving"]),
         origin=truth.origin,
@@ -182,19 +179,11 @@ def of_grid(path: Path, alignment: Alignment, truth: GroundTruth, classes: Class
     return Prediction(occupied, np.where(occupied, predicted, 0).astype(np.uint8)), note
 
 
-class _Scaled(Sequence[Frame]):
-    """Keyframes whose depth is in the true frame's metres; a similarity scales the cameras' frames as well."""
-
-    def __init__(self, keyframes: Keyframes, scale: float):
-        self.keyframes = keyframes
-        self.scale = np.float32(scale)
-
-    def __len__(self) -> int:
-        return len(self.keyframes)
-
-    def __getitem__(self, row: Any) -> Any:
-        frame = self.keyframes[row]
-        return replace(frame, depth_m=frame.depth_m * self.scale)
+def _scaled(scan_map: Map, alignment: Alignment) -> Iterator[PosedFrame]:
+    """Keyframes in the true frame, depth in its metres; a similarity scales the cameras' frames as well."""
+    poses = alignment.poses(scan_map.trajectory.T_world_keyframe)
+    for row, (frame, T) in enumerate(zip(scan_map.keyframes, poses, strict=True)):
+        yield PosedFrame(replace(frame, depth_m=frame.depth_m * np.float32(alignment.scale)), T, row)
 
 
 def _splatting(settings: Config, truth: GroundTruth) -> splat.Options:

@@ -10,21 +10,18 @@ surface, not with the frames.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..errors import ConfigError
-from ..geometry import back_project, depth_sigma, invert, multiply_quats, rotations_to_quats, transform
+from ..geometry import invert, multiply_quats, rotations_to_quats
 from ..registry import require_positive
-from ..types import Frame, Gaussians, Intrinsics
+from ..types import Frame, Gaussians, Intrinsics, PosedFrame
 from . import fusion
-
-_CELLS_PER_AXIS = 1 << 20  # cells on either side of the world's origin, along each axis
-_ROWS_BEFORE_MERGE = 2_000_000
+from .cells import Cells, CellSums
 
 
 @dataclass(frozen=True)
@@ -36,6 +33,9 @@ class Options:
     pixel_stride: int | None = None
     """Every n-th pixel of a keyframe, in both directions, is lifted; null = as many as leave 320 columns, more where
     cells are small."""
+    every: int = 1
+    """Every n-th tracked frame shows the surface, besides the keyframes; 0 = keyframes alone, as in the paper, which
+    loses one to seven points of IoU on the shipped captures."""
     denoise: bool = True
     """Move the cells' points to where all keyframes' depth images together have the surface, and leave out those that
     most see through: adds 3 to 9 points of IoU on the shipped captures and halves the number of Gaussians."""
@@ -66,177 +66,71 @@ class Options:
         require_positive(self, "cell_size", "pixel_stride", "coverage", "gamma", "opacity", "edge", "min_pixels")
         if self.opacity > 1:
             raise ConfigError(f"'opacity' must be at most 1, got {self.opacity}.")
-        if self.uncertainty < 0:
-            raise ConfigError(f"'uncertainty' must not be negative, got {self.uncertainty}.")
+        if self.uncertainty < 0 or self.every < 0:
+            raise ConfigError("'uncertainty' and 'every' must not be negative.")
         if self.initialisation not in ("ray_aligned", "isotropic"):
             raise ConfigError(f"'initialisation' must be ray_aligned or isotropic, got '{self.initialisation}'.")
-
-
-def away_from_edges(depth_m: NDArray[np.float32], edge: float) -> NDArray[np.bool_]:
-    """(H, W) pixels with a depth, none of whose four neighbours differs by more than ``edge`` times its depth."""
-    good = depth_m > 0
-    for axis in (0, 1):
-        near, far = np.take(depth_m, range(depth_m.shape[axis] - 1), axis), np.delete(depth_m, 0, axis)
-        jump = (np.abs(near - far) > edge * np.minimum(near, far)) & (near > 0) & (far > 0)
-        pad = [(0, 0), (0, 0)]
-        pad[axis] = (1, 1)
-        padded = np.pad(jump, pad)
-        good &= ~np.take(padded, range(depth_m.shape[axis]), axis) & ~np.delete(padded, 0, axis)
-    return good
-
-
-@dataclass
-class _Cells:
-    """Sums over the measurements of each cell; rows are cells, ``key`` is ascending."""
-
-    key: NDArray[np.int64]
-    weight: NDArray[Any]
-    position: NDArray[Any]  # (n, 3) weighted sum, world
-    color: NDArray[Any]  # (n, 3) weighted sum
-    pixels: NDArray[np.int64]
-    best_weight: NDArray[Any]  # of the keyframe that measured the cell best
-    best_keyframe: NDArray[np.int32]
-    best_footprint: NDArray[np.float32]  # spacing of that keyframe's measurements on the surface, metres
-
-    @property
-    def points(self) -> NDArray[np.float64]:
-        """(n, 3) mean positions, world."""
-        return np.asarray(self.position / self.weight[:, None])
-
-    def __getitem__(self, rows: NDArray[np.bool_]) -> _Cells:
-        return _Cells(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    def merged(self) -> _Cells:
-        """Rows of the same cell summed. The result does not depend on the order of rows but to rounding."""
-        key, row = np.unique(self.key, return_inverse=True)
-        order = np.lexsort((-self.best_keyframe, self.best_weight, row))
-        best = order[
-            np.flatnonzero(np.diff(row[order], append=-1))
-        ]  # last of each cell: largest weight, first keyframe
-        return _Cells(
-            key,
-            np.bincount(row, self.weight),
-            np.stack([np.bincount(row, self.position[:, i]) for i in range(3)], axis=1),
-            np.stack([np.bincount(row, self.color[:, i]) for i in range(3)], axis=1),
-            np.bincount(row, self.pixels).astype(np.int64),
-            self.best_weight[best],
-            self.best_keyframe[best],
-            self.best_footprint[best],
-        )
 
 
 class AnchoredCells:
     """Collects keyframes; ``gaussians`` turns what was collected into anchored Gaussians.
 
-    Memory: 100 bytes a cell, plus at most two million unmerged rows; a Gaussian takes 63 bytes (positions, scales and
-    anchor 12 each, rotation 16, opacity and keyframe 4 each, colour 3).
+    Memory: 130 bytes a cell; a Gaussian takes 67 bytes (positions, scales and anchor 12 each, rotation 16, opacity and
+    keyframe 4 each, colour 3, feature 4).
     """
 
-    def __init__(self, options: Options, cell_size: float):
+    def __init__(self, options: Options, cell_size: float, T_world_keyframe: NDArray[np.float64]):
         self.options = options
         self.cell_size = cell_size
-        self._T_world_keyframe: list[NDArray[np.float64]] = []
-        self._cells: _Cells | None = None
-        self._pending: list[_Cells] = []
+        self._T_world_keyframe = T_world_keyframe
+        self._sums = CellSums(cell_size)
 
-    def add(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> None:
-        """Take the next keyframe; its row is the number of keyframes taken before."""
-        row = len(self._T_world_keyframe)
-        self._T_world_keyframe.append(T_world_cam)
-        cells = self._measure(frame, T_world_cam, row)
-        if cells is not None:
-            self._pending.append(cells)
-        if sum(len(cells.key) for cells in self._pending) > _ROWS_BEFORE_MERGE:
-            self._merge()
+    def add(self, posed: PosedFrame) -> None:
+        """Take a keyframe, or a frame between keyframes: what it shows is anchored to the keyframe that it hangs on."""
+        self._sums.add_frame(posed, self.options.pixel_stride or self._stride(posed.frame), self.options.edge)
 
-    def gaussians(self, keyframes: Iterable[Frame]) -> Gaussians:
-        """One Gaussian per cell with enough measurements. keyframes: those that were taken, in the same order; their
-        depth is read again to denoise the surface."""
-        self._merge()
-        if self._cells is None:
-            return _no_gaussians()
+    def gaussians(self, frames: Iterable[PosedFrame]) -> Gaussians:
+        """One Gaussian per cell with enough measurements. frames: those that were taken, again, to denoise the
+        surface."""
+        cells = self._sums.cells()
         # A cell smaller than the measurements' spacing cannot hold as many as a large one: one is enough there.
-        possible = np.maximum((self.cell_size / self._cells.best_footprint) ** 2, 1.0)
-        cells = self._cells[self._cells.pixels >= np.minimum(self.options.min_pixels, np.floor(possible))]
-        T_world_keyframe = np.stack(self._T_world_keyframe)
+        possible = np.maximum((self.cell_size / cells.footprint) ** 2, 1.0)
+        cells = cells[cells.pixels >= np.minimum(self.options.min_pixels, np.floor(possible))]
         if self.options.denoise:
-            cells = self._denoised(cells, keyframes, T_world_keyframe)
-        color = np.rint(cells.color / cells.weight[:, None]).astype(np.uint8)
-        anchor_cam = _move_each(invert(T_world_keyframe), cells.best_keyframe, cells.points.astype(np.float32))
-        spacing = np.maximum(self.cell_size, cells.best_footprint)
-        spacing = np.hypot(spacing, self.options.uncertainty / np.sqrt(cells.weight)).astype(np.float32)
-        made = ray_aligned(
-            anchor_cam, cells.best_keyframe, T_world_keyframe, self.options.coverage * spacing, color, self.options
+            cells = self._denoised(cells, frames)
+        T_world_keyframe = self._T_world_keyframe
+        anchor_cam = _move_each(invert(T_world_keyframe), cells.keyframe, cells.points.astype(np.float32))
+        spacing = np.hypot(
+            np.maximum(self.cell_size, cells.footprint), self.options.uncertainty / np.sqrt(cells.weights)
         )
+        colors = np.rint(cells.colors).astype(np.uint8)
+        s_perp = (self.options.coverage * spacing).astype(np.float32)
+        made = ray_aligned(anchor_cam, cells.keyframe, T_world_keyframe, s_perp, colors, self.options)
         return isotropic(made) if self.options.initialisation == "isotropic" else made
 
-    def _denoised(self, cells: _Cells, keyframes: Iterable[Frame], T_world_keyframe: NDArray[np.float64]) -> _Cells:
+    def _denoised(self, cells: Cells, frames: Iterable[PosedFrame]) -> Cells:
         """The cells' points where all depth images have the surface, averaged by the cells that they are in now."""
-        usable = (
-            (frame, np.where(away_from_edges(frame.depth_m, self.options.edge), frame.depth_m, np.float32(0)))
-            for frame in keyframes
-        )
-        found = fusion.denoised(cells.points, usable, T_world_keyframe)
+        directions = cells.points - self._T_world_keyframe[cells.keyframe, :3, 3]
+        found = fusion.denoised(cells.points, directions, frames, self.options.edge)
         seen = found.weights > 0  # what no image shows, because its pixel is another point's, stays as it was measured
-        weight = np.where(seen, found.weights, cells.weight)
-        return _Cells(
-            cell_keys(found.points, self.cell_size),
-            weight,
-            weight[:, None] * found.points,
-            (weight / cells.weight)[:, None] * cells.color,
-            cells.pixels,
-            np.where(seen, found.best, cells.best_weight),
-            np.where(seen, found.keyframe, cells.best_keyframe),
-            cells.best_footprint,
-        )[found.kept].merged()
-
-    def _measure(self, frame: Frame, T_world_cam: NDArray[np.float64], row: int) -> _Cells | None:
-        step = self.options.pixel_stride or self._stride(frame)
-        usable = away_from_edges(frame.depth_m, self.options.edge)[::step, ::step]
-        v, u = (step * index for index in np.nonzero(usable))
-        if len(v) == 0:
-            return None
-        depth = frame.depth_m[v, u]
-        pixels = np.stack((u, v), axis=1).astype(np.float32)
-        points = transform(T_world_cam, back_project(pixels, depth, frame.intrinsics).astype(np.float64))
-        key, cell = np.unique(cell_keys(points, self.cell_size), return_inverse=True)
-        weight = 1.0 / depth_sigma(depth).astype(np.float64) ** 2
-        total = np.bincount(cell, weight)
-        count = np.bincount(cell)
-        footprint = np.bincount(cell, step * depth / frame.intrinsics.fx) / count
-        colors = frame.color[v, u]
-        return _Cells(
-            key,
-            total,
-            np.stack([np.bincount(cell, weight * points[:, i]) for i in range(3)], axis=1),
-            np.stack([np.bincount(cell, weight * colors[:, i]) for i in range(3)], axis=1),
-            count.astype(np.int64),
-            total / count,
-            np.full(len(key), row, np.int32),
-            footprint.astype(np.float32),
+        moved = replace(
+            cells,
+            points=found.points,
+            weights=np.where(seen, found.weights, cells.weights),
+            best=np.where(seen, found.best, cells.best),
+            keyframe=np.where(seen, found.keyframe, cells.keyframe),
         )
+        sums = CellSums(self.cell_size)
+        sums.add(moved[found.kept])
+        return sums.cells()
 
     def _stride(self, frame: Frame) -> int:
         """As many pixels as leave 320 columns, or more where cells are small: about two to a cell's edge."""
-        measured = frame.depth_m[frame.depth_m > 0]
+        measured = frame.depth_m[::4, ::4]
+        measured = measured[measured > 0]
         usual = float(np.median(measured)) if len(measured) else 1.0
         fine = int(0.5 * self.cell_size * frame.intrinsics.fx / usual)
         return max(1, min(frame.intrinsics.width // 320, fine))
-
-    def _merge(self) -> None:
-        if not self._pending:
-            return
-        cells, *others = self._pending if self._cells is None else [self._cells, *self._pending]
-        self._cells = _Cells(
-            *(np.concatenate([getattr(c, f.name) for c in (cells, *others)]) for f in fields(_Cells))
-        ).merged()
-        self._pending = []
-
-
-def cell_keys(points_world: NDArray[np.float64], cell_size: float) -> NDArray[np.int64]:
-    """(N, 3) metres to (N,) one integer per cell; cells within 2**20 of the origin along each axis are told apart."""
-    index = np.floor(points_world / cell_size).astype(np.int64) + _CELLS_PER_AXIS
-    return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
 
 
 def ray_aligned(
@@ -250,8 +144,9 @@ def ray_aligned(
     """Gaussians at (N, 3) anchors in their keyframes' camera frames, local +z along the viewing ray and
     s = (s_perp, s_perp, gamma s_perp): the paper's geometry-aware initialisation."""
     ray = anchor_cam / np.linalg.norm(anchor_cam, axis=1, keepdims=True)
-    # The shortest rotation that takes +z to the ray; rays point forward, so 1 + ray_z > 0.
-    quats_cam = np.stack((1 + ray[:, 2], -ray[:, 1], ray[:, 0], np.zeros(len(ray))), axis=1)
+    # The shortest rotation that takes +z to the ray. What a frame beside the keyframe shows may lie behind it, but for
+    # exactly backwards there is one; there, none does, for an ellipsoid has no sign.
+    quats_cam = np.stack((np.maximum(1 + ray[:, 2], 1e-6), -ray[:, 1], ray[:, 0], np.zeros(len(ray))), axis=1)
     quats_cam /= np.linalg.norm(quats_cam, axis=1, keepdims=True)
     quats_keyframe = rotations_to_quats(T_world_keyframe[:, :3, :3])
     n = len(anchor_cam)
@@ -328,11 +223,3 @@ def _move_each(T: NDArray[np.float64], row: NDArray[np.int32], points: NDArray[n
     """Points (N, 3), each by its own transform T[row]."""
     moved = np.einsum("nij,nj->ni", T[row, :3, :3], points.astype(np.float64)) + T[row, :3, 3]
     return moved.astype(np.float32)
-
-
-def _no_gaussians() -> Gaussians:
-    empty = np.zeros((0, 3), np.float32)
-    return Gaussians(
-        empty, empty, np.zeros((0, 4), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.uint8),
-        np.zeros(0, np.int32), empty,
-    )  # fmt: skip

@@ -26,7 +26,7 @@ from torch import Tensor
 from ..errors import ConfigError
 from ..registry import require_positive
 from ..types import Gaussians
-from .anchors import cell_keys
+from .cells import cell_keys
 from .images import View
 from .rasterizers.base import ALPHA_MIN, Rasterizer, Rendered
 

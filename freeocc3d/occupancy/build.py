@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Frame, Gaussians, Occupancy
+from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, PosedFrame
 from . import carve, splat
 from .grid import union, unpack
 
@@ -15,36 +15,32 @@ from .grid import union, unpack
 def build_occupancy(
     gaussians: Gaussians,
     features: NDArray[np.float16],
-    keyframes: Sequence[Frame],
-    T_world_keyframe: NDArray[np.float64],
+    frames: Iterable[PosedFrame],
     splatting: splat.Options,
     carving: carve.Options,
     origin: NDArray[np.float64] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Occupancy:
-    """The occupancy map of N Gaussians with features (N, D) and of the K keyframes' depth images at (K, 4, 4) poses.
+    """The occupancy map of N Gaussians with features (N, D) and of depth images.
 
     origin: (3,) lower corner of voxel (0, 0, 0); the world's origin by default.  progress: called with the number of
-    keyframes looked at.
+    frames looked at.
     """
     origin = np.zeros(3) if origin is None else np.asarray(origin, np.float64)
     size = splatting.voxel_size
     bins = splat.bin_gaussians(gaussians, origin, size, splatting.cutoff)
 
-    seen = [
-        carve.visible_blocks(frame, T, origin, size, carving.ray_step)
-        for frame, T in zip(keyframes, T_world_keyframe, strict=True)
-    ]
-    packed = union(bins.packed, *seen)
-    evidence = carve.Evidence(packed, origin, size, carving)
-    for done, (frame, T) in enumerate(zip(keyframes, T_world_keyframe, strict=True), start=1):
-        evidence.add(frame, T)
+    evidence = carve.Evidence(origin, size, carving)
+    for done, posed in enumerate(frames, start=1):
+        evidence.add(posed.frame, posed.T_world_cam)
         progress(done)
+    packed = union(bins.packed, evidence.packed)
+    free, hits = evidence.at(packed)
 
     probability = np.zeros((len(packed), BLOCK**3), np.float32)
     splatted = np.searchsorted(packed, bins.packed)
     probability[splatted] = splat.probability(bins, unpack(bins.packed))
-    state = classify(probability, evidence.free, evidence.hits, splatting, carving)
+    state = classify(probability, free, hits, splatting, carving)
 
     slots = np.full(state.shape, -1, np.int32)
     occupied = state == OCCUPIED
@@ -56,8 +52,8 @@ def build_occupancy(
         origin=origin,
         keys=unpack(packed),
         probability=probability,
-        free=evidence.free,
-        hits=evidence.hits,
+        free=free,
+        hits=hits,
         state=state,
         features=normalized(means[:, 3:]),
         colors=np.rint(means[:, :3]).astype(np.uint8),

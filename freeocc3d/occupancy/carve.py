@@ -27,53 +27,101 @@ class Options:
     """Growth of a depth's standard deviation with its square, 1/m; three of them are added to the margin."""
     min_free: int = 1
     """Depth images that must see through a voxel that holds no surface before it counts as free."""
+    every: int = 1
+    """Every n-th tracked frame tells what is free, besides the keyframes; 0 = keyframes alone."""
     ray_step: int = 16
     """Every n-th pixel's ray (more where blocks are small) is followed to find the blocks that a camera looked into."""
 
     def __post_init__(self) -> None:
         require_positive(self, "margin", "min_free", "ray_step")
-        if self.noise < 0:
-            raise ConfigError(f"'noise' must not be negative, got {self.noise}.")
-
-
-def visible_blocks(
-    frame: Frame, T_world_cam: NDArray[np.float64], origin: NDArray[np.float64], voxel_size: float, ray_step: int
-) -> NDArray[np.int64]:
-    """Packed keys of the blocks between the camera and what its depth image shows. Rays are no farther apart than half
-    a block at the greatest depth, so that few blocks are missed, and those at their corners."""
-    farthest = max(float(frame.depth_m.max(initial=0.0)), 1e-3)
-    ray_step = max(1, min(ray_step, int(0.5 * BLOCK * voxel_size * frame.intrinsics.fx / farthest)))
-    depth = frame.depth_m[ray_step // 2 :: ray_step, ray_step // 2 :: ray_step]
-    v, u = np.nonzero(depth)
-    if len(v) == 0:
-        return np.zeros(0, np.int64)
-    pixels = np.stack((u, v), axis=1) * ray_step + ray_step // 2
-    points = transform(T_world_cam, back_project(pixels, depth[v, u], frame.intrinsics).astype(np.float64))
-    return blocks_along_rays(points, T_world_cam[:3, 3], origin, voxel_size)
+        if self.noise < 0 or self.every < 0:
+            raise ConfigError("'noise' and 'every' must not be negative.")
 
 
 class Evidence:
-    """Counts, for every voxel of a set of blocks, the depth images that saw through it and those that ended in it.
+    """Counts, for every voxel, the depth images that saw through it and those that ended in it.
 
     A voxel's centre and the four points half a voxel beside it (along the image's axes) are looked up in the depth
     image: it is seen through only if none of the five shows anything in front of its back, so that a chair's leg that
-    fills a quarter of a voxel is not seen through beside the leg. 4 bytes a voxel.
+    fills a quarter of a voxel is not seen through beside the leg.
+
+    A frame counts in the blocks that the rays of its pixels pass through, whatever other frames do: the counts do not
+    depend on the order of frames, and a frame can be taken out again. 4 bytes a voxel, in blocks that were looked into.
     """
 
-    def __init__(self, packed: NDArray[np.int64], origin: NDArray[np.float64], voxel_size: float, options: Options):
-        self.keys = unpack(packed)
+    def __init__(self, origin: NDArray[np.float64], voxel_size: float, options: Options):
         self.origin = np.asarray(origin, np.float64)
         self.voxel_size = voxel_size
         self.options = options
-        self.free = np.zeros((len(packed), BLOCK**3), np.uint16)
-        self.hits = np.zeros((len(packed), BLOCK**3), np.uint16)
+        self.packed = np.zeros(0, np.int64)
+        """(B,) ascending packed keys of the blocks that were looked into."""
+        self._row = np.zeros(0, np.int64)  # of each of them in the counts, which have room for more
+        self._free = np.zeros((0, BLOCK**3), np.uint16)
+        self._hits = np.zeros((0, BLOCK**3), np.uint16)
 
-    def add(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> None:
-        """Count one depth image."""
+    @property
+    def free(self) -> NDArray[np.uint16]:
+        """(B, 512) depth images that saw through each voxel."""
+        return self._free[self._row]
+
+    @property
+    def hits(self) -> NDArray[np.uint16]:
+        """(B, 512) depth images that ended in each voxel."""
+        return self._hits[self._row]
+
+    def add(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Count one depth image. Returns the packed keys of the blocks that it looks into."""
+        packed = self.visible_blocks(frame, T_world_cam)
+        self._make_room(np.setdiff1d(packed, self.packed, assume_unique=True))
+        self._count(packed, frame, T_world_cam, 1)
+        return packed
+
+    def remove(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Take back a depth image that was added at this pose. Returns the packed keys of the blocks that it looked
+        into; they stay, with counts that may be zero."""
+        packed = self.visible_blocks(frame, T_world_cam)
+        self._count(packed, frame, T_world_cam, -1)
+        return packed
+
+    def visible_blocks(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Ascending packed keys of the blocks between the camera and what its depth image shows, and just behind it.
+        Rays are no farther apart than half a block at the greatest depth."""
+        camera = frame.intrinsics
+        farthest = max(float(frame.depth_m.max(initial=0.0)), 1e-3)
+        step = max(1, min(self.options.ray_step, int(0.5 * BLOCK * self.voxel_size * camera.fx / farthest)))
+        rows, columns = (np.union1d(np.arange(0, n, step), n - 1) for n in frame.depth_m.shape)
+        measured = frame.depth_m[np.ix_(rows, columns)]
+        v, u = np.nonzero(measured)
+        pixels = np.stack((columns[u], rows[v]), axis=1)
+        z = measured[v, u] + 0.5 * self.voxel_size + 3 * self.options.noise * measured[v, u] ** 2
+        points = transform(T_world_cam, back_project(pixels, z.astype(np.float32), camera).astype(np.float64))
+        return blocks_along_rays(points, T_world_cam[:3, 3], self.origin, self.voxel_size)
+
+    def at(self, packed: NDArray[np.int64]) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+        """(B, 512) free and hits of some blocks, zeros where nothing looked."""
+        free, hits = (np.zeros((len(packed), BLOCK**3), np.uint16) for _ in range(2))
+        known = np.isin(packed, self.packed)
+        rows = self._row[np.searchsorted(self.packed, packed[known])]
+        free[known], hits[known] = self._free[rows], self._hits[rows]
+        return free, hits
+
+    def _make_room(self, new: NDArray[np.int64]) -> None:
+        if not len(new):
+            return
+        used, wanted = len(self.packed), len(self.packed) + len(new)
+        if wanted > len(self._free):
+            more = np.zeros((max(wanted, 3 * len(self._free) // 2) - len(self._free), BLOCK**3), np.uint16)
+            self._free, self._hits = np.concatenate((self._free, more)), np.concatenate((self._hits, more))
+        place = np.searchsorted(self.packed, new)
+        self.packed = np.insert(self.packed, place, new)
+        self._row = np.insert(self._row, place, np.arange(used, wanted))
+
+    def _count(self, packed: NDArray[np.int64], frame: Frame, T_world_cam: NDArray[np.float64], change: int) -> None:
         camera = frame.intrinsics
         T_cam_world = invert(T_world_cam)
         _count(
-            self.keys,
+            unpack(packed),
+            self._row[np.searchsorted(self.packed, packed)],
             (T_cam_world[:3, :3] * self.voxel_size).astype(np.float32),
             (T_cam_world[:3, :3] @ self.origin + T_cam_world[:3, 3]).astype(np.float32),
             np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32),
@@ -81,14 +129,16 @@ class Evidence:
             np.float32(self.voxel_size),
             np.float32(self.options.margin * self.voxel_size),
             np.float32(3 * self.options.noise),
-            self.free,
-            self.hits,
+            np.uint16(change % 65536),  # adding 65535 takes one away
+            self._free,
+            self._hits,
         )
 
 
 @njit(parallel=True, cache=True)
 def _count(
     keys: NDArray[np.int32],
+    rows: NDArray[np.int64],
     R: NDArray[np.float32],  # voxels to metres in the camera's frame
     t: NDArray[np.float32],
     camera: NDArray[np.float32],
@@ -96,24 +146,16 @@ def _count(
     voxel_size: np.float32,
     margin: np.float32,
     noise: np.float32,
+    change: np.uint16,
     free: NDArray[np.uint16],
     hits: NDArray[np.uint16],
 ) -> None:
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     height, width = depth_m.shape
     half = np.float32(0.5) * voxel_size
-    radius = half * np.float32(BLOCK * math.sqrt(3.0))
     for b in prange(len(keys)):
+        row_of_block = rows[b]
         x0, y0, z0 = keys[b, 0] * BLOCK, keys[b, 1] * BLOCK, keys[b, 2] * BLOCK
-        middle = np.float32(0.5 * BLOCK)
-        mx, my, mz = x0 + middle, y0 + middle, z0 + middle
-        depth_of_block = R[2, 0] * mx + R[2, 1] * my + R[2, 2] * mz + t[2]
-        if depth_of_block < -radius or not _sphere_in_view(
-            R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz + t[0],
-            R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz + t[1],
-            depth_of_block, radius, camera, height, width,
-        ):  # fmt: skip
-            continue
         for voxel in range(BLOCK**3):
             vx = x0 + voxel // 64 + np.float32(0.5)
             vy = y0 + voxel // 8 % 8 + np.float32(0.5)
@@ -138,9 +180,9 @@ def _count(
                     and _beyond(depth_m, row - dv, column, z + far)
                     and _beyond(depth_m, row + dv, column, z + far)
                 ):
-                    free[b, voxel] += np.uint16(1)
+                    free[row_of_block, voxel] += change
             elif abs(depth - z) <= half + noise * z * z:
-                hits[b, voxel] += np.uint16(1)
+                hits[row_of_block, voxel] += change
 
 
 @njit(cache=True)
@@ -150,24 +192,3 @@ def _beyond(depth_m: NDArray[np.float32], row: int, column: int, z: np.float32) 
         return True
     depth = depth_m[row, column]
     return depth <= 0 or depth > z
-
-
-@njit(cache=True)
-def _sphere_in_view(
-    x: np.float32,
-    y: np.float32,
-    z: np.float32,
-    radius: np.float32,
-    camera: NDArray[np.float32],
-    height: int,
-    width: int,
-) -> bool:
-    """Whether a sphere at a camera-frame point may project into the image: false only if it certainly does not."""
-    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
-    for f, c, size, along in ((fx, cx, width, x), (fy, cy, height, y)):
-        low, high = -(c + np.float32(0.5)) / f, (size - c - np.float32(0.5)) / f
-        if along - low * z < -radius * math.sqrt(1 + low * low):
-            return False
-        if along - high * z > radius * math.sqrt(1 + high * high):
-            return False
-    return True

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ..hashing import put
 from ..types import BLOCK
 
 KEY_LIMIT = 1 << 20
@@ -37,30 +40,16 @@ def blocks_along_rays(
     origin: NDArray[np.float64],
     voxel_size: float,
 ) -> NDArray[np.int64]:
-    """Packed keys of the blocks that lie on the segments from a camera's centre to (P, 3) points, sampled at half a
-    block; a corner that a segment only grazes may be missed."""
+    """Ascending packed keys of all blocks that the segments from a camera's centre to (P, 3) points pass through."""
     edge = BLOCK * voxel_size
-    steps = np.linalg.norm(points_world - center_world, axis=1) / (0.5 * edge)
-    fractions = np.linspace(0.0, 1.0, int(np.ceil(steps.max(initial=0.0))) + 1)
-    samples = center_world + (points_world - center_world)[:, None] * fractions[None, :, None]
-    keys = np.floor((samples.reshape(-1, 3) - origin) / edge).astype(np.int64)
-    return np.unique(pack(keys))
+    ends = (np.asarray(points_world, np.float64) - origin) / edge
+    return np.sort(_walked((np.asarray(center_world, np.float64) - origin) / edge, ends))
 
 
 @njit(cache=True)
 def packed_key(i: int, j: int, k: int) -> int:
     """``pack`` for one block index."""
     return ((i + KEY_LIMIT) << 42) | ((j + KEY_LIMIT) << 21) | (k + KEY_LIMIT)
-
-
-@njit(cache=True)
-def _slot(table: NDArray[np.int64], key: int) -> int:
-    """Where ``key`` stands, or would be put, in an open-addressing table whose size is a power of two (-1 = empty)."""
-    mask = len(table) - 1
-    at = (((key * -7046029254386353131) & 0x7FFFFFFFFFFFFFFF) >> 20) & mask  # Fibonacci hashing
-    while table[at] != -1 and table[at] != key:
-        at = (at + 1) & mask
-    return at
 
 
 @njit(cache=True, nogil=True)
@@ -77,40 +66,40 @@ def touched_blocks(lo: NDArray[np.int32], hi: NDArray[np.int32]) -> NDArray[np.i
             for j in range(lo[g, 1] >> 3, (hi[g, 1] >> 3) + 1):
                 for k in range(lo[g, 2] >> 3, (hi[g, 2] >> 3) + 1):
                     key = packed_key(i, j, k)
-                    if key == last:
-                        continue
-                    last = key
-                    at = _slot(table, key)
-                    if table[at] == key:
-                        continue
-                    table[at] = key
-                    count += 1
-                    if 2 * count > len(table):
-                        grown = np.full(2 * len(table), -1, np.int64)
-                        for old in table:
-                            if old != -1:
-                                grown[_slot(grown, old)] = old
-                        table = grown
+                    if key != last:
+                        last = key
+                        table, count = put(table, count, key)
     return table[table != -1]
 
 
-@njit(cache=True)
-def build_table(packed: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """A hash table from packed key to row: (table of keys, rows beside them)."""
-    size = 1024
-    while size < 2 * len(packed) + 1:
-        size *= 2
-    table = np.full(size, -1, np.int64)
-    rows = np.full(size, -1, np.int32)
-    for row in range(len(packed)):
-        at = _slot(table, packed[row])
-        table[at] = packed[row]
-        rows[at] = row
-    return table, rows
+@njit(cache=True, nogil=True)
+def _walked(start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Distinct packed keys of the unit cells on the segments from one point to (P, 3) others.
 
-
-@njit(cache=True)
-def find(table: NDArray[np.int64], rows: NDArray[np.int32], key: int) -> int:
-    """Row of ``key``, -1 if it is not there."""
-    at = _slot(table, key)
-    return rows[at] if table[at] == key else -1
+    Source: J. Amanatides, A. Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, Eurographics 1987.
+    """
+    table = np.full(1024, -1, np.int64)
+    count = 0
+    cell, step = np.empty(3, np.int64), np.empty(3, np.int64)
+    next_face, between = np.empty(3), np.empty(3)  # as shares of the segment
+    for p in range(len(ends)):
+        faces = 0
+        for i in range(3):
+            cell[i] = math.floor(start[i])
+            length = ends[p, i] - start[i]
+            step[i] = 1 if length > 0 else -1
+            faces += abs(np.int64(math.floor(ends[p, i])) - cell[i])
+            between[i] = 1.0 / abs(length) if length != 0 else np.inf
+            ahead = cell[i] + 1 - start[i] if length > 0 else start[i] - cell[i]
+            next_face[i] = ahead * between[i] if length != 0 else np.inf
+        table, count = put(table, count, packed_key(cell[0], cell[1], cell[2]))
+        for _ in range(faces):
+            i = 0
+            if next_face[1] < next_face[i]:
+                i = 1
+            if next_face[2] < next_face[i]:
+                i = 2
+            cell[i] += step[i]
+            next_face[i] += between[i]
+            table, count = put(table, count, packed_key(cell[0], cell[1], cell[2]))
+    return table[table != -1]

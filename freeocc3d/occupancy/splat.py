@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 
 from ..errors import ConfigError
 from ..geometry import quats_to_rotations
+from ..hashing import build_table, find
 from ..registry import require_positive
 from ..types import BLOCK, Gaussians
-from .grid import build_table, find, packed_key, touched_blocks, union
+from .grid import packed_key, touched_blocks, union
 
 _SMALLEST_SCALE = 1e-5
 
@@ -199,7 +200,7 @@ def _sort_by_block(
     parts = [slice(first, end) for first, end in pairwise(bounds)]
     with ThreadPoolExecutor(len(parts)) as threads:
         packed = union(*threads.map(lambda part: touched_blocks(lo[part], hi[part]), parts))
-        table, rows = build_table(packed)
+        table, rows = build_table(packed, len(packed))
         count = np.stack(list(threads.map(lambda part: _count(table, rows, lo[part], hi[part], len(packed)), parts)))
         start = np.concatenate(([0], np.cumsum(count.sum(axis=0))))
         place = start[:-1] + np.cumsum(count, axis=0) - count  # where each part's share of each block begins

@@ -1,0 +1,55 @@
+"""Open-addressing hash tables of 64-bit keys for compiled code: arrays whose size is a power of two, -1 = empty."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+
+@njit(cache=True, nogil=True)
+def slot(table: NDArray[np.int64], key: int) -> int:
+    """Where ``key`` stands, or would be put."""
+    mask = len(table) - 1
+    at = (((key * -7046029254386353131) & 0x7FFFFFFFFFFFFFFF) >> 20) & mask  # Fibonacci hashing
+    while table[at] != -1 and table[at] != key:
+        at = (at + 1) & mask
+    return at
+
+
+@njit(cache=True, nogil=True)
+def put(table: NDArray[np.int64], count: int, key: int) -> tuple[NDArray[np.int64], int]:
+    """Add a key to a set, which may move: (table, number of keys)."""
+    at = slot(table, key)
+    if table[at] == key:
+        return table, count
+    table[at] = key
+    if 2 * (count + 1) > len(table):
+        grown = np.full(2 * len(table), -1, np.int64)
+        for old in table:
+            if old != -1:
+                grown[slot(grown, old)] = old
+        table = grown
+    return table, count + 1
+
+
+@njit(cache=True, nogil=True)
+def build_table(keys: NDArray[np.int64], room: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """A table from each of the keys to its row, with room for a number of keys: (table of keys, rows beside them)."""
+    size = 1024
+    while size < 2 * room + 1:
+        size *= 2
+    table = np.full(size, -1, np.int64)
+    rows = np.full(size, -1, np.int32)
+    for row in range(len(keys)):
+        at = slot(table, keys[row])
+        table[at] = keys[row]
+        rows[at] = row
+    return table, rows
+
+
+@njit(cache=True, nogil=True)
+def find(table: NDArray[np.int64], rows: NDArray[np.int32], key: int) -> int:
+    """Row of ``key``, -1 if it is not there."""
+    at = slot(table, key)
+    return rows[at] if table[at] == key else -1
