@@ -6,7 +6,7 @@ from scenes import CAMERA, lifted, wall_frame
 
 from freeocc3d.gaussians import anchors, edges
 from freeocc3d.geometry import depth_sigma, invert, project, quats_to_rotations, rotations_to_quats, transform
-from freeocc3d.occupancy import splat
+from freeocc3d.occupancy import reference, splat
 from freeocc3d.types import Frame
 
 CELL = 0.04
@@ -89,10 +89,8 @@ def test_at_the_default_coverage_a_wall_reaches_one_half_at_six_tenths_of_a_voxe
     g = lifted([wall_frame(2.0 + 0.5 * CELL)], [np.eye(4)])
     wall = float(g.means[0, 2])
     x, y = (np.random.default_rng(0).uniform(-0.5, 0.5, 200) for _ in range(2))
-    alpha = {
-        offset: splat.probability_reference(g, np.stack((x, y, np.full(200, wall + offset * V)), axis=1), 3.0).mean()
-        for offset in (0.0, 0.6, 1.0)
-    }
+    points = {offset: np.stack((x, y, np.full(200, wall + offset * V)), axis=1) for offset in (0.0, 0.6, 1.0)}
+    alpha = {offset: reference.probability(g, at, splat.Options()).mean() for offset, at in points.items()}
     assert alpha[0.0] > 0.9
     assert alpha[0.6] == pytest.approx(0.5, abs=0.05)
     assert alpha[1.0] < 0.05

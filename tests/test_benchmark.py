@@ -25,13 +25,13 @@ def run(*arguments: object, code: int = 0) -> str:
 
 def test_every_part_of_a_few_frames(tmp_path: Path) -> None:
     bedroom = data_folder() / "house" / "bedroom"
-    names = ("rgbd", "rgbd_true_poses", "rgbd_poisson", *benchmark.PEERS, "query")
+    names = ("rgbd", "rgbd_true_poses", "rgbd_trident", *benchmark.PEERS, "query")
     printed = run("--captures", bedroom, "--variants", *names, "--frames", 8, "-o", tmp_path / "out", "--json")
     results = json.loads(printed)
     rows = {row["variant"]: row for row in results["rows"]}
     assert set(rows) == {name for name in names if name != "query"}
     for name, row in rows.items():
-        assert row["available"] == (name != "rgbd_poisson"), row["why"]
+        assert row["available"] == (name != "rgbd_trident"), row["why"]
         if row["available"]:
             assert 0 < row["iou"] < 1
             assert row["miou"] is None
@@ -40,13 +40,13 @@ def test_every_part_of_a_few_frames(tmp_path: Path) -> None:
     for name in ("rgbd", "rgbd_true_poses", "dense_slam_tsdf"):
         assert rows[name]["ate_rmse_m"] < 0.05
     assert rows["rgbd"]["map_bytes"] > 0
-    assert "iou" not in rows["rgbd_poisson"]
+    assert "iou" not in rows["rgbd_trident"]
     assert results["kernels"]["query"]["loaded_seconds"] > 0
     written = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"results.json", "table.md", "iou.png", "stages.png", "trajectory_house_bedroom_rgbd.png"} <= written
     table = (tmp_path / "out" / "table.md").read_text()
-    lacking = next(line for line in table.splitlines() if "rgbd_poisson" in line)
-    assert "**not available**, needs the projection mode" in lacking
+    lacking = next(line for line in table.splitlines() if "rgbd_trident" in line)
+    assert "**not available**, needs the encoder" in lacking
     assert "0" not in lacking.split("|")[3]
     assert benchmark.moved(results, results) == "nothing moved"
 

@@ -17,7 +17,8 @@ from freeocc3d.evaluation.classes import ClassMap, identity
 from freeocc3d.evaluation.ground_truth import GroundTruth, save_ground_truth
 from freeocc3d.evaluation.iou import Prediction
 from freeocc3d.geometry import quats_to_rotations, rotations_to_quats
-from freeocc3d.occupancy.splat import Options, posterior_mean_reference, probability_reference
+from freeocc3d.occupancy import reference
+from freeocc3d.occupancy.splat import Options
 from freeocc3d.types import Gaussians, PosedFrame
 
 SHAPE = (40, 40, 48)
@@ -119,11 +120,11 @@ def test_gaussians_are_projected_at_the_lattices_centres() -> None:
     semantics = np.eye(2, dtype=np.float32)[np.arange(60) % 2]
     settings = config.load(None, ["occupancy.cutoff=8"])
     found = project.of_gaussians(some, semantics, settings, Alignment.identity(), truth)
-    points = truth.centers().reshape(-1, 3)
-    expected = (probability_reference(some, points) >= Options().threshold).reshape(truth.shape)
+    points, wide = truth.centers().reshape(-1, 3), Options(cutoff=8.0)
+    expected = (reference.probability(some, points, wide) >= wide.threshold).reshape(truth.shape)
     np.testing.assert_array_equal(found.occupied, expected)
     assert found.labels is not None
-    nearest = posterior_mean_reference(some, points, semantics).argmax(axis=1).reshape(truth.shape) + 1
+    nearest = reference.posterior_mean(some, points, semantics, wide).argmax(axis=1).reshape(truth.shape) + 1
     np.testing.assert_array_equal(found.labels, np.where(expected, nearest, 0))
 
 

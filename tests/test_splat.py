@@ -1,27 +1,32 @@
 """The projection against its plain reference and against cases whose answers are known."""
 
+import math
+
 import numpy as np
 import pytest
 from scenes import gaussians, random_gaussians
 
-from freeocc3d.occupancy import grid, splat
+from freeocc3d.errors import ConfigError
+from freeocc3d.geometry import quats_to_rotations
+from freeocc3d.occupancy import grid, reference, splat
+from freeocc3d.occupancy.mass import box_masses
 from freeocc3d.types import Gaussians
 
 V = 0.08
 LOCAL = np.stack((np.arange(512) // 64, np.arange(512) // 8 % 8, np.arange(512) % 8), axis=1)
 
 
-def project(g: Gaussians, origin=(0.0, 0.0, 0.0), cutoff: float = 3.0):
+def project(g: Gaussians, origin=(0.0, 0.0, 0.0), **options):
     """Bins, block keys, probabilities (B, 512) and voxel centres (B * 512, 3)."""
     origin = np.asarray(origin, float)
-    bins = splat.bin_gaussians(g, origin, V, cutoff)
+    bins = splat.bin_gaussians(g, origin, splat.Options(voxel_size=V, **options))
     keys = grid.unpack(bins.packed)
     centers = origin + ((keys[:, None] * 8 + LOCAL).reshape(-1, 3) + 0.5) * V
     return bins, keys, splat.probability(bins, keys), centers
 
 
-def alpha_at(g: Gaussians, point) -> float:
-    _, _, alpha, centers = project(g)
+def alpha_at(g: Gaussians, point, **options) -> float:
+    _, _, alpha, centers = project(g, **options)
     return float(alpha.reshape(-1)[np.linalg.norm(centers - point, axis=1).argmin()])
 
 
@@ -52,21 +57,82 @@ def test_a_rotated_gaussian_reaches_along_its_long_axis() -> None:
     assert alpha_at(g, center + (V, 0, 0)) == pytest.approx(0.0, abs=1e-3)
 
 
+def test_poisson_composes_by_opacity_as_its_equation_says() -> None:
+    center = np.array([0.5, 0.5, 0.5]) * V
+    means = np.stack((center - (0.03, 0, 0), center + (0.05, 0, 0)))
+    a, b = np.exp(-0.5 * (0.03 / 0.04) ** 2), np.exp(-0.5 * (0.05 / 0.04) ** 2)
+    two = gaussians(means, 0.04, opacities=(0.9, 0.7))
+    assert alpha_at(two, center, projection="poisson") == pytest.approx(1 - np.exp(-0.9 * a - 0.7 * b), rel=1e-4)
+
+
+def test_released_fills_the_box_around_a_gaussian_evenly() -> None:
+    g = gaussians(np.array([0.1, 0.6, 0.4]) * V, 0.03, opacities=(0.999,))
+    _, keys, alpha, _ = project(g, projection="released")
+    filled = alpha.reshape(-1) > 0
+    voxels = (keys[:, None] * 8 + LOCAL).reshape(-1, 3)[filled]
+    np.testing.assert_array_equal(voxels.min(axis=0), (-2, -2, -2))  # ceil(3 * 0.03 / 0.08) = 2
+    np.testing.assert_array_equal(voxels.max(axis=0), (2, 2, 2))
+    assert len(voxels) == 125
+    np.testing.assert_allclose(alpha.reshape(-1)[filled], 1 - np.exp(-0.999), rtol=1e-4)
+
+
+@pytest.mark.parametrize("projection", ["probabilistic", "poisson"])
 @pytest.mark.parametrize("origin", [(0, 0, 0), (0.013, -0.021, 0.3)])
-def test_probability_equals_the_reference_on_random_gaussians(origin) -> None:
+def test_probability_equals_the_reference_on_random_gaussians(origin, projection) -> None:
     g = random_gaussians(400, seed=1)
-    _, _, alpha, centers = project(g, origin)
-    expected = splat.probability_reference(g, centers, cutoff=3.0)
+    _, _, alpha, centers = project(g, origin, projection=projection)
+    expected = reference.probability(g, centers, splat.Options(projection=projection))
     np.testing.assert_allclose(alpha.reshape(-1), expected, atol=2e-6)
-    assert expected.max() > 0.9
+    assert expected.max() > 0.6
 
 
 def test_what_the_cutoff_leaves_out_is_as_small_as_stated() -> None:
     g = random_gaussians(30, seed=2, extent=3.0)
-    _, _, alpha, centers = project(g, cutoff=3.0)
-    whole = splat.probability_reference(g, centers)
-    neighbours_left_out = 1.0 - (1.0 - np.exp(-4.5)) ** len(g)
-    assert np.abs(alpha.reshape(-1) - whole).max() <= neighbours_left_out
+    for projection, each in (("probabilistic", np.exp(-4.5)), ("integrated", 6 * 0.00135)):
+        near, far = (project(g, cutoff=cutoff, projection=projection) for cutoff in (3.0, 6.0))
+        whole = far[2][np.searchsorted(far[0].packed, near[0].packed)]
+        assert 0 < np.abs(near[2] - whole).max() <= 1.0 - (1.0 - each) ** len(g)
+
+
+def test_mass_within_voxels_equals_quadrature() -> None:
+    """Spheres, needles and sheets, from a tenth of a voxel to several."""
+    rng = np.random.default_rng(7)
+    g = random_gaussians(8, seed=7, extent=0.2)
+    g.scales[:] = V * np.array([0.1, 0.3, 1.0, 2.0])[rng.integers(0, 4, (8, 3))]
+    options = splat.Options(voxel_size=V, projection="integrated")
+    _, _, alpha, centers = project(g, projection="integrated")
+    expected = reference.probability(g, centers, options)
+    np.testing.assert_allclose(alpha.reshape(-1), expected, atol=5e-5)
+    assert expected.max() > 0.5
+
+
+def test_mass_along_the_axes_is_in_closed_form_and_sums_to_one() -> None:
+    mass, key = np.zeros((8, 8, 8)), np.zeros(3, np.int32)
+    mean = np.array([4.2, 3.7, 4.0], np.float32)
+    for covariance in ((0.3, 0.0, 0.0, 0.2, 0.0, 0.1), (0.3, 0.1, 0.05, 0.2, -0.05, 0.1)):
+        box_masses(mean, np.array(covariance, np.float32), key, 0, 0, 0, 8, 8, 8, mass)
+        assert mass.sum() == pytest.approx(1.0, abs=1e-5)
+    box_masses(mean, np.array((0.25, 0, 0, 0.25, 0, 0.25), np.float32), key, 4, 3, 4, 5, 4, 5, mass)
+    halves = [
+        math.erf(b / math.sqrt(0.5)) - math.erf(a / math.sqrt(0.5)) for a, b in ((-0.2, 0.8), (-0.7, 0.3), (0, 1))
+    ]
+    assert mass[4, 3, 4] == pytest.approx(np.prod(halves) / 8, rel=1e-5)
+
+
+@pytest.mark.parametrize("flat", [(0.8, 0.8, 0.05), (0.05, 0.7, 0.8), (0.8, 0.05, 0.05)])
+def test_mass_of_sheets_and_needles_at_any_angle_sums_to_one(flat) -> None:
+    mass, key = np.zeros((8, 8, 8)), np.zeros(3, np.int32)
+    for R in quats_to_rotations(random_gaussians(40, seed=9).quats_wxyz.astype(float)):
+        S = R @ np.diag(np.array(flat) ** 2) @ R.T
+        covariance = S[np.triu_indices(3)].astype(np.float32)
+        box_masses(np.full(3, 4.1, np.float32), covariance, key, 0, 0, 0, 8, 8, 8, mass)
+        assert mass.min() >= 0
+        assert mass.sum() == pytest.approx(1.0, abs=1e-5)
+
+
+def test_an_unknown_projection_is_refused_with_what_there_is() -> None:
+    with pytest.raises(ConfigError, match="probabilistic, poisson"):
+        splat.Options(projection="average")
 
 
 def test_every_voxel_that_a_gaussian_reaches_lies_in_a_block() -> None:
@@ -79,16 +145,18 @@ def test_every_voxel_that_a_gaussian_reaches_lies_in_a_block() -> None:
     assert (np.diff(bins.start) > 0).all()
 
 
-def test_posterior_mean_equals_the_reference() -> None:
-    g = random_gaussians(300, seed=4)
-    bins, keys, alpha, centers = project(g)
+@pytest.mark.parametrize("projection", ["probabilistic", "integrated"])
+def test_posterior_mean_equals_the_reference(projection) -> None:
+    g = random_gaussians(300 if projection == "probabilistic" else 20, seed=4)
+    bins, keys, alpha, centers = project(g, projection=projection)
     wanted = alpha > 0.3
     slots = np.full(alpha.shape, -1, np.int32)
     slots[wanted] = np.arange(wanted.sum())
     values = np.random.default_rng(5).normal(size=(len(g), 9)).astype(np.float32)
     mean = splat.posterior_mean(bins, keys, slots, values)
-    expected = splat.posterior_mean_reference(g, centers[wanted.reshape(-1)], values, cutoff=3.0)
-    np.testing.assert_allclose(mean, expected, atol=2e-5)
+    options = splat.Options(projection=projection)
+    expected = reference.posterior_mean(g, centers[wanted.reshape(-1)], values, options)
+    np.testing.assert_allclose(mean, expected, atol=2e-5 if projection == "probabilistic" else 2e-4)
 
 
 def test_posterior_prefers_the_narrow_the_near_and_the_opaque() -> None:

@@ -24,11 +24,11 @@ def measure_splat() -> Figures:
     from freeocc3d.occupancy import splat
     from freeocc3d.occupancy.grid import unpack
 
-    cutoff, origin = splat.Options().cutoff, np.zeros(3)
+    options, origin = splat.Options(voxel_size=SPLAT_VOXEL_SIZE_M), np.zeros(3)
 
     def project(gaussians: Any, seconds: dict[str, float]) -> Any:
         mark = time.perf_counter()
-        bins = splat.bin_gaussians(gaussians, origin, SPLAT_VOXEL_SIZE_M, cutoff)
+        bins = splat.bin_gaussians(gaussians, origin, options)
         mark = lap(seconds, "sort into blocks", mark)
         splat.probability(bins, unpack(bins.packed))
         lap(seconds, "evaluate", mark)

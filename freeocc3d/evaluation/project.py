@@ -79,7 +79,7 @@ def of_gaussians(
     """
     splatting = _splatting(settings, truth)
     moved = anchors.aligned(gaussians, alignment.scale, alignment.rotation, alignment.translation)
-    bins = splat.bin_gaussians(moved, truth.origin, truth.voxel_size, splatting.cutoff, truth.shape)
+    bins = splat.bin_gaussians(moved, truth.origin, splatting, truth.shape)
     keys = unpack(bins.packed)
     probability = splat.probability(bins, keys)
     block, local = np.nonzero(probability >= splatting.threshold)

@@ -28,7 +28,7 @@ def build_occupancy(
     """
     origin = np.zeros(3) if origin is None else np.asarray(origin, np.float64)
     size = splatting.voxel_size
-    bins = splat.bin_gaussians(gaussians, origin, size, splatting.cutoff)
+    bins = splat.bin_gaussians(gaussians, origin, splatting)
 
     evidence = carve.Evidence(origin, size, carving)
     for done, posed in enumerate(frames, start=1):

@@ -1,13 +1,26 @@
 """Gaussian-to-occupancy projection (paper, Sec. "Gaussian-to-Occupancy Projection") over sparse voxel blocks.
 
-At a voxel's centre x, over the neighbouring Gaussians H(x) = {k : Mahalanobis distance of x to G_k <= cutoff}:
+Every mode is a product over the neighbouring Gaussians H(x) of a voxel with centre x and box V(x),
 
-    alpha_k(x) = exp(-1/2 (x - mu_k)^T Sigma_k^-1 (x - mu_k)),   Sigma_k = R(r_k) diag(s_k^2) R(r_k)^T        (A)
-    alpha(x)   = 1 - prod_k (1 - alpha_k(x))                      opacity is not part of it                    (B)
-    p(G_k | x) = N(x; mu_k, Sigma_k) o_k / sum_j N(x; mu_j, Sigma_j) o_j                                       (C)
+    alpha(x) = 1 - prod_{k in H(x)} (1 - c_k(x)),                                                             (B)
+
+with phi_k(x) = exp(-1/2 (x - mu_k)^T Sigma_k^-1 (x - mu_k)), Sigma_k = R(r_k) diag(s_k^2) R(r_k)^T, and
+
+    probabilistic   c_k = phi_k(x): the paper's, opacity is not part of it                                     (A)
+    poisson         c_k = 1 - exp(-o_k phi_k(x)), so that alpha = 1 - exp(-sum_k o_k phi_k(x))
+    integrated      c_k = the mass of N(mu_k, Sigma_k) within V(x)
+    released        as poisson, with Sigma_k (m^2) where Sigma_k^-1 belongs: the paper's code as it seems to run. phi is
+                    1 in all of H(x), in effect a dilation by it; for comparison.
+
+and the features of the voxel are posterior means,
+
+    p(G_k | x) = w_k(x) / sum_j w_j(x),  w_k = N(x; mu_k, Sigma_k) o_k  (integrated: c_k o_k, released: o_k phi_k)   (C)
     f(x)       = sum_k p(G_k | x) f_k                                                                          (D)
 
-A Gaussian that the cutoff leaves out would have contributed less than exp(-cutoff^2 / 2): 0.011 at the default of 3.
+H(x) is all k with a Mahalanobis distance of x to G_k of at most the cutoff; what that leaves out is a c_k of less than
+exp(-cutoff^2 / 2) each, 0.011 at the default of 3. Integrated: all whose bounding box at the cutoff touches V(x); what
+that leaves out is less than 6 Phi(-cutoff) of a Gaussian's mass, 0.008. Released: all whose voxel is, along each axis,
+at most ceil(cutoff s_max / voxel) voxels away.
 """
 
 from __future__ import annotations
@@ -22,12 +35,14 @@ from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 
 from ..errors import ConfigError
-from ..geometry import quats_to_rotations
 from ..hashing import build_table, find
 from ..registry import require_positive
 from ..types import BLOCK, Gaussians
 from .grid import packed_key, touched_blocks, union
+from .mass import box_masses
 
+PROJECTIONS = ("probabilistic", "poisson", "integrated", "released")
+_POINT, _POISSON, _MASS = 0, 1, 2
 _SMALLEST_SCALE = 1e-5
 
 
@@ -37,6 +52,9 @@ class Options:
 
     voxel_size: float = 0.08
     """Edge of a voxel, metres."""
+    projection: str = "probabilistic"
+    """What a Gaussian adds to a voxel: "probabilistic" (the paper's equations), "poisson" (with its opacity, in the
+    form of the paper's code), "integrated" (its mass within the voxel), "released" (a dilation, as that code runs)."""
     cutoff: float = 3.0
     """Neighbourhood of a Gaussian in standard deviations."""
     threshold: float = 0.5
@@ -49,6 +67,8 @@ class Options:
         require_positive(self, "voxel_size", "cutoff", "threshold", "seen_through")
         if self.threshold >= 1:
             raise ConfigError(f"'threshold' must be less than 1, got {self.threshold}.")
+        if self.projection not in PROJECTIONS:
+            raise ConfigError(f"'projection' must be one of {', '.join(PROJECTIONS)}, got '{self.projection}'.")
 
 
 @dataclass(frozen=True)
@@ -56,49 +76,68 @@ class Bins:
     """Gaussians sorted into the voxel blocks that their neighbourhoods touch.
 
     packed: (B,) ascending packed block keys.  start: (B + 1,) and gaussian: (P,) list block b's Gaussians as
-    ``gaussian[start[b]:start[b + 1]]``.  precision: (N, 6) float32 upper triangle of Sigma^-1 in units of voxels^-2.
-    lo, hi: (N, 3) int32 first and last voxel of the neighbourhood's box.  means: (N, 3) float32 in voxels, relative to
-    the lattice's origin.  log_weight: (N,) float32 log of o_k |Sigma_k|^-1/2 up to a common constant.
+    ``gaussian[start[b]:start[b + 1]]``.  means: (N, 3) float32 in voxels, relative to the lattice's origin.
+    form: (N, 6) float32 upper triangle of a matrix: Sigma^-1 in voxels^-2; integrated: Sigma in voxels^2; released:
+    Sigma in metres^2, times what turns voxels into metres twice.  lo, hi: (N, 3) int32 first and last voxel of the
+    neighbourhood's box.  opacities: (N,) float32.  log_weight: (N,) float32 log of the part of w_k that is the same at
+    all voxels, up to a common constant.  kind, squared_cutoff: how the kernels take it.
     """
 
     packed: NDArray[np.int64]
     start: NDArray[np.int64]
     gaussian: NDArray[np.int32]
     means: NDArray[np.float32]
-    precision: NDArray[np.float32]
-    log_weight: NDArray[np.float32]
+    form: NDArray[np.float32]
     lo: NDArray[np.int32]
     hi: NDArray[np.int32]
-    cutoff: float
+    opacities: NDArray[np.float32]
+    log_weight: NDArray[np.float32]
+    kind: int
+    squared_cutoff: np.float32
 
 
 def bin_gaussians(
     gaussians: Gaussians,
     origin: NDArray[np.float64],
-    voxel_size: float,
-    cutoff: float,
+    options: Options,
     shape: tuple[int, int, int] | None = None,
 ) -> Bins:
     """Sort Gaussians into blocks of the lattice whose voxel (0, 0, 0) has its lower corner at ``origin``.
 
     shape: only the voxels (0, 0, 0) … shape - 1 are evaluated, however far a Gaussian reaches; all by default.
     """
-    means = ((gaussians.means.astype(np.float64) - origin) / voxel_size).astype(np.float32)
-    scales = np.maximum(gaussians.scales, _SMALLEST_SCALE).astype(np.float32) / np.float32(voxel_size)
-    precision, extent = _precisions(gaussians.quats_wxyz.astype(np.float32), scales)
-    log_weight = np.log(np.maximum(gaussians.opacities, 1e-6)) - np.log(scales).sum(axis=1)
-    lo, hi = _boxes(means, extent, np.float32(cutoff))
+    mode, size = options.projection, options.voxel_size
+    means = ((gaussians.means.astype(np.float64) - origin) / size).astype(np.float32)
+    scales = np.maximum(gaussians.scales, _SMALLEST_SCALE).astype(np.float32) / np.float32(size)
+    quats, opacities = gaussians.quats_wxyz.astype(np.float32), gaussians.opacities.astype(np.float32)
+    log_weight = np.log(np.maximum(opacities, np.float32(1e-6)))
+    covariance = _rotated(quats, scales**2)
+    kind, form, squared_cutoff = _POINT, covariance, np.float32(options.cutoff**2)
+    if mode == "released":
+        kind, form, squared_cutoff = _POISSON, covariance * np.float32(size**4), np.float32(np.inf)
+        reach = np.ceil(np.float32(options.cutoff) * scales.max(axis=1, keepdims=True)).astype(np.int32)
+        home = np.floor(means).astype(np.int32)
+        lo, hi = home - reach, home + reach
+    else:
+        lo, hi = _boxes(means, covariance, np.float32(options.cutoff), mode == "integrated")
+        if mode == "integrated":
+            kind = _MASS
+        else:
+            kind = _POISSON if mode == "poisson" else _POINT
+            form = _rotated(quats, scales**-2)
+            log_weight = log_weight - np.log(scales).sum(axis=1)
     if shape is not None:
         lo, hi = np.maximum(lo, np.int32(0)), np.minimum(hi, np.array(shape, np.int32) - 1)
     packed, start, gaussian = _sort_by_block(lo, hi)
-    return Bins(packed, start, gaussian, means, precision, log_weight.astype(np.float32), lo, hi, cutoff)
+    return Bins(packed, start, gaussian, means, form, lo, hi, opacities, log_weight, kind, squared_cutoff)
 
 
 def probability(bins: Bins, keys: NDArray[np.int32]) -> NDArray[np.float32]:
     """(B, 512) alpha at every voxel of the bins' blocks, whose (B, 3) keys are given: equations (A) and (B)."""
-    return _probability(
-        keys, bins.start, bins.gaussian, bins.means, bins.precision, bins.lo, bins.hi, np.float32(bins.cutoff**2)
-    )
+    listed = keys, bins.start, bins.gaussian, bins.means, bins.form, bins.lo, bins.hi
+    if bins.kind == _MASS:
+        return _probability_by_mass(*listed)
+    return _probability(*listed, bins.opacities, bins.squared_cutoff, bins.kind == _POISSON)
 
 
 def posterior_mean(
@@ -111,47 +150,16 @@ def posterior_mean(
     """
     rows = int(slots.max(initial=-1)) + 1
     return _posterior_mean(
-        keys, bins.start, bins.gaussian, bins.means, bins.precision, bins.log_weight, bins.lo, bins.hi,
-        np.float32(bins.cutoff**2), slots, values, rows,
+        keys, bins.start, bins.gaussian, bins.means, bins.form, bins.lo, bins.hi, bins.log_weight, bins.squared_cutoff,
+        bins.kind == _MASS, slots, values, rows,
     )  # fmt: skip
 
 
-def probability_reference(
-    gaussians: Gaussians, points: NDArray[np.float64], cutoff: float = np.inf
-) -> NDArray[np.float64]:
-    """(P,) alpha at (P, 3) world points: equations (A) and (B) written out, every pair evaluated."""
-    squared = _squared_distances(gaussians, points)
-    alpha_k = np.where(squared <= cutoff**2, np.exp(-0.5 * squared), 0.0)
-    return 1.0 - np.prod(1.0 - alpha_k, axis=1)
-
-
-def posterior_mean_reference(
-    gaussians: Gaussians, points: NDArray[np.float64], values: NDArray[np.floating], cutoff: float = np.inf
-) -> NDArray[np.float64]:
-    """(P, D) posterior expectation at (P, 3) world points: equations (C) and (D) written out."""
-    squared = _squared_distances(gaussians, points)
-    density = np.exp(-0.5 * squared) / gaussians.scales.astype(np.float64).prod(axis=1)
-    weight = np.where(squared <= cutoff**2, density, 0.0) * gaussians.opacities
-    total = weight.sum(axis=1, keepdims=True)
-    return (weight / np.where(total > 0, total, 1.0)) @ values
-
-
-def _squared_distances(gaussians: Gaussians, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P, N) squared Mahalanobis distances."""
-    R = quats_to_rotations(gaussians.quats_wxyz.astype(np.float64))
-    offset = points[:, None] - gaussians.means.astype(np.float64)[None]
-    along_axes = np.einsum("pni,nij->pnj", offset, R) / gaussians.scales.astype(np.float64)
-    return (along_axes**2).sum(axis=2)
-
-
 @njit(parallel=True, cache=True)
-def _precisions(
-    quats: NDArray[np.float32], scales: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Sigma^-1 (N, 6) as xx, xy, xz, yy, yz, zz and the standard deviations along the lattice's axes (N, 3)."""
+def _rotated(quats: NDArray[np.float32], diagonal: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 6) R diag R^T as xx, xy, xz, yy, yz, zz."""
     n = len(quats)
-    precision = np.empty((n, 6), np.float32)
-    extent = np.empty((n, 3), np.float32)
+    out = np.empty((n, 6), np.float32)
     for g in prange(n):
         w, x, y, z = quats[g, 0], quats[g, 1], quats[g, 2], quats[g, 3]
         norm = math.sqrt(w * w + x * x + y * y + z * z)
@@ -161,32 +169,32 @@ def _precisions(
             (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
             (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
         )
-        s0, s1, s2 = scales[g, 0] ** 2, scales[g, 1] ** 2, scales[g, 2] ** 2
-        p0, p1, p2 = 1 / s0, 1 / s1, 1 / s2
         entry = 0
         for i in range(3):
             a = R[i]
-            extent[g, i] = math.sqrt(a[0] * a[0] * s0 + a[1] * a[1] * s1 + a[2] * a[2] * s2)
             for j in range(i, 3):
                 b = R[j]
-                precision[g, entry] = a[0] * b[0] * p0 + a[1] * b[1] * p1 + a[2] * b[2] * p2
+                out[g, entry] = (
+                    a[0] * b[0] * diagonal[g, 0] + a[1] * b[1] * diagonal[g, 1] + a[2] * b[2] * diagonal[g, 2]
+                )
                 entry += 1
-    return precision, extent
+    return out
 
 
 @njit(parallel=True, cache=True)
 def _boxes(
-    means: NDArray[np.float32], extent: NDArray[np.float32], cutoff: np.float32
+    means: NDArray[np.float32], covariance: NDArray[np.float32], cutoff: np.float32, whole_voxels: bool
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """First and last voxel whose centre lies in the bounding box of each neighbourhood; lo > hi if none does."""
+    """First and last voxel whose centre, or any part of whom, lies in the bounding box of each neighbourhood; lo > hi
+    if none does."""
     n = len(means)
-    lo = np.empty((n, 3), np.int32)
-    hi = np.empty((n, 3), np.int32)
+    lo, hi = np.empty((n, 3), np.int32), np.empty((n, 3), np.int32)
     for g in prange(n):
         for i in range(3):
-            reach = cutoff * extent[g, i]
-            lo[g, i] = math.ceil(means[g, i] - reach - 0.5)
-            hi[g, i] = math.floor(means[g, i] + reach - 0.5)
+            reach = cutoff * math.sqrt(covariance[g, (0, 3, 5)[i]])
+            first, last = means[g, i] - reach, means[g, i] + reach
+            lo[g, i] = math.floor(first) if whole_voxels else math.ceil(first - np.float32(0.5))
+            hi[g, i] = math.floor(last if whole_voxels else last - np.float32(0.5))
     return lo, hi
 
 
@@ -260,9 +268,12 @@ def _probability(
     precision: NDArray[np.float32],
     lo: NDArray[np.int32],
     hi: NDArray[np.int32],
+    opacities: NDArray[np.float32],
     squared_cutoff: np.float32,
+    poisson: bool,
 ) -> NDArray[np.float32]:
     alpha = np.empty((len(keys), BLOCK**3), np.float32)
+    one, two, half = np.float32(1), np.float32(2), np.float32(0.5)
     for b in prange(len(keys)):
         x0, y0, z0 = keys[b, 0] * BLOCK, keys[b, 1] * BLOCK, keys[b, 2] * BLOCK
         survival = np.ones(BLOCK**3, np.float32)
@@ -271,20 +282,59 @@ def _probability(
             pxx, pxy, pxz = precision[g, 0], precision[g, 1], precision[g, 2]
             pyy, pyz, pzz = precision[g, 3], precision[g, 4], precision[g, 5]
             for i in range(max(lo[g, 0] - x0, 0), min(hi[g, 0] - x0, BLOCK - 1) + 1):
-                dx = np.float32(x0 + i) + np.float32(0.5) - means[g, 0]
+                dx = np.float32(x0 + i) + half - means[g, 0]
                 for j in range(max(lo[g, 1] - y0, 0), min(hi[g, 1] - y0, BLOCK - 1) + 1):
-                    dy = np.float32(y0 + j) + np.float32(0.5) - means[g, 1]
-                    constant = dx * (pxx * dx + np.float32(2) * pxy * dy) + pyy * dy * dy
-                    linear = np.float32(2) * (pxz * dx + pyz * dy)
+                    dy = np.float32(y0 + j) + half - means[g, 1]
+                    constant = dx * (pxx * dx + two * pxy * dy) + pyy * dy * dy
+                    linear = two * (pxz * dx + pyz * dy)
                     for k in range(max(lo[g, 2] - z0, 0), min(hi[g, 2] - z0, BLOCK - 1) + 1):
-                        dz = np.float32(z0 + k) + np.float32(0.5) - means[g, 2]
+                        dz = np.float32(z0 + k) + half - means[g, 2]
                         squared = constant + dz * (linear + pzz * dz)
                         if squared <= squared_cutoff:
-                            alpha_k = math.exp(np.float32(-0.5) * squared)  # (A)
-                            survival[(i * BLOCK + j) * BLOCK + k] *= np.float32(1) - alpha_k
+                            phi = math.exp(-half * squared)
+                            left = math.exp(-opacities[g] * phi) if poisson else one - phi  # (A)
+                            survival[(i * BLOCK + j) * BLOCK + k] *= left
         for voxel in range(BLOCK**3):
-            alpha[b, voxel] = np.float32(1) - survival[voxel]  # (B)
+            alpha[b, voxel] = one - survival[voxel]  # (B)
     return alpha
+
+
+@njit(parallel=True, cache=True)
+def _probability_by_mass(
+    keys: NDArray[np.int32],
+    start: NDArray[np.int64],
+    gaussian: NDArray[np.int32],
+    means: NDArray[np.float32],
+    covariance: NDArray[np.float32],
+    lo: NDArray[np.int32],
+    hi: NDArray[np.int32],
+) -> NDArray[np.float32]:
+    alpha = np.empty((len(keys), BLOCK**3), np.float32)
+    for b in prange(len(keys)):
+        survival, mass = np.ones(BLOCK**3), np.empty((BLOCK, BLOCK, BLOCK))
+        for pair in range(start[b], start[b + 1]):
+            g = gaussian[pair]
+            i0, j0, k0, i1, j1, k1 = _window(keys[b], lo[g], hi[g])
+            box_masses(means[g], covariance[g], keys[b], i0, j0, k0, i1, j1, k1, mass)
+            for i in range(i0, i1):
+                for j in range(j0, j1):
+                    for k in range(k0, k1):
+                        survival[(i * BLOCK + j) * BLOCK + k] *= 1.0 - mass[i, j, k]
+        for voxel in range(BLOCK**3):
+            alpha[b, voxel] = 1.0 - survival[voxel]  # (B)
+    return alpha
+
+
+@njit(cache=True)
+def _window(
+    key: NDArray[np.int32], lo: NDArray[np.int32], hi: NDArray[np.int32]
+) -> tuple[int, int, int, int, int, int]:
+    """First voxel, and the one after the last, of a Gaussian's neighbourhood within a block."""
+    x0, y0, z0 = key[0] * BLOCK, key[1] * BLOCK, key[2] * BLOCK
+    return (
+        max(lo[0] - x0, 0), max(lo[1] - y0, 0), max(lo[2] - z0, 0),
+        min(hi[0] - x0 + 1, BLOCK), min(hi[1] - y0 + 1, BLOCK), min(hi[2] - z0 + 1, BLOCK),
+    )  # fmt: skip
 
 
 @njit(parallel=True, cache=True)
@@ -293,46 +343,54 @@ def _posterior_mean(
     start: NDArray[np.int64],
     gaussian: NDArray[np.int32],
     means: NDArray[np.float32],
-    precision: NDArray[np.float32],
-    log_weight: NDArray[np.float32],
+    form: NDArray[np.float32],
     lo: NDArray[np.int32],
     hi: NDArray[np.int32],
+    log_weight: NDArray[np.float32],
     squared_cutoff: np.float32,
+    by_mass: bool,
     slots: NDArray[np.int32],
     values: NDArray[np.floating],
     rows: int,
 ) -> NDArray[np.float32]:
     dimension = values.shape[1]
     mean = np.zeros((rows, dimension), np.float32)
+    two, half = np.float32(2), np.float32(0.5)
     for b in prange(len(keys)):
         x0, y0, z0 = keys[b, 0] * BLOCK, keys[b, 1] * BLOCK, keys[b, 2] * BLOCK
-        total = np.zeros(BLOCK**3, np.float32)
+        total, mass = np.zeros(BLOCK**3, np.float32), np.empty((BLOCK, BLOCK, BLOCK))
         # Densities of thin and of wide Gaussians differ by orders of magnitude: the block's largest is the unit.
         unit = np.float32(-np.inf)
         for pair in range(start[b], start[b + 1]):
             unit = max(unit, log_weight[gaussian[pair]])
         for pair in range(start[b], start[b + 1]):
             g = gaussian[pair]
-            pxx, pxy, pxz = precision[g, 0], precision[g, 1], precision[g, 2]
-            pyy, pyz, pzz = precision[g, 3], precision[g, 4], precision[g, 5]
-            for i in range(max(lo[g, 0] - x0, 0), min(hi[g, 0] - x0, BLOCK - 1) + 1):
-                dx = np.float32(x0 + i) + np.float32(0.5) - means[g, 0]
-                for j in range(max(lo[g, 1] - y0, 0), min(hi[g, 1] - y0, BLOCK - 1) + 1):
-                    dy = np.float32(y0 + j) + np.float32(0.5) - means[g, 1]
-                    constant = dx * (pxx * dx + np.float32(2) * pxy * dy) + pyy * dy * dy
-                    linear = np.float32(2) * (pxz * dx + pyz * dy)
-                    for k in range(max(lo[g, 2] - z0, 0), min(hi[g, 2] - z0, BLOCK - 1) + 1):
+            fxx, fxy, fxz, fyy, fyz, fzz = form[g, 0], form[g, 1], form[g, 2], form[g, 3], form[g, 4], form[g, 5]
+            i0, j0, k0, i1, j1, k1 = _window(keys[b], lo[g], hi[g])
+            if by_mass:
+                box_masses(means[g], form[g], keys[b], i0, j0, k0, i1, j1, k1, mass)
+            for i in range(i0, i1):
+                dx = np.float32(x0 + i) + half - means[g, 0]
+                for j in range(j0, j1):
+                    dy = np.float32(y0 + j) + half - means[g, 1]
+                    constant = dx * (fxx * dx + two * fxy * dy) + fyy * dy * dy
+                    linear = two * (fxz * dx + fyz * dy)
+                    for k in range(k0, k1):
                         voxel = (i * BLOCK + j) * BLOCK + k
                         row = slots[b, voxel]
                         if row < 0:
                             continue
-                        dz = np.float32(z0 + k) + np.float32(0.5) - means[g, 2]
-                        squared = constant + dz * (linear + pzz * dz)
-                        if squared <= squared_cutoff:
-                            weight = math.exp(np.float32(-0.5) * squared + log_weight[g] - unit)  # (C), numerator
-                            total[voxel] += weight
-                            for d in range(dimension):
-                                mean[row, d] += weight * values[g, d]  # (D)
+                        if by_mass:
+                            weight = np.float32(mass[i, j, k] * math.exp(log_weight[g] - unit))  # (C), numerator
+                        else:
+                            dz = np.float32(z0 + k) + half - means[g, 2]
+                            squared = constant + dz * (linear + fzz * dz)
+                            if squared > squared_cutoff:
+                                continue
+                            weight = np.float32(math.exp(-half * squared + log_weight[g] - unit))  # (C), numerator
+                        total[voxel] += weight
+                        for d in range(dimension):
+                            mean[row, d] += weight * values[g, d]  # (D)
         for voxel in range(BLOCK**3):
             row = slots[b, voxel]
             if row >= 0 and total[voxel] > 0:
