@@ -130,12 +130,23 @@ def query(
     threshold: Annotated[float | None, typer.Option("--threshold", help="Least similarity, 0…1.")] = None,
     ply: Annotated[Path | None, typer.Option("--ply", help="Write the map as PLY, matches coloured.")] = None,
     picture: Annotated[Path | None, typer.Option("--picture", help="Write a picture, matches coloured (PNG).")] = None,
+    refine_to: Annotated[
+        float | None,
+        typer.Option("--refine", metavar="METRES", help="Look again with finer voxels, around the best match."),
+    ] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Keep the map that --refine makes.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Ask a map where something is."""
+    import tempfile
+
     from . import query as asking
     from .store import load_map
 
+    if output is not None and refine_to is None:
+        raise typer.BadParameter("-o keeps the map that --refine makes: give --refine METRES.")
+    if refine_to is not None and len(words) > 1:
+        raise typer.BadParameter("--refine looks around the best match of one word.")
     options: dict[str, Any] = {}
     if top is not None:
         options["top_k"] = top
@@ -143,6 +154,11 @@ def query(
         options["threshold"] = threshold
     loaded = load_map(map_path)
     results = loaded.query_words(words, **options)
+    with tempfile.TemporaryDirectory() as folder:
+        if refine_to is not None and results[0].matched:
+            loaded = _refined(loaded, results[0].regions[0], refine_to, output or Path(folder) / "refined", overwrite)
+            results = loaded.query_words(words, **options)
+            _ = loaded.gaussians  # read before the folder is gone
     if ply is not None:
         from .export.ply import write_query_ply
 
@@ -155,6 +171,43 @@ def query(
         print(json.dumps(asking.to_json(map_path, results)))
     else:
         print(asking.to_text(results))
+
+
+def _refined(loaded: Any, region: Any, voxel_size: float, output: Path, overwrite: bool) -> Any:
+    from . import refine as refining
+
+    progress = ConsoleProgress()
+    box = refining.around(region, loaded.manifest["voxel_size_m"])
+    try:
+        return refining.refine(loaded, box, voxel_size, output, overwrite=overwrite, progress=progress)
+    finally:
+        progress.close()
+
+
+@app.command()
+def refine(
+    map_path: MapPath,
+    box: Annotated[
+        tuple[float, float, float, float, float, float],
+        typer.Option("--box", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Lower and upper corner, map frame, metres."),
+    ],
+    voxel: Annotated[float, typer.Option("--voxel", metavar="METRES", help="Edge of the finer voxels.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="MAP", help="Map folder to write.")],
+    overwrite: Overwrite = False,
+) -> None:
+    """Make a map of a box of another map, with finer voxels."""
+    import numpy as np
+
+    from . import refine as refining
+    from .store import load_map
+
+    corners = refining.Box(np.array(box[:3]), np.array(box[3:]))
+    progress = ConsoleProgress()
+    try:
+        made = refining.refine(load_map(map_path), corners, voxel, output, overwrite=overwrite, progress=progress)
+    finally:
+        progress.close()
+    print(_info_text(_info(made)))
 
 
 @app.command()

@@ -469,7 +469,7 @@ def _manifest(
         "up": estimate_up(trajectory.T_world_keyframe, gaussians.means).tolist(),
         "T_world_map": np.eye(4).tolist(),
         "encoder": {"name": encoder.name, "dimension": encoder.dimension, "state": encoder.text_state()},
-        "codec": "scalar quantisation, 8 bits a dimension",
+        "codec": "transform coding, 8, 4 and 2 bits a direction",
         "counts": {
             "gaussians": len(gaussians),
             "voxels": store.counts(occupancy),

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from . import __version__
 from .errors import ConfigError, FreeOccError, MapError
+from .language.codec import Features, cosines, known
 from .registry import require_positive
 from .types import Occupancy
 
@@ -115,7 +116,7 @@ def query(
         )
     competes = text.features @ contrast.features.T < text_encoder.same_word
     competes &= contrast.features.any(axis=1)
-    scores = _in_chunks(occupancy.features, text)
+    scores = similarity(occupancy.features, text)
     voxels = occupancy.occupied_voxels()
     threshold = text_encoder.threshold if options.threshold is None else options.threshold
     results = []
@@ -130,31 +131,24 @@ def query(
     return results
 
 
-def similarity(features: NDArray[np.floating], text: TextFeatures) -> NDArray[np.float32]:
+def similarity(features: Features, text: TextFeatures) -> NDArray[np.float32]:
     """(V, W) scores of (V, D) unit features for W words: cosine over attainable cosine, at most 1."""
-    cosine = features.astype(np.float32, copy=False) @ text.features.T
-    return np.minimum(cosine if text.attainable is None else cosine / text.attainable, np.float32(1))
+    score = cosines(features, text.features)
+    if text.attainable is not None:
+        score /= text.attainable
+    return np.minimum(score, np.float32(1), out=score)
 
 
-def nearest_word(features: NDArray[np.float16], text: TextFeatures) -> NDArray[np.int64]:
+def nearest_word(features: Features, text: TextFeatures) -> NDArray[np.int64]:
     """(V,) which of W words is nearest to each of (V, D) features by plain cosine, -1 where nothing is known.
 
     Of "table" and "coffee table" the narrower word is nearer to a coffee table, though both fit.
     """
     nearest = np.full(len(features), -1, np.int64)
     for start in range(0, len(features) if len(text.understood) else 0, _ROWS):
-        chunk = features[start : start + _ROWS].astype(np.float32)
-        cosines = chunk @ text.features.T
-        nearest[start : start + _ROWS] = np.where(chunk.any(axis=1), cosines.argmax(axis=1), -1)
+        chunk = features[start : start + _ROWS]
+        nearest[start : start + _ROWS] = np.where(known(chunk), cosines(chunk, text.features).argmax(axis=1), -1)
     return nearest
-
-
-def _in_chunks(features: NDArray[np.float16], text: TextFeatures) -> NDArray[np.float32]:
-    """``similarity``, some rows at a time."""
-    scores = np.zeros((len(features), len(text.understood)), np.float32)
-    for start in range(0, len(features), _ROWS):
-        scores[start : start + _ROWS] = similarity(features[start : start + _ROWS], text)
-    return scores
 
 
 def _some(text: TextFeatures, words: NDArray[np.bool_]) -> TextFeatures:
@@ -165,7 +159,7 @@ def _some(text: TextFeatures, words: NDArray[np.bool_]) -> TextFeatures:
 
 
 def _against_contrasts(
-    features: NDArray[np.float16],
+    features: Features,
     rows: NDArray[np.int64],
     scores: NDArray[np.float32],
     contrast: TextFeatures,
@@ -178,7 +172,7 @@ def _against_contrasts(
         chunk = rows[start : start + _ROWS]
         feature = features[chunk]
         margin = similarity(feature, contrast) - scores[start : start + _ROWS, None]
-        best = feature.any(axis=1) & (margin.max(axis=1, initial=-1.0) <= 0)
+        best = known(feature) & (margin.max(axis=1, initial=-1.0) <= 0)
         odds = np.exp(margin[best] / np.float32(temperature)).sum(axis=1)
         kept.append(chunk[best])
         confidences.append(1.0 / (1.0 + odds))

@@ -16,7 +16,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import yaml
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from . import registry
 from .errors import MapError
 from .geometry import quats_to_rotations, rotations_to_quats
-from .language.codec import Codec
+from .language.codec import Codec, CodedFeatures
 from .types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, Trajectory
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from .language.encoders.base import TextEncoder
     from .query import QueryResult
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MANIFEST, CONFIG, REPORT, TRAJECTORY = "map.yaml", "config.yaml", "report.json", "trajectory.txt"
 PATH_PICTURE, RENDER_PICTURE = "trajectory.png", "gaussians.png"
 GAUSSIANS, OCCUPANCY, FEATURES, KEYFRAMES = "gaussians.ply", "occupancy.npz", "features.npz", "keyframes"
@@ -45,6 +45,10 @@ _OCCUPANCY_ARRAYS = {
     "colors": ("u", 2), "feature_codes": ("u", 2),
 }  # fmt: skip
 """Arrays of occupancy.npz: kind of number and dimensions."""
+_FEATURE_ARRAYS = {
+    "gaussian_codes": ("u", 2), "codec_basis": ("f", 2), "codec_bits": ("u", 1), "codec_offset": ("f", 1),
+    "codec_scale": ("f", 1),
+}  # fmt: skip
 
 
 class Map:
@@ -69,7 +73,7 @@ class Map:
             arrays["keys"].shape == (blocks, 3)
             and all(arrays[name].shape == (blocks, BLOCK**3) for name in ("probability", "free", "hits", "state"))
             and arrays["colors"].shape == (occupied, 3)
-            and arrays["feature_codes"].shape == (occupied, self._feature_arrays["gaussian_codes"].shape[1])
+            and arrays["feature_codes"].shape == (occupied, self._codec.code_bytes)
         )
         if not shapes_fit:
             raise MapError(f"{self.path / OCCUPANCY} is damaged: its arrays do not belong together.")
@@ -81,7 +85,7 @@ class Map:
             free=arrays["free"].astype(np.uint16),
             hits=arrays["hits"].astype(np.uint16),
             state=arrays["state"].astype(np.uint8),
-            features=self._codec.decode(arrays["feature_codes"]),
+            features=cast(Any, CodedFeatures(self._codec, arrays["feature_codes"])),
             colors=arrays["colors"].astype(np.uint8),
         )
 
@@ -165,17 +169,19 @@ class Map:
 
     @functools.cached_property
     def _feature_arrays(self) -> dict[str, NDArray[Any]]:
-        return read_arrays(
-            self.path / FEATURES, {"gaussian_codes": ("u", 2), "codec_offset": ("f", 1), "codec_scale": ("f", 1)}
-        )
+        return read_arrays(self.path / FEATURES, _FEATURE_ARRAYS)
 
     @functools.cached_property
     def _codec(self) -> Codec:
         arrays = self._feature_arrays
         tables = {name.removeprefix("codec_"): table for name, table in arrays.items() if name.startswith("codec_")}
-        if any(table.shape != arrays["gaussian_codes"].shape[1:] for table in tables.values()):
-            raise MapError(f"{self.path / FEATURES} is damaged: its tables do not belong to its codes.")
-        return Codec.from_tables(tables)
+        try:
+            codec = Codec.from_tables(tables)
+        except ValueError as error:
+            raise MapError(f"{self.path / FEATURES} is damaged: {error}.") from error
+        if arrays["gaussian_codes"].shape[1] != codec.code_bytes:
+            raise MapError(f"{self.path / FEATURES} is damaged: its codes do not belong to its codec.")
+        return codec
 
     def _require(self, name: str) -> None:
         expected = self.manifest["files"].get(name)
@@ -208,6 +214,8 @@ def load_map(path: str | Path) -> Map:
         raise MapError(
             f"The map {path} has format {version}, this freeocc3d reads up to {FORMAT_VERSION}: upgrade freeocc3d."
         )
+    if version < FORMAT_VERSION:
+        raise MapError(f"The map {path} has format {version}, of an earlier freeocc3d: map the capture again.")
     _check_manifest(manifest, path)
     loaded = Map(path, manifest)
     for name in manifest["files"]:
@@ -217,8 +225,9 @@ def load_map(path: str | Path) -> Map:
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Write map.yaml with the sizes of the map's files beside it. Raises OSError."""
-    parts = (CONFIG, REPORT, TRAJECTORY, PATH_PICTURE, RENDER_PICTURE, GAUSSIANS, OCCUPANCY, FEATURES)
-    paths = [*(folder / name for name in parts), *sorted((folder / KEYFRAMES).iterdir())]
+    parts = (CONFIG, REPORT, TRAJECTORY, GAUSSIANS, OCCUPANCY, FEATURES)
+    pictures = (folder / name for name in (PATH_PICTURE, RENDER_PICTURE) if (folder / name).is_file())
+    paths = [*(folder / name for name in parts), *pictures, *sorted((folder / KEYFRAMES).iterdir())]
     files = {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
     content = {"format_version": FORMAT_VERSION, **manifest, "files": files}
     (folder / MANIFEST).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")

@@ -169,7 +169,8 @@ class Occupancy:
     free: uint16 number of depth images that saw through the voxel.  hits: uint16 number that ended in it.
     state: uint8 FREE, OCCUPIED or UNKNOWN.
     Per occupied voxel, (V, …), in the order of ``occupied_voxels()``:
-    features: (V, D) float16 unit language features, zero where nothing is known.  colors: (V, 3) uint8 RGB.
+    features: (V, D) float16 unit language features, zero where nothing is known; those of a saved map stay coded
+    (``language.codec.CodedFeatures``) until ``np.asarray`` decodes them.  colors: (V, 3) uint8 RGB.
     """
 
     voxel_size: float

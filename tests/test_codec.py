@@ -1,13 +1,14 @@
-"""8-bit features: how much a cosine loses, and what stays exact."""
+"""Coded features: how much a cosine loses, what stays exact, and that scores need no decoding."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers import data_folder
 from numpy.typing import NDArray
 
 from freeocc3d.language import codec as codec_module
-from freeocc3d.language.codec import Codec
+from freeocc3d.language.codec import Codec, CodedFeatures
 
 
 def unit(rows: NDArray[np.floating]) -> NDArray[np.float16]:
@@ -32,13 +33,15 @@ def cosines(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floa
     return (a * b).sum(axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
 
 
-@pytest.mark.parametrize("features", [random_features(), membership_features(), unit(np.eye(40))])
+@pytest.mark.parametrize(
+    "features", [random_features(), membership_features(), unit(np.eye(40)), random_features(dimension=512)]
+)
 def test_decoded_features_are_unit_and_nearly_the_same(features: NDArray[np.float16]) -> None:
     codec = Codec.fit(features)
     codes = codec.encode(features)
     decoded = codec.decode(codes)
     assert codes.dtype == np.uint8
-    assert codes.shape == features.shape
+    assert codes.shape == (len(features), codec.code_bytes)
     assert decoded.dtype == np.float16
     np.testing.assert_allclose(np.linalg.norm(decoded.astype(np.float64), axis=1), 1, atol=2e-3)
     assert cosines(decoded, features).mean() >= 0.999
@@ -85,15 +88,65 @@ def test_tables_restore_the_codec() -> None:
     np.testing.assert_array_equal(restored.decode(codes), codec.decode(codes))
 
 
-def test_similarity_is_that_of_decoded_features() -> None:
-    features = random_features()
+@pytest.mark.parametrize("dimension", [32, 512])
+@pytest.mark.parametrize("many", [False, True])
+def test_cosines_are_those_of_decoded_features(dimension: int, many: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    features = random_features(dimension=dimension)
     features[:10] = 0
-    text = random_features(5, seed=1).astype(np.float32)
+    text = random_features(5, dimension, seed=1).astype(np.float32)
     codec = Codec.fit(features)
     codes = codec.encode(features)
     expected = codec.decode(codes).astype(np.float32) @ text.T
-    np.testing.assert_allclose(codec.similarity(codes, text), expected, atol=2e-3)
-    assert not codec.similarity(codes, text)[:10].any()
+    monkeypatch.setattr(codec_module, "_MANY", 0 if many else 10**9)
+    found = codec.cosines(codes, text)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert not found[:10].any()
+    coded = CodedFeatures(codec, codes)
+    np.testing.assert_array_equal(codec_module.cosines(coded[5:50], text), codec.cosines(codes[5:50], text))
+    np.testing.assert_array_equal(codec_module.known(coded), features.any(axis=1))
+    np.testing.assert_array_equal(np.asarray(coded), codec.decode(codes))
+    assert coded.shape == features.shape
+
+
+def smooth_fields(length: float, n: int = 20000, dimension: int = 512) -> NDArray[np.float16]:
+    """Features that change over the walls of a room of 4 m, by their correlation length in metres."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 4, (n, 3))
+    wall = rng.integers(0, 3, n)
+    points[np.arange(n), wall] = 4 * rng.integers(0, 2, n)
+    waves = rng.normal(size=(3, dimension)) / length
+    return unit(np.cos(points @ waves + rng.uniform(0, 2 * np.pi, dimension)))
+
+
+@pytest.mark.parametrize(("length", "mean"), [(2.0, 0.999), (1.0, 0.995), (0.7, 0.98)])
+def test_smooth_fields_of_512_dimensions_fit_in_48_bytes(length: float, mean: float) -> None:
+    features = smooth_fields(length)
+    codec = Codec.fit(features)
+    assert codec.code_bytes == 48
+    assert cosines(codec.decode(codec.encode(features)), features).mean() >= mean
+
+
+def test_words_name_the_same_voxels_after_coding() -> None:
+    """Posteriors of a real network's kind, mixed with real text embeddings."""
+    file = np.load(data_folder().parent / "models" / "clip_text_names.npz")
+    embeddings = file["embeddings"].astype(np.float32)
+    rng = np.random.default_rng(0)
+    things = embeddings[rng.choice(len(embeddings), 40, replace=False)]
+    features = unit(rng.dirichlet(np.full(40, 0.05), 20000) @ things)
+    words = np.concatenate((things[::4], embeddings[:10]))
+    codec = Codec.fit(features)
+    codes = codec.encode(features)
+    assert cosines(codec.decode(codes), features).mean() >= 0.999
+    same = codec.cosines(codes, words).argmax(axis=1) == (features.astype(np.float32) @ words.T).argmax(axis=1)
+    assert same.mean() >= 0.99
+
+
+def test_tables_that_do_not_belong_together_are_refused() -> None:
+    tables = Codec.fit(random_features(dimension=100)).tables()
+    with pytest.raises(ValueError, match="do not belong together"):
+        Codec.from_tables(tables | {"offset": tables["offset"][1:]})
+    with pytest.raises(ValueError, match="do not belong together"):
+        Codec.from_tables(tables | {"bits": tables["bits"][::-1]})
 
 
 def test_the_size_of_chunks_does_not_show(monkeypatch: pytest.MonkeyPatch) -> None:

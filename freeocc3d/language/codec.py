@@ -1,91 +1,248 @@
-"""Small features: 8-bit scalar quantisation, a scale and an offset per dimension."""
+"""Small features: transform coding. A feature's coordinates along the directions in which features vary most are kept,
+with 8, 4 or 2 bits each, by what each of them adds to the error; at most 48 bytes a feature, whatever its dimension.
+
+Chosen by measurement (``tools/benchmark.py --variants codec``) over low rank with 8 bits throughout and over product
+quantisation, which both lose more at the same size. Source of the optimal uniform quantisers' steps: J. Max, Quantizing
+for Minimum Distortion, IRE Trans. Inf. Theory 6(1), 1960.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+MOST_BYTES = 48
+"""Of a code. Features of at most so many dimensions keep their own axes, 8 bits each: what never is negative decodes to
+exact zeros."""
+_BITS = (8, 4, 2)
+_STEPS = {4: 0.335, 2: 0.996}  # in standard deviations of a normal distribution (Max, table II)
+_ERRORS = {8: 1.0e-4, 4: 0.01154, 2: 0.1188}  # what is left of the variance
 _LEVELS = 254
-"""Codes 1…255 are levels; code 0 in every dimension is the zero feature, of which nothing is known."""
+"""8-bit codes 1…255 are levels; the code of zeros is the zero feature, of which nothing is known."""
 _MARGIN = 0.02
-"""By which the range of a dimension is widened on either side: a normalised mean of features can lie outside of it."""
+"""By which an 8-bit range is widened on either side: a normalised mean of features can lie outside of it."""
 _ROWS = 8192  # worked on at once, so that float32 copies of all rows never exist
+_MANY = 200_000  # rows from which scores are computed by compiled code
+_SAMPLE = 20000  # rows that quantisers are fitted to
 
 
 @dataclass(frozen=True)
 class Codec:
-    """(V, D) unit features to (V, D) uint8 and back; a byte a dimension.
+    """(V, D) unit features to (V, M) uint8 and back.
 
-    offset, scale: (D,) float32; value = offset + scale * (code - 1), and the row of values is normalised.
+    basis: (R, D) float32 orthonormal directions.  bits: (R,) uint8, 8s, then 4s, then 2s; those of 4 are a multiple of
+    two, those of 2 of four.  offset, scale: (R,) float32; coordinate = offset + scale * level. The row of values that
+    the coordinates give is normalised.
     """
 
+    basis: NDArray[np.float32]
+    bits: NDArray[np.uint8]
     offset: NDArray[np.float32]
     scale: NDArray[np.float32]
 
+    @property
+    def code_bytes(self) -> int:
+        """M, the length of a code."""
+        return int(self.bits.sum()) // 8
+
     @classmethod
-    def fit(cls, features: NDArray[np.floating]) -> Codec:
-        """The range of each dimension over (N, D) features, rows of zeros left out, and a margin that does not cross
-        zero (what never is negative decodes to exact zeros)."""
+    def fit(cls, features: NDArray[np.floating], most_bytes: int = MOST_BYTES) -> Codec:
+        """The codec that (N, D) features, rows of zeros left out, lose least with."""
         dimension = features.shape[1]
-        low, high = np.full(dimension, np.inf, np.float32), np.full(dimension, -np.inf, np.float32)
-        for rows in _chunks(features):
-            known = rows[rows.any(axis=1)].astype(np.float32)
-            low = np.minimum(low, known.min(axis=0, initial=np.inf))
-            high = np.maximum(high, known.max(axis=0, initial=-np.inf))
-        if not np.isfinite(low).all():
-            return cls(np.zeros(dimension, np.float32), np.full(dimension, 1 / _LEVELS, np.float32))
+        known = np.flatnonzero(features.any(axis=1))
+        if dimension <= most_bytes or not len(known):
+            basis = np.eye(dimension, dtype=np.float32)[:most_bytes]
+            bits = np.full(len(basis), 8, np.uint8)
+        else:
+            basis, energy = _directions(features)
+            bits = _shared_out(energy, most_bytes)
+            basis = np.ascontiguousarray(basis[: len(bits)])
+        low, high = np.full(len(bits), np.inf, np.float32), np.full(len(bits), -np.inf, np.float32)
+        for rows in _chunks(features[known]):
+            coordinates = rows.astype(np.float32) @ basis.T
+            low = np.minimum(low, coordinates.min(axis=0))
+            high = np.maximum(high, coordinates.max(axis=0))
+        if not len(known):
+            low, high = np.zeros_like(low), np.ones_like(high)
         low = np.where(low >= 0, np.maximum(low - _MARGIN, 0.0), low - _MARGIN).astype(np.float32)
         high = np.where(high <= 0, np.minimum(high + _MARGIN, 0.0), high + _MARGIN).astype(np.float32)
-        return cls(low, np.maximum(high - low, np.float32(1e-6)) / np.float32(_LEVELS))
+        scale = np.maximum(high - low, np.float32(1e-6)) / np.float32(_LEVELS)
+        offset = low - scale  # level 1 is the lowest
+        sample = features[known[:: max(1, len(known) // _SAMPLE)]].astype(np.float32) @ basis.T
+        for row in np.flatnonzero(bits < 8):
+            offset[row], scale[row] = _coarse(sample[:, row], int(bits[row]))
+        return cls(basis, bits, offset, scale)
 
     def encode(self, features: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """(V, D) features to codes; values outside the range are clipped to it."""
-        codes = np.empty(features.shape, np.uint8)
+        """(V, D) features to codes; coordinates outside a range are clipped to it."""
+        codes = np.empty((len(features), self.code_bytes), np.uint8)
+        lowest = np.where(self.bits == 8, 1, 0)
+        highest = (1 << self.bits.astype(np.int64)) - 1
         for rows, out in zip(_chunks(features), _chunks(codes), strict=True):
-            level = np.clip(np.rint((rows.astype(np.float32) - self.offset) / self.scale), 0, _LEVELS)
-            out[:] = np.where(rows.any(axis=1, keepdims=True), level + 1, 0)
+            coordinates = rows.astype(np.float32) @ self.basis.T
+            level = np.clip(np.rint((coordinates - self.offset) / self.scale), lowest, highest).astype(np.uint8)
+            at = filled = 0
+            for bits in _BITS:
+                own = level[:, at : at + np.count_nonzero(self.bits == bits)]
+                share = 8 // bits
+                packed = np.zeros((len(own), own.shape[1] // share), np.uint8)
+                for part in range(share):
+                    packed |= own[:, part * packed.shape[1] : (part + 1) * packed.shape[1]] << np.uint8(bits * part)
+                out[:, filled : filled + packed.shape[1]] = packed
+                at, filled = at + own.shape[1], filled + packed.shape[1]
+            out[~rows.any(axis=1)] = 0
         return codes
 
     def decode(self, codes: NDArray[np.uint8]) -> NDArray[np.float16]:
-        """(V, D) codes to unit features; the zero feature comes back exactly."""
-        features = np.empty(codes.shape, np.float16)
+        """(V, M) codes to unit features; the zero feature comes back exactly."""
+        features = np.empty((len(codes), self.basis.shape[1]), np.float16)
         for rows, out in zip(_chunks(codes), _chunks(features), strict=True):
-            values = self.offset + self.scale * (rows.astype(np.float32) - 1)
+            values = (self._levels(rows) * self.scale + self.offset) @ self.basis
             values[~rows.any(axis=1)] = 0
             norms = np.linalg.norm(values, axis=1, keepdims=True)
             out[:] = values / np.where(norms > 0, norms, 1)
         return features
 
-    def similarity(self, codes: NDArray[np.uint8], text: NDArray[np.floating]) -> NDArray[np.float32]:
-        """(V, W) cosines of coded features with (W, D) unit text features, without decoding them all: with codes c the
-        dot product is c (scale * t) + (offset - scale) t, and the squared norm is a quadratic in c. Zero features give
-        zero."""
-        base = (self.offset - self.scale).astype(np.float32)
-        weight = (text * self.scale).astype(np.float32).T
-        constant = (text @ base).astype(np.float32)
+    def cosines(self, codes: NDArray[np.uint8], text: NDArray[np.floating]) -> NDArray[np.float32]:
+        """(V, W) cosines of coded features with (W, D) unit text features, without decoding: with levels c and text t
+        in the codec's coordinates, the dot product is c (scale t) + offset t, and the squared norm a quadratic in c.
+        Zero features give zero."""
+        t = (text.astype(np.float32) @ self.basis.T).astype(np.float32)
+        if len(codes) >= _MANY:
+            from . import scoring  # numba takes longer to import than fewer scores to compute
+
+            fours, twos = (int(np.count_nonzero(self.bits == bits)) * bits // 8 for bits in _BITS[1:])
+            return np.asarray(scoring.cosines(codes, fours, twos, self.scale, self.offset, t))
+        linear = np.concatenate((t * self.scale, [2 * self.scale * self.offset])).T
+        constant, squared_offset = t @ self.offset, float(self.offset @ self.offset)
         scores = np.empty((len(codes), len(text)), np.float32)
         for rows, out in zip(_chunks(codes), _chunks(scores), strict=True):
-            c = rows.astype(np.float32)
-            squared = (c * c) @ self.scale**2 + c @ (2 * self.scale * base) + base @ base
-            known = rows.any(axis=1) & (squared > 0)
-            norms = np.sqrt(np.where(known, squared, 1.0))
-            out[:] = np.where(known, 1.0, 0.0)[:, None] * (c @ weight + constant) / norms[:, None]
+            c = self._levels(rows)
+            products = c @ linear
+            np.multiply(c, c, out=c)
+            squared = c @ (self.scale**2) + products[:, -1] + squared_offset
+            something = (rows[:, 0] > 0) & (squared > 0)  # the first is an 8-bit level
+            inverse = np.where(something, 1 / np.sqrt(np.where(something, squared, 1.0)), 0.0).astype(np.float32)
+            np.multiply(products[:, :-1] + constant, inverse[:, None], out=out)
         return scores
 
-    def tables(self) -> dict[str, NDArray[np.float32]]:
+    def _levels(self, codes: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """(V, R) levels of (V, M) codes."""
+        parts: list[NDArray[np.uint8]] = []
+        read = 0
+        for bits in _BITS:
+            share = 8 // bits
+            own = codes[:, read : read + int(np.count_nonzero(self.bits == bits)) // share]
+            mask = np.uint8((1 << bits) - 1)
+            parts += [own] if share == 1 else [(own >> np.uint8(bits * part)) & mask for part in range(share)]
+            read += own.shape[1]
+        return np.concatenate(parts, axis=1).astype(np.float32)
+
+    def tables(self) -> dict[str, NDArray[Any]]:
         """What ``from_tables`` needs."""
-        return {"offset": self.offset, "scale": self.scale}
+        return {"basis": self.basis, "bits": self.bits, "offset": self.offset, "scale": self.scale}
 
     @classmethod
-    def from_tables(cls, tables: Mapping[str, NDArray[np.float32]]) -> Codec:
-        """The codec that a map was saved with."""
-        return cls(tables["offset"], tables["scale"])
+    def from_tables(cls, tables: Mapping[str, NDArray[Any]]) -> Codec:
+        """The codec that a map was saved with. Raises ValueError for tables that do not belong together."""
+        basis, bits, offset, scale = (tables[name] for name in ("basis", "bits", "offset", "scale"))
+        fit = basis.ndim == 2 and bits.shape == offset.shape == scale.shape == basis.shape[:1]
+        counts = {b: int(np.count_nonzero(bits == b)) for b in _BITS}
+        ordered = fit and np.array_equal(bits, np.repeat(_BITS, [counts[b] for b in _BITS]))
+        if not ordered or any(count % (8 // b) for b, count in counts.items()):
+            raise ValueError("the codec's tables do not belong together")
+        floats = (table.astype(np.float32) for table in (basis, offset, scale))
+        basis, offset, scale = floats
+        return cls(basis, bits.astype(np.uint8), offset, scale)
 
 
-def _chunks(rows: NDArray[Any]) -> list[NDArray[Any]]:
+@dataclass(frozen=True)
+class CodedFeatures:
+    """(V, D) unit features that stay coded: (V, M) ``codes``. ``np.asarray`` decodes them."""
+
+    codec: Codec
+    codes: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+    def __getitem__(self, rows: Any) -> CodedFeatures:
+        return CodedFeatures(self.codec, self.codes[rows])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return self.codec.decode(self.codes).astype(dtype or np.float16, copy=False)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(V, D)."""
+        return len(self.codes), self.codec.basis.shape[1]
+
+
+Features: TypeAlias = NDArray[np.floating] | CodedFeatures
+
+
+def cosines(features: Features, text: NDArray[np.floating]) -> NDArray[np.float32]:
+    """(V, W) cosines of unit features, coded or not, with (W, D) unit text features; zero features give zero."""
+    if isinstance(features, CodedFeatures):
+        return features.codec.cosines(features.codes, text)
+    found = np.empty((len(features), len(text)), np.float32)
+    t = text.astype(np.float32).T
+    for rows, out in zip(_chunks(features), _chunks(found), strict=True):
+        np.matmul(rows.astype(np.float32), t, out=out)
+    return found
+
+
+def known(features: Features) -> NDArray[np.bool_]:
+    """(V,) whether anything is known of each feature: whether it is not zero."""
+    rows = features.codes if isinstance(features, CodedFeatures) else features
+    return np.asarray(rows.any(axis=1))
+
+
+def _directions(features: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """(D, D) orthonormal directions, and the mean square along each, largest first."""
+    moments = np.zeros((features.shape[1],) * 2)
+    for rows in _chunks(features):
+        values = rows.astype(np.float32)
+        moments += values.T @ values
+    energy, columns = np.linalg.eigh(moments / len(features))
+    return np.ascontiguousarray(columns[:, ::-1].T, np.float32), np.maximum(energy[::-1], 0.0)
+
+
+def _shared_out(energy: NDArray[np.float64], most_bytes: int) -> NDArray[np.uint8]:
+    """(R,) bits of the first R directions: of all ways to spend the bytes on 8, 4 and 2 bits, the one that leaves the
+    least energy."""
+    below = np.concatenate(([0.0], np.cumsum(energy)))
+    eights, fours = np.meshgrid(np.arange(1, most_bytes + 1), np.arange(most_bytes), indexing="ij")
+    twos = most_bytes - eights - fours
+    eights, fours, twos = (count[twos >= 0] for count in (eights, fours, twos))
+    ends = np.cumsum(np.stack((eights, 2 * fours, 4 * twos)), axis=0)
+    fits = ends[2] <= len(energy)
+    ends = ends[:, fits]
+    left = below[-1] - below[ends[2]]
+    for start, end, bits in zip((np.zeros_like(ends[0]), *ends[:2]), ends, _BITS, strict=True):
+        left = left + _ERRORS[bits] * (below[end] - below[start])
+    best = int(np.argmin(left))
+    counts = np.diff(np.concatenate(([0], ends[:, best])))
+    return np.repeat(np.array(_BITS, np.uint8), counts)
+
+
+def _coarse(values: NDArray[np.float32], bits: int) -> tuple[float, float]:
+    """Offset and step of the uniform quantiser with the least squared error, about Max's for a normal distribution."""
+    mean, deviation = float(values.mean()), max(float(values.std()), 1e-6)
+    top = (1 << bits) - 1
+    best, least = (0.0, 1.0), np.inf
+    for step in _STEPS[bits] * deviation * np.geomspace(0.5, 2.0, 9):
+        offset = mean - 0.5 * top * step
+        error = float(((np.clip(np.rint((values - offset) / step), 0, top) * step + offset - values) ** 2).mean())
+        if error < least:
+            best, least = (offset, step), error
+    return best
+
+
+def _chunks(rows: NDArray[Any]) -> Iterator[NDArray[Any]]:
     """Views of successive rows."""
-    return [rows[start : start + _ROWS] for start in range(0, len(rows), _ROWS)]
+    return (rows[start : start + _ROWS] for start in range(0, len(rows), _ROWS))

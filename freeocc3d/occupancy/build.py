@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, PosedFrame
 from . import carve, splat
-from .grid import union, unpack
+from .grid import pack, union, unpack
 
 
 def build_occupancy(
@@ -19,18 +19,24 @@ def build_occupancy(
     splatting: splat.Options,
     carving: carve.Options,
     origin: NDArray[np.float64] | None = None,
+    blocks: tuple[int, int, int] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Occupancy:
     """The occupancy map of N Gaussians with features (N, D) and of depth images.
 
-    origin: (3,) lower corner of voxel (0, 0, 0); the world's origin by default.  progress: called with the number of
+    origin: (3,) lower corner of voxel (0, 0, 0); the world's origin by default.  blocks: only the blocks (0, 0, 0) …
+    blocks - 1 are made, and all of them; those that anything touches by default.  progress: called with the number of
     frames looked at.
     """
     origin = np.zeros(3) if origin is None else np.asarray(origin, np.float64)
     size = splatting.voxel_size
-    bins = splat.bin_gaussians(gaussians, origin, splatting)
+    shape, within = None, None
+    if blocks is not None:
+        shape = (BLOCK * blocks[0], BLOCK * blocks[1], BLOCK * blocks[2])
+        within = pack(np.stack(np.unravel_index(np.arange(np.prod(blocks)), blocks), axis=1))
+    bins = splat.bin_gaussians(gaussians, origin, splatting, shape)
 
-    evidence = carve.Evidence(origin, size, carving)
+    evidence = carve.Evidence(origin, size, carving, within)
     for done, posed in enumerate(frames, start=1):
         evidence.add(posed.frame, posed.T_world_cam)
         progress(done)

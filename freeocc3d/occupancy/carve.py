@@ -47,12 +47,21 @@ class Evidence:
 
     A frame counts in the blocks that the rays of its pixels pass through, whatever other frames do: the counts do not
     depend on the order of frames, and a frame can be taken out again. 4 bytes a voxel, in blocks that were looked into.
+
+    within: ascending packed keys of the only blocks that are of interest; all by default.
     """
 
-    def __init__(self, origin: NDArray[np.float64], voxel_size: float, options: Options):
+    def __init__(
+        self,
+        origin: NDArray[np.float64],
+        voxel_size: float,
+        options: Options,
+        within: NDArray[np.int64] | None = None,
+    ):
         self.origin = np.asarray(origin, np.float64)
         self.voxel_size = voxel_size
         self.options = options
+        self.within = within
         self.packed = np.zeros(0, np.int64)
         """(B,) ascending packed keys of the blocks that were looked into."""
         self._row = np.zeros(0, np.int64)  # of each of them in the counts, which have room for more
@@ -84,8 +93,10 @@ class Evidence:
         return packed
 
     def visible_blocks(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Ascending packed keys of the blocks between the camera and what its depth image shows, and just behind it.
-        Rays are no farther apart than half a block at the greatest depth."""
+        """Ascending packed keys of the blocks between the camera and what its depth image shows, and just behind it
+        (or of all those of interest). Rays are no farther apart than half a block at the greatest depth."""
+        if self.within is not None:
+            return self.within
         camera = frame.intrinsics
         farthest = max(float(frame.depth_m.max(initial=0.0)), 1e-3)
         step = max(1, min(self.options.ray_step, int(0.5 * BLOCK * self.voxel_size * camera.fx / farthest)))

@@ -32,7 +32,7 @@ def to_voxel_block_grid(
     arrays = {name: getattr(occupancy, name)[:, :, None] for name in _PER_VOXEL}
     arrays["color"] = _spread(occupancy.colors, occupied)
     if features and occupancy.features.shape[1]:
-        arrays["feature"] = _spread(occupancy.features, occupied)
+        arrays["feature"] = _spread(np.asarray(occupancy.features), occupied)
     kinds = _PER_VOXEL | _OF_OCCUPIED
     where = o3c.Device(device)
     grid = o3d.t.geometry.VoxelBlockGrid(

@@ -1,0 +1,238 @@
+"""A box of a saved map at finer voxels: lifted again from the keyframes that see it, in finer cells.
+
+The Gaussians of a map are as coarse as its voxels, so that what lies between two of them (a cup beside another) is not
+in them, but in the keyframes, which the map keeps. What comes out is a map of the box alone, in the same frame.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import config, registry, store
+from .capture import open_capture
+from .config import Config
+from .errors import FreeOccError, MapError
+from .gaussians import anchors
+from .gaussians.cloud import write_ply
+from .geometry import back_project, transform
+from .keyframes import Keyframes
+from .language import lift
+from .language.codec import Codec
+from .occupancy import build, carve, splat
+from .progress import Progress
+from .query import Region
+from .store import Map, load_map
+from .types import BLOCK, Frame, Gaussians, Occupancy, PosedFrame, Trajectory
+from .work import WorkFolder
+
+SMALLEST_VOXEL_M = 0.001
+_MOST_BLOCKS = 1 << 18  # 13 bytes a voxel: 1.7 GB
+_AROUND = 3.0
+"""Voxels of the box's new size around it, from where Gaussians reach into it."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """low, high: (3,) opposite corners in the map's frame, metres."""
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.low).all() and np.isfinite(self.high).all() and (self.low < self.high).all()):
+            raise MapError(
+                "A box has a lower and an upper corner, x0 y0 z0 x1 y1 z1 in metres, each of the first three less than "
+                f"its counterpart; got {' '.join(f'{value:g}' for value in (*self.low, *self.high))}."
+            )
+
+    def contains(self, points: NDArray[np.floating], margin: float) -> NDArray[np.bool_]:
+        """(P,) whether each of (P, 3) points is inside, or no farther outside than the margin along any axis."""
+        return np.asarray(((points >= self.low - margin) & (points <= self.high + margin)).all(axis=1))
+
+
+def around(region: Region, voxel_size: float) -> Box:
+    """The box of what a query found, and two of the map's voxels around it."""
+    return Box(region.box_min - 2 * voxel_size, region.box_max + 2 * voxel_size)
+
+
+def refine(
+    scan_map: Map,
+    box: Box,
+    voxel_size: float,
+    output: str | Path,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Map:
+    """Write a map of a box of another map, with voxels of ``voxel_size`` metres, to the folder ``output``.
+
+    The box is widened to whole blocks of 8 voxels. Raises FreeOccError: the box is empty, or holds more than can be
+    kept, no keyframe sees a surface in it, or the folder exists.
+    """
+    progress = progress or Progress()
+    if not SMALLEST_VOXEL_M <= voxel_size <= scan_map.manifest["voxel_size_m"]:
+        raise MapError(
+            f"Voxels of {voxel_size:g} m cannot be had: give from {SMALLEST_VOXEL_M:g} up to the map's own "
+            f"{scan_map.manifest['voxel_size_m']:g}."
+        )
+    blocks = tuple(math.ceil(edge - 1e-6) for edge in (box.high - box.low) / (BLOCK * voxel_size))
+    if math.prod(blocks) > _MOST_BLOCKS:
+        edge = BLOCK * voxel_size * _MOST_BLOCKS ** (1 / 3)
+        raise MapError(
+            f"The box holds {math.prod(blocks) * BLOCK**3:,} voxels of {voxel_size:g} m, more than can be kept: take "
+            f"one of up to {edge:.1f} m an edge, or larger voxels."
+        )
+    work = WorkFolder.open(Path(output), overwrite, resume=False)
+    settings = _settings(scan_map, voxel_size)
+    seeing, rows, trajectory = _seeing(scan_map, box, _AROUND * voxel_size, progress)
+    trajectory = trajectory.only_keyframes(trajectory.keyframes[rows])
+    poses = trajectory.T_world_keyframe
+
+    def posed() -> Iterator[PosedFrame]:
+        for row, frame in enumerate(seeing):
+            yield PosedFrame(frame, poses[row], row)
+
+    gaussians = _gaussians(posed, box, voxel_size, settings, poses, progress)
+    if not len(gaussians):
+        raise MapError(f"No keyframe of {scan_map.path} shows a surface in the box: nothing can be refined there.")
+    features = _features(scan_map, posed, gaussians, settings, progress)
+    progress.stage("occupancy", len(seeing))
+    occupancy = build.build_occupancy(
+        gaussians,
+        features,
+        posed(),
+        registry.build_options(splat, settings["occupancy"]),
+        registry.build_options(carve, settings["carving"]),
+        origin=box.low,
+        blocks=(blocks[0], blocks[1], blocks[2]),
+        progress=progress.advance,
+    )
+    progress.stage("saving")
+    try:
+        work.begin([str(scan_map.path), *box.low.tolist(), *box.high.tolist()], settings)
+        keyframes = Keyframes(work.folder / store.KEYFRAMES)
+        for frame in seeing:
+            keyframes.append(frame)
+        keyframes.save_index()
+        write_ply(gaussians, work.folder / store.GAUSSIANS)
+        store.write_occupancy(work.folder, occupancy, Codec.fit(features), features)
+        store.write_tum(work.folder / store.TRAJECTORY, trajectory)
+        (work.folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
+        (work.folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
+        store.write_manifest(work.folder, _manifest(scan_map, box, trajectory.keyframes, gaussians, occupancy))
+        work.finish(Path(output))
+    except OSError as error:
+        raise MapError(f"Cannot write {output}: {error.strerror}.") from error
+    except BaseException:
+        work.discard()
+        raise
+    return load_map(output)
+
+
+def _settings(scan_map: Map, voxel_size: float) -> Config:
+    """The map's own, at the new voxel size, with cells that follow it."""
+    settings = config.load(scan_map.path / store.CONFIG)
+    settings["occupancy"]["voxel_size"] = voxel_size
+    settings["gaussians"]["cell_size"] = None
+    settings["gaussians"]["pixel_stride"] = None
+    return settings
+
+
+class _Decoded:
+    """Some keyframes of a map, decoded anew each time that they are gone through."""
+
+    def __init__(self, keyframes: Keyframes, rows: NDArray[np.int64]):
+        self.keyframes, self.rows = keyframes, rows
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self.keyframes[int(row)] for row in self.rows)
+
+
+def _seeing(
+    scan_map: Map, box: Box, margin: float, progress: Progress
+) -> tuple[_Decoded, NDArray[np.int64], Trajectory]:
+    """The keyframes that show something in the box, their rows among all, and the trajectory."""
+    trajectory, keyframes = scan_map.trajectory, scan_map.keyframes
+    progress.stage("keyframes", len(keyframes))
+    seen = np.zeros(len(keyframes), bool)
+    for row, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True)):
+        seen[row] = box.contains(_points(frame, T)[1], margin).any()
+        progress.advance(row + 1)
+    rows = np.flatnonzero(seen)
+    return _Decoded(keyframes, rows), rows, trajectory
+
+
+def _points(frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(P, 2) measured pixels u, v, and (P, 3) where they are in the world."""
+    v, u = np.nonzero(frame.depth_m)
+    pixels = np.stack((u, v), axis=1)
+    points = back_project(pixels, frame.depth_m[v, u], frame.intrinsics)
+    return pixels, transform(T_world_cam, points.astype(np.float64))
+
+
+def _gaussians(
+    posed: Any, box: Box, voxel_size: float, settings: Config, poses: NDArray[np.float64], progress: Progress
+) -> Gaussians:
+    """Layer 2 of what lies in the box."""
+    options: anchors.Options = registry.build_options(anchors, settings["gaussians"])
+    margin = _AROUND * voxel_size
+    progress.stage("gaussians", len(poses))
+    cells = anchors.AnchoredCells(options, 0.5 * voxel_size, poses)
+    for done, look in enumerate(posed(), 1):
+        pixels, points = _points(look.frame, look.T_world_cam)
+        outside = pixels[~box.contains(points, margin)]
+        depth_m = look.frame.depth_m.copy()
+        depth_m[outside[:, 1], outside[:, 0]] = 0
+        cells.add(look._replace(frame=dataclasses.replace(look.frame, depth_m=depth_m)))
+        progress.advance(done)
+    gaussians = cells.gaussians(posed())
+    return gaussians[box.contains(gaussians.means, margin)]
+
+
+def _features(
+    scan_map: Map, posed: Any, gaussians: Gaussians, settings: Config, progress: Progress
+) -> NDArray[np.float16]:
+    """Layer 3 of these Gaussians; where the encoder cannot be had again, the features of the map's own nearest."""
+    name = scan_map.manifest["encoder"]["name"]
+    module = registry.load("language.encoders", name)
+    try:
+        capture = open_capture(scan_map.manifest["capture"]["path"])
+        encoder = module.load(registry.build_options(module, settings["language"].get(name, {})), capture)
+    except FreeOccError as error:
+        progress.warn(f"The encoder '{name}' cannot be used again, so features stay as coarse as the map's: {error}")
+        from scipy.spatial import cKDTree
+
+        nearest = cKDTree(scan_map.gaussians.means).query(gaussians.means)[1]
+        return scan_map.gaussian_features[nearest]
+    options: lift.Options = registry.build_options(lift, config.options(settings, "language"))
+    fusion = lift.FeatureFusion(len(gaussians), encoder.dimension, options)
+    progress.stage("language")
+    for look in posed():
+        fusion.add(gaussians, look.frame, look.T_world_cam, encoder.encode(look.frame))
+    return fusion.features()
+
+
+def _manifest(
+    scan_map: Map, box: Box, keyframes: NDArray[np.int32], gaussians: Gaussians, occupancy: Occupancy
+) -> dict[str, Any]:
+    kept = {key: value for key, value in scan_map.manifest.items() if key not in ("format_version", "files")}
+    return {
+        **kept,
+        "voxel_size_m": occupancy.voxel_size,
+        "origin": occupancy.origin.tolist(),
+        "refined": {"map": str(scan_map.path.absolute()), "box": [*box.low.tolist(), *box.high.tolist()]},
+        "counts": {**kept["counts"], "gaussians": len(gaussians), "voxels": store.counts(occupancy)},
+        "keyframes": keyframes.tolist(),
+    }
