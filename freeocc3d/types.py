@@ -6,6 +6,7 @@ coordinates of frame b to frame a; voxel (i, j, k) covers ``origin + [i, i+1) * 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -156,6 +157,11 @@ class Gaussians:
 
     def __getitem__(self, rows: NDArray[np.generic] | slice) -> Gaussians:
         return Gaussians(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    @classmethod
+    def concatenated(cls, parts: Sequence[Gaussians]) -> Gaussians:
+        """All of one or more sets, in their order."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
 @dataclass(frozen=True)

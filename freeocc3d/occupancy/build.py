@@ -40,9 +40,20 @@ def build_occupancy(
     for done, posed in enumerate(frames, start=1):
         evidence.add(posed.frame, posed.T_world_cam)
         progress(done)
-    packed = union(bins.packed, evidence.packed)
-    free, hits = evidence.at(packed)
+    return of_blocks(union(bins.packed, evidence.packed), bins, gaussians, features, evidence, splatting, carving)
 
+
+def of_blocks(
+    packed: NDArray[np.int64],
+    bins: splat.Bins,
+    gaussians: Gaussians,
+    features: NDArray[np.float16],
+    evidence: carve.Evidence,
+    splatting: splat.Options,
+    carving: carve.Options,
+) -> Occupancy:
+    """The occupancy of some blocks, given by their ascending packed keys, among them all of the bins'."""
+    free, hits = evidence.at(packed)
     probability = np.zeros((len(packed), BLOCK**3), np.float32)
     splatted = np.searchsorted(packed, bins.packed)
     probability[splatted] = splat.probability(bins, unpack(bins.packed))
@@ -54,8 +65,8 @@ def build_occupancy(
     values = np.concatenate((gaussians.colors.astype(np.float32), features.astype(np.float32)), axis=1)
     means = splat.posterior_mean(bins, unpack(bins.packed), slots[splatted], values)
     return Occupancy(
-        voxel_size=size,
-        origin=origin,
+        voxel_size=splatting.voxel_size,
+        origin=evidence.origin,
         keys=unpack(packed),
         probability=probability,
         free=free,

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -94,6 +94,14 @@ class Bins:
     log_weight: NDArray[np.float32]
     kind: int
     squared_cutoff: np.float32
+
+    def only(self, packed: NDArray[np.int64]) -> Bins:
+        """Those of the blocks whose packed keys are among the given."""
+        rows = np.flatnonzero(np.isin(self.packed, packed))
+        count = np.diff(self.start)[rows]
+        start = np.concatenate(([0], np.cumsum(count)))
+        pairs = np.arange(start[-1]) + np.repeat(self.start[rows] - start[:-1], count)
+        return replace(self, packed=self.packed[rows], start=start, gaussian=self.gaussian[pairs])
 
 
 def bin_gaussians(

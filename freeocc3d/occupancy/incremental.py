@@ -1,0 +1,124 @@
+"""Layer 4 kept current while keyframes come, go and move: only the blocks that one touches are made again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import OCCUPIED, Frame, Gaussians, Occupancy
+from . import build, carve, splat
+from .grid import pack, union, unpack
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """What a keyframe brought. touched: packed keys of the blocks that its Gaussians reach."""
+
+    gaussians: Gaussians
+    features: NDArray[np.float16]
+    T_world_cam: NDArray[np.float64]
+    touched: NDArray[np.int64]
+
+
+class IncrementalOccupancy:
+    """The occupancy of a set of keyframes, each with the Gaussians that are anchored to it.
+
+    ``update()`` gives, to the last bit, what ``build_occupancy`` gives for the same set with Gaussians in the order of
+    the keyframes' numbers, but for blocks that say nothing, which are left out. It makes the blocks again that the
+    keyframes added, removed and moved since the last time touch; others are copied.
+    """
+
+    def __init__(
+        self, splatting: splat.Options, carving: carve.Options, origin: NDArray[np.float64] | None = None
+    ) -> None:
+        self.splatting, self.carving = splatting, carving
+        self.evidence = carve.Evidence(np.zeros(3) if origin is None else origin, splatting.voxel_size, carving)
+        self.stale = np.zeros(0, np.int64)
+        """Packed keys of the blocks that the next update makes again."""
+        self._keyframes: dict[int, _Kept] = {}
+        self._none: tuple[Gaussians, NDArray[np.float16]] | None = None  # none of them, and features of their kind
+        self._now: Occupancy | None = None
+
+    def add(
+        self,
+        number: int,
+        frame: Frame,
+        T_world_cam: NDArray[np.float64],
+        gaussians: Gaussians,
+        features: NDArray[np.float16],
+    ) -> None:
+        """Take a keyframe, under a number of its own, with its N Gaussians and their features (N, D)."""
+        if number in self._keyframes:
+            raise ValueError(f"keyframe {number} is there already")
+        touched = splat.bin_gaussians(gaussians, self.evidence.origin, self.splatting).packed
+        self._keyframes[number] = _Kept(gaussians, features, T_world_cam, touched)
+        self._none = gaussians[:0], features[:0]
+        self.stale = union(self.stale, touched, self.evidence.add(frame, T_world_cam))
+
+    def remove(self, number: int, frame: Frame) -> None:
+        """Take a keyframe out again; ``frame`` is what was added. Raises KeyError for a number that is not there."""
+        kept = self._keyframes.pop(number)
+        self.stale = union(self.stale, kept.touched, self.evidence.remove(frame, kept.T_world_cam))
+
+    def move(self, number: int, frame: Frame, T_world_cam: NDArray[np.float64], gaussians: Gaussians) -> None:
+        """Put a keyframe elsewhere, and its Gaussians, as ``anchors.reanchored`` moved them."""
+        features = self._keyframes[number].features
+        self.remove(number, frame)
+        self.add(number, frame, T_world_cam, gaussians, features)
+
+    def update(self) -> Occupancy:
+        """The occupancy of what is there now. Raises ValueError before the first keyframe."""
+        stale = self.stale
+        reaching = [
+            self._keyframes[number]
+            for number in sorted(self._keyframes)
+            if np.isin(self._keyframes[number].touched, stale, assume_unique=True).any()
+        ]
+        if self._none is None:  # nothing was ever added
+            raise ValueError("an occupancy map begins with a keyframe")
+        gaussians = Gaussians.concatenated([self._none[0], *(kept.gaussians for kept in reaching)])
+        features = np.concatenate([self._none[1], *(kept.features for kept in reaching)])
+        bins = splat.bin_gaussians(gaussians, self.evidence.origin, self.splatting).only(stale)
+        made = build.of_blocks(stale, bins, gaussians, features, self.evidence, self.splatting, self.carving)
+        self._now = _merged(self._now, made)
+        self.stale = np.zeros(0, np.int64)
+        return self._now
+
+
+def _merged(old: Occupancy | None, new: Occupancy) -> Occupancy:
+    """The new blocks in place of the old ones of the same keys, those that say nothing left out, keys ascending."""
+    parts = [new] if old is None else [_blocks(old, ~np.isin(pack(old.keys), pack(new.keys))), new]
+    parts = [_blocks(part, _says_something(part)) for part in parts]
+    packed = np.concatenate([pack(part.keys) for part in parts])
+    order = np.argsort(packed)
+    arrays = {
+        name: np.concatenate([getattr(part, name) for part in parts])[order]
+        for name in ("probability", "free", "hits", "state")
+    }
+    count = np.concatenate([np.count_nonzero(part.state == OCCUPIED, axis=1) for part in parts])
+    first = np.cumsum(count) - count
+    rows = np.repeat(first[order] - (np.cumsum(count[order]) - count[order]), count[order]) + np.arange(count.sum())
+    return new.replace(
+        keys=unpack(packed[order]),
+        features=np.concatenate([part.features for part in parts])[rows],
+        colors=np.concatenate([part.colors for part in parts])[rows],
+        **arrays,
+    )
+
+
+def _says_something(part: Occupancy) -> NDArray[np.bool_]:
+    """(B,) whether anything of each block is known."""
+    return np.asarray(((part.probability > 0) | (part.free > 0) | (part.hits > 0)).any(axis=1))
+
+
+def _blocks(occupancy: Occupancy, chosen: NDArray[np.bool_]) -> Occupancy:
+    """Some of the blocks, given by a mask (B,)."""
+    block = np.nonzero(occupancy.state == OCCUPIED)[0]
+    kept = chosen[block]
+    return occupancy.replace(
+        features=occupancy.features[kept],
+        colors=occupancy.colors[kept],
+        **{name: getattr(occupancy, name)[chosen] for name in ("keys", "probability", "free", "hits", "state")},
+    )
