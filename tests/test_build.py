@@ -45,9 +45,9 @@ def test_features_and_colors_belong_to_their_voxels() -> None:
 
 
 def test_what_several_images_see_through_is_not_occupied() -> None:
-    # A Gaussian that floats between the camera and a wall that eight images show behind it.
-    frames = [wall_frame(2.0, i) for i in range(8)]
-    poses = np.tile(np.eye(4), (8, 1, 1))
+    # A Gaussian that floats between the camera and a wall that twelve images show behind it.
+    frames = [wall_frame(2.0, i) for i in range(12)]
+    poses = np.tile(np.eye(4), (12, 1, 1))
     floater = gaussians([[0.02, 0.02, 1.0]], 0.05)
     nothing = np.zeros((1, 0), np.float16)
     contradicted = build.build_occupancy(floater, nothing, posed(frames, poses), splat.Options(), carve.Options())

@@ -140,3 +140,20 @@ def test_visible_blocks_hold_every_voxel_that_an_image_says_something_about() ->
         wide._count(wide.packed, frame, T, 1)
         for narrow, broad in ((few.free, wide.free), (few.hits, wide.hits)):
             assert narrow.sum() >= 0.985 * broad.sum()  # the rest lies in blocks that the image's border grazes
+
+
+def test_log_odds_are_the_sensor_models_and_noise_widens_it() -> None:
+    options = carve.Options()
+    free, hits = np.array([[4, 0, 2]], np.uint16), np.array([[0, 3, 1]], np.uint16)
+    np.testing.assert_allclose(carve.log_odds(free, hits, options), [[-1.6, 2.55, 0.05]], rtol=1e-5)
+    logit = np.log(0.7 / 0.3), np.log(0.4 / 0.6)
+    np.testing.assert_allclose((options.hit, -options.miss), logit, atol=0.01)
+    thickness = []
+    for depth in (1.0, 6.0):
+        evidence = carve.Evidence(np.zeros(3), 0.08, options)
+        evidence.add(wall_frame(depth), np.eye(4))
+        hit = np.argwhere(evidence.hits > 0)
+        layers = grid.unpack(evidence.packed)[hit[:, 0], 2] * 8 + hit[:, 1] % 8
+        thickness.append(len(np.unique(layers)))
+    assert thickness[0] == 1
+    assert thickness[1] >= 3  # half a voxel either side, plus sigma: 2 mm at 1 m, 7 cm at 6 m, and as much noise

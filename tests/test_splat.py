@@ -1,14 +1,15 @@
 """The projection against its plain reference and against cases whose answers are known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scenes import gaussians, random_gaussians
 
-from freeocc3d.errors import ConfigError
+from freeocc3d.errors import ConfigError, DependencyError
 from freeocc3d.geometry import quats_to_rotations
-from freeocc3d.occupancy import grid, reference, splat
+from freeocc3d.occupancy import grid, reference, splat, splat_torch
 from freeocc3d.occupancy.mass import box_masses
 from freeocc3d.types import Gaussians
 
@@ -180,3 +181,35 @@ def test_far_apart_and_negative_coordinates_cost_only_the_blocks_they_touch() ->
     _, keys, alpha, _ = project(g)
     assert len(keys) <= 16
     assert (alpha > 0.1).any(axis=1).sum() >= 2
+
+
+@pytest.mark.parametrize("projection", ["probabilistic", "poisson", "released"])
+@pytest.mark.parametrize("device", ["cpu:0", "cuda:0"])
+def test_torch_projects_as_the_kernels_do(device: str, projection: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the processor as well: what differs on a GPU is the device only."""
+    torch = pytest.importorskip("torch")
+    if device == "cuda:0" and not torch.cuda.is_available():
+        pytest.skip("needs a GPU")
+    g = random_gaussians(200, seed=6)
+    bins, keys, alpha, _ = project(g, (0.3, -1.2, 0.0), projection=projection)
+    there = replace(bins, device=device)
+    monkeypatch.setattr(splat_torch, "_PAIRS", 1000)
+    np.testing.assert_allclose(splat.probability(there, keys), alpha, atol=3e-6)
+    slots = np.full(alpha.shape, -1, np.int32)
+    wanted = alpha > 0.3
+    slots[wanted] = np.arange(wanted.sum())
+    values = np.random.default_rng(5).normal(size=(len(g), 20)).astype(np.float32)
+    np.testing.assert_allclose(
+        splat.posterior_mean(there, keys, slots, values), splat.posterior_mean(bins, keys, slots, values), atol=3e-5
+    )
+
+
+def test_a_gpu_that_is_not_there_is_told() -> None:
+    torch = pytest.importorskip("torch")
+    with pytest.raises(ConfigError, match="cpu or cuda"):
+        splat.Options(device="gpu")
+    with pytest.raises(ConfigError, match="on the processor only"):
+        splat.Options(device="cuda:0", projection="integrated")
+    if not torch.cuda.is_available():
+        with pytest.raises(DependencyError, match="needs a GPU"):
+            splat.Options(device="cuda:0")

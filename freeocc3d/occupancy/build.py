@@ -84,9 +84,9 @@ def classify(
     splatting: splat.Options,
     carving: carve.Options,
 ) -> NDArray[np.uint8]:
-    """State of each voxel: occupied by alpha unless the depth images contradict it, free where they saw through, else
-    unknown. Unknown is never taken for free."""
-    contradicted = free > splatting.seen_through * np.maximum(hits.astype(np.float32), 1.0)
+    """State of each voxel: occupied by alpha unless the log-odds of the depth images contradict it, free where they saw
+    through, else unknown. Unknown is never taken for free."""
+    contradicted = carve.log_odds(free, hits, carving) <= -splatting.contradiction
     occupied = (probability >= splatting.threshold) & ~contradicted
     state = np.where(free >= carving.min_free, FREE, UNKNOWN).astype(np.uint8)
     state[occupied] = OCCUPIED

@@ -25,6 +25,10 @@ class Options:
     depth's uncertainty)."""
     noise: float = 0.0019
     """Growth of a depth's standard deviation with its square, 1/m; three of them are added to the margin."""
+    hit: float = 0.85
+    """Log-odds that a depth image which ends in a voxel adds: OctoMap's, a probability of 0.7."""
+    miss: float = 0.4
+    """Log-odds that one which sees through a voxel takes away: OctoMap's, a probability of 0.4."""
     min_free: int = 1
     """Depth images that must see through a voxel that holds no surface before it counts as free."""
     every: int = 1
@@ -33,9 +37,19 @@ class Options:
     """Every n-th pixel's ray (more where blocks are small) is followed to find the blocks that a camera looked into."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "margin", "min_free", "ray_step")
+        require_positive(self, "margin", "hit", "miss", "min_free", "ray_step")
         if self.noise < 0 or self.every < 0:
             raise ConfigError("'noise' and 'every' must not be negative.")
+
+
+def log_odds(free: NDArray[np.uint16], hits: NDArray[np.uint16], options: Options) -> NDArray[np.float32]:
+    """Log-odds of occupancy that depth images alone give, by the numbers that saw through and ended in each voxel: the
+    inverse sensor model says ``hit`` within half a voxel and the depth's uncertainty, which grows with its square, of
+    what is measured, ``-miss`` in front of that with a margin, and nothing behind.
+
+    Source: A. Hornung et al., OctoMap, Autonomous Robots 34(3), 2013, eq. 2.
+    """
+    return np.float32(options.hit) * hits - np.float32(options.miss) * free
 
 
 class Evidence:

@@ -59,16 +59,22 @@ class Options:
     """Neighbourhood of a Gaussian in standard deviations."""
     threshold: float = 0.5
     """Occupied from this alpha on."""
-    seen_through: float = 3.0
-    """A voxel above the threshold is free all the same when this many times more depth images saw through it than ended
-    in it."""
+    device: str = "cpu"
+    """Where Gaussians are projected: "cpu" (compiled), or a GPU for torch, such as "cuda:0"."""
+    contradiction: float = 4.0
+    """A voxel above the threshold is free all the same when the log-odds of what depth images saw there (see carving)
+    are at most minus this: 4 is ten more images that saw through it than are made up for by some that ended in it."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "voxel_size", "cutoff", "threshold", "seen_through")
+        require_positive(self, "voxel_size", "cutoff", "threshold", "contradiction")
         if self.threshold >= 1:
             raise ConfigError(f"'threshold' must be less than 1, got {self.threshold}.")
         if self.projection not in PROJECTIONS:
             raise ConfigError(f"'projection' must be one of {', '.join(PROJECTIONS)}, got '{self.projection}'.")
+        if self.device != "cpu":
+            from . import splat_torch
+
+            splat_torch.check(self.device, self.projection)
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,7 @@ class Bins:
     form: (N, 6) float32 upper triangle of a matrix: Sigma^-1 in voxels^-2; integrated: Sigma in voxels^2; released:
     Sigma in metres^2, times what turns voxels into metres twice.  lo, hi: (N, 3) int32 first and last voxel of the
     neighbourhood's box.  opacities: (N,) float32.  log_weight: (N,) float32 log of the part of w_k that is the same at
-    all voxels, up to a common constant.  kind, squared_cutoff: how the kernels take it.
+    all voxels, up to a common constant.  kind, squared_cutoff: how the kernels take it.  device: where they run.
     """
 
     packed: NDArray[np.int64]
@@ -94,6 +100,7 @@ class Bins:
     log_weight: NDArray[np.float32]
     kind: int
     squared_cutoff: np.float32
+    device: str
 
     def only(self, packed: NDArray[np.int64]) -> Bins:
         """Those of the blocks whose packed keys are among the given."""
@@ -137,11 +144,18 @@ def bin_gaussians(
     if shape is not None:
         lo, hi = np.maximum(lo, np.int32(0)), np.minimum(hi, np.array(shape, np.int32) - 1)
     packed, start, gaussian = _sort_by_block(lo, hi)
-    return Bins(packed, start, gaussian, means, form, lo, hi, opacities, log_weight, kind, squared_cutoff)
+    return Bins(
+        packed, start, gaussian, means, form, lo, hi, opacities, log_weight, kind, squared_cutoff,
+        options.device,
+    )  # fmt: skip
 
 
 def probability(bins: Bins, keys: NDArray[np.int32]) -> NDArray[np.float32]:
     """(B, 512) alpha at every voxel of the bins' blocks, whose (B, 3) keys are given: equations (A) and (B)."""
+    if bins.device != "cpu":
+        from . import splat_torch
+
+        return splat_torch.probability(bins, keys, bins.kind == _POISSON)
     listed = keys, bins.start, bins.gaussian, bins.means, bins.form, bins.lo, bins.hi
     if bins.kind == _MASS:
         return _probability_by_mass(*listed)
@@ -157,6 +171,10 @@ def posterior_mean(
     without a neighbouring Gaussian gets zeros.
     """
     rows = int(slots.max(initial=-1)) + 1
+    if bins.device != "cpu":
+        from . import splat_torch
+
+        return splat_torch.posterior_mean(bins, keys, slots, values, rows)
     return _posterior_mean(
         keys, bins.start, bins.gaussian, bins.means, bins.form, bins.lo, bins.hi, bins.log_weight, bins.squared_cutoff,
         bins.kind == _MASS, slots, values, rows,

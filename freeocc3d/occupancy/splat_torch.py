@@ -1,0 +1,111 @@
+"""The projection in torch, for a GPU: all pairs of a Gaussian and a voxel of its neighbourhood, summed by voxel.
+
+Products become sums of logarithms, in an order that the device chooses: equal to ``splat`` to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..errors import ConfigError, DependencyError
+from ..types import BLOCK
+from .grid import KEY_LIMIT, pack
+
+if TYPE_CHECKING:
+    from .splat import Bins
+
+_PAIRS = 1 << 24  # worked on at once: 60 bytes each
+
+
+def check(device: str, projection: str) -> None:
+    """Raises ConfigError or DependencyError if this cannot be done there."""
+    if projection == "integrated":
+        raise ConfigError("'integrated' projects on the processor only: set occupancy.device=cpu.")
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise ConfigError(f"'device' must be cpu or cuda:0, got '{device}'.") from error
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise DependencyError(f"occupancy.device={device} needs a GPU and a torch that uses it; there is none here.")
+
+
+def probability(bins: Bins, keys: NDArray[np.int32], poisson: bool) -> NDArray[np.float32]:
+    """As ``splat.probability``."""
+    device = torch.device(bins.device)
+    logarithms = torch.zeros(len(keys) * BLOCK**3, dtype=torch.float32, device=device)
+    opacities = torch.from_numpy(bins.opacities).to(device)
+    for gaussian, voxel, squared in _pairs(bins, keys, device):
+        phi = torch.exp(-0.5 * squared)
+        left = -opacities[gaussian] * phi if poisson else torch.log1p(-phi)  # (A)
+        logarithms.index_add_(0, voxel, left)
+    return (-torch.expm1(logarithms)).reshape(-1, BLOCK**3).cpu().numpy()  # (B)
+
+
+def posterior_mean(
+    bins: Bins, keys: NDArray[np.int32], slots: NDArray[np.int32], values: NDArray[np.floating], rows: int
+) -> NDArray[np.float32]:
+    """As ``splat.posterior_mean``."""
+    device = torch.device(bins.device)
+    row_of_voxel = torch.from_numpy(slots.reshape(-1).astype(np.int64)).to(device)
+    log_weight = torch.from_numpy(bins.log_weight).to(device)
+    own = torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
+    largest = torch.full((rows,), -torch.inf, device=device)  # of each voxel: the unit of its weights
+    for gaussian, voxel, squared in _pairs(bins, keys, device):
+        row = row_of_voxel[voxel]
+        kept = row >= 0
+        exponents = (log_weight[gaussian] - 0.5 * squared)[kept]
+        largest.scatter_reduce_(0, row[kept], exponents, "amax")
+    mean = torch.zeros((rows, values.shape[1]), device=device)
+    total = torch.zeros(rows, device=device)
+    for gaussian, voxel, squared in _pairs(bins, keys, device, _PAIRS // max(1, values.shape[1] // 16)):
+        row = row_of_voxel[voxel]
+        kept = row >= 0
+        row, g = row[kept], gaussian[kept]
+        weight = torch.exp(log_weight[g] - 0.5 * squared[kept] - largest[row])  # (C), numerator
+        total.index_add_(0, row, weight)
+        mean.index_add_(0, row, weight[:, None] * own[g])  # (D)
+    return (mean / torch.where(total > 0, total, 1.0)[:, None]).cpu().numpy()  # (C), denominator
+
+
+def _pairs(
+    bins: Bins, keys: NDArray[np.int32], device: torch.device, at_once: int = _PAIRS
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Gaussian, voxel (row of its block * 512 + local index) and squared distance of the pairs within the cutoff."""
+    packed = pack(keys)
+    order = np.argsort(packed)
+    sorted_keys = torch.from_numpy(packed[order]).to(device)
+    block_row = torch.from_numpy(order).to(device)
+    lo, hi = (torch.from_numpy(array.astype(np.int64)).to(device) for array in (bins.lo, bins.hi))
+    means, form = torch.from_numpy(bins.means).to(device), torch.from_numpy(bins.form).to(device)
+    size = (hi - lo + 1).clamp(min=0)
+    ends = torch.cumsum(size.prod(dim=1), 0)
+    first, pairs = 0, int(ends[-1]) if len(ends) else 0
+    while first < pairs:
+        number = torch.arange(first, min(first + max(at_once, 1), pairs), device=device)
+        first += len(number)
+        g = torch.searchsorted(ends, number, right=True)
+        local = number - (ends[g] - size[g].prod(dim=1))
+        k = local % size[g, 2]
+        j = local // size[g, 2] % size[g, 1]
+        i = local // (size[g, 2] * size[g, 1])
+        voxel = lo[g] + torch.stack((i, j, k), dim=1)
+        d = voxel.float() + 0.5 - means[g]
+        f = form[g]
+        squared = (
+            d[:, 0] * (f[:, 0] * d[:, 0] + 2 * f[:, 1] * d[:, 1] + 2 * f[:, 2] * d[:, 2])
+            + d[:, 1] * (f[:, 3] * d[:, 1] + 2 * f[:, 4] * d[:, 2])
+            + f[:, 5] * d[:, 2] ** 2
+        )
+        block = (voxel >> 3) + KEY_LIMIT
+        key = (block[:, 0] << 42) | (block[:, 1] << 21) | block[:, 2]
+        at = torch.searchsorted(sorted_keys, key).clamp(max=max(len(sorted_keys) - 1, 0))
+        kept = (squared <= float(bins.squared_cutoff)) & (sorted_keys[at] == key)
+        inside = voxel[kept] & 7
+        index = block_row[at[kept]] * BLOCK**3 + (inside[:, 0] * BLOCK + inside[:, 1]) * BLOCK + inside[:, 2]
+        yield g[kept], index, squared[kept]
