@@ -160,6 +160,18 @@ def test_posterior_mean_equals_the_reference(projection) -> None:
     np.testing.assert_allclose(mean, expected, atol=2e-5 if projection == "probabilistic" else 2e-4)
 
 
+def test_values_of_half_precision_are_taken_as_they_are() -> None:
+    g = random_gaussians(100, seed=4)
+    bins, keys, alpha, _ = project(g)
+    slots = np.where(alpha > 0.3, 0, -1).astype(np.int32)
+    slots[slots == 0] = np.arange(np.count_nonzero(slots == 0))
+    halves = np.random.default_rng(5).normal(size=(len(g), 9)).astype(np.float16)
+    halves[:, :3] *= np.float16(1e-4)  # some without a whole mantissa
+    halves[::7, 3] = -255
+    expected = splat.posterior_mean(bins, keys, slots, halves.astype(np.float32))
+    np.testing.assert_allclose(splat.posterior_mean(bins, keys, slots, halves), expected, rtol=1e-6)
+
+
 def test_posterior_prefers_the_narrow_the_near_and_the_opaque() -> None:
     center = np.array([0.5, 0.5, 0.5]) * V
     g = gaussians([center, center + (0.03, 0, 0)], [[0.02] * 3, [0.06] * 3], opacities=(0.5, 1.0))

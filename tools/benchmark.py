@@ -32,6 +32,7 @@ import held_out
 import kernels
 import rendering
 import variants
+import voxels
 
 Figures = dict[str, Any]
 
@@ -55,7 +56,7 @@ PEERS = {
 
 UNFITTED = "rgbd_no_fitting"
 
-KERNELS = ("splat", "query", "rasterizer")
+KERNELS = ("splat", "voxels", "query", "rasterizer")
 LAYER_1 = {
     "stress": "layer 1 on altered captures: what is reached, what is lost, and whether that is told",
     "glued": "layer 1 on two captures as if they were one, which must stay two submaps",
@@ -271,7 +272,7 @@ def occupancy(kind: str, capture: str, frames: int | None, poses: str | None, tr
 
 def kernel(name: str, asked_map: Path | None) -> Figures:
     """Speed of the projection, or of queries in a map. Raises PartFailed."""
-    if name in ("splat", "rasterizer"):
+    if name in ("splat", "voxels", "rasterizer"):
         return _inside(name)
     if asked_map is None or not (asked_map / "map.yaml").is_file():
         raise PartFailed(f"there is no map to ask: name the variant {OURS}, too")
@@ -299,6 +300,7 @@ INSIDE = {
     "lengths": lambda **given: _stress().lengths(**given),
     "warm_up": lambda **given: _stress().warm_up(**given),
     "splat": lambda: kernels.measure_splat(),
+    "voxels": lambda: voxels.measure_voxels(),
     "rasterizer": lambda: rendering.measure_rasterizer(),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
 }
@@ -457,7 +459,12 @@ def markdown(results: Figures) -> str:
         )
         lines.append(f"| {' | '.join(cells)} |")
     lines += [f"\nmIoU of {capture}: over {classes}" for capture, classes in _class_lists(results).items()]
-    writers = {"splat": kernels.splat_lines, "query": kernels.query_lines, "rasterizer": rendering.rasterizer_lines}
+    writers = {
+        "splat": kernels.splat_lines,
+        "voxels": voxels.voxels_lines,
+        "query": kernels.query_lines,
+        "rasterizer": rendering.rasterizer_lines,
+    }
     for name, write in writers.items():
         figures = results["kernels"].get(name)
         if figures is not None and "error" in figures:
@@ -621,7 +628,7 @@ def main() -> None:
             print(f"{name:<38} {title}")
         for name, title in LAYER_1.items():
             print(f"{name:<38} {title}")
-        print(f"{', '.join(KERNELS):<38} speed of the projection and of queries")
+        print(f"{', '.join(KERNELS):<38} speed of the projection, of voxels, queries and rendering")
         return
     old = json.loads(given.compare.read_text(encoding="utf-8")) if given.compare else None
     with tempfile.TemporaryDirectory(prefix="freeocc3d-benchmark-") as temporary:

@@ -62,7 +62,7 @@ def of_blocks(
     slots = np.full(state.shape, -1, np.int32)
     occupied = state == OCCUPIED
     slots[occupied] = np.arange(np.count_nonzero(occupied))
-    values = np.concatenate((gaussians.colors.astype(np.float32), features.astype(np.float32)), axis=1)
+    values = np.concatenate((gaussians.colors.astype(np.float16), features), axis=1)  # 0…255 are exact
     means = splat.posterior_mean(bins, unpack(bins.packed), slots[splatted], values)
     return Occupancy(
         voxel_size=splatting.voxel_size,

@@ -31,7 +31,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, njit, prange, types
+from numba.extending import overload
 from numpy.typing import NDArray
 
 from ..errors import ConfigError
@@ -41,8 +42,8 @@ from ..types import BLOCK, Gaussians
 from .grid import packed_key, touched_blocks, union
 from .mass import box_masses
 
-PROJECTIONS = ("probabilistic", "poisson", "integrated", "released")
-_POINT, _POISSON, _MASS = 0, 1, 2
+_PROBABILISTIC, _POISSON, _INTEGRATED, _RELEASED = range(4)
+_MODES = {"probabilistic": _PROBABILISTIC, "poisson": _POISSON, "integrated": _INTEGRATED, "released": _RELEASED}
 _SMALLEST_SCALE = 1e-5
 
 
@@ -69,8 +70,8 @@ class Options:
         require_positive(self, "voxel_size", "cutoff", "threshold", "contradiction")
         if self.threshold >= 1:
             raise ConfigError(f"'threshold' must be less than 1, got {self.threshold}.")
-        if self.projection not in PROJECTIONS:
-            raise ConfigError(f"'projection' must be one of {', '.join(PROJECTIONS)}, got '{self.projection}'.")
+        if self.projection not in _MODES:
+            raise ConfigError(f"'projection' must be one of {', '.join(_MODES)}, got '{self.projection}'.")
         if self.device != "cpu":
             from . import splat_torch
 
@@ -86,7 +87,7 @@ class Bins:
     form: (N, 6) float32 upper triangle of a matrix: Sigma^-1 in voxels^-2; integrated: Sigma in voxels^2; released:
     Sigma in metres^2, times what turns voxels into metres twice.  lo, hi: (N, 3) int32 first and last voxel of the
     neighbourhood's box.  opacities: (N,) float32.  log_weight: (N,) float32 log of the part of w_k that is the same at
-    all voxels, up to a common constant.  kind, squared_cutoff: how the kernels take it.  device: where they run.
+    all voxels, up to a common constant.  mode, squared_cutoff: of the projection.  device: where they run.
     """
 
     packed: NDArray[np.int64]
@@ -98,7 +99,7 @@ class Bins:
     hi: NDArray[np.int32]
     opacities: NDArray[np.float32]
     log_weight: NDArray[np.float32]
-    kind: int
+    mode: int
     squared_cutoff: np.float32
     device: str
 
@@ -121,31 +122,17 @@ def bin_gaussians(
 
     shape: only the voxels (0, 0, 0) … shape - 1 are evaluated, however far a Gaussian reaches; all by default.
     """
-    mode, size = options.projection, options.voxel_size
-    means = ((gaussians.means.astype(np.float64) - origin) / size).astype(np.float32)
-    scales = np.maximum(gaussians.scales, _SMALLEST_SCALE).astype(np.float32) / np.float32(size)
-    quats, opacities = gaussians.quats_wxyz.astype(np.float32), gaussians.opacities.astype(np.float32)
-    log_weight = np.log(np.maximum(opacities, np.float32(1e-6)))
-    covariance = _rotated(quats, scales**2)
-    kind, form, squared_cutoff = _POINT, covariance, np.float32(options.cutoff**2)
-    if mode == "released":
-        kind, form, squared_cutoff = _POISSON, covariance * np.float32(size**4), np.float32(np.inf)
-        reach = np.ceil(np.float32(options.cutoff) * scales.max(axis=1, keepdims=True)).astype(np.int32)
-        home = np.floor(means).astype(np.int32)
-        lo, hi = home - reach, home + reach
-    else:
-        lo, hi = _boxes(means, covariance, np.float32(options.cutoff), mode == "integrated")
-        if mode == "integrated":
-            kind = _MASS
-        else:
-            kind = _POISSON if mode == "poisson" else _POINT
-            form = _rotated(quats, scales**-2)
-            log_weight = log_weight - np.log(scales).sum(axis=1)
+    mode = _MODES[options.projection]
+    means, form, log_weight, lo, hi = _prepared(
+        gaussians.means, gaussians.scales, gaussians.quats_wxyz, gaussians.opacities, origin, options.voxel_size,
+        options.cutoff, mode,
+    )  # fmt: skip
     if shape is not None:
         lo, hi = np.maximum(lo, np.int32(0)), np.minimum(hi, np.array(shape, np.int32) - 1)
     packed, start, gaussian = _sort_by_block(lo, hi)
+    squared_cutoff = np.float32(np.inf if mode == _RELEASED else options.cutoff**2)
     return Bins(
-        packed, start, gaussian, means, form, lo, hi, opacities, log_weight, kind, squared_cutoff,
+        packed, start, gaussian, means, form, lo, hi, gaussians.opacities, log_weight, mode, squared_cutoff,
         options.device,
     )  # fmt: skip
 
@@ -155,11 +142,11 @@ def probability(bins: Bins, keys: NDArray[np.int32]) -> NDArray[np.float32]:
     if bins.device != "cpu":
         from . import splat_torch
 
-        return splat_torch.probability(bins, keys, bins.kind == _POISSON)
+        return splat_torch.probability(bins, keys, bins.mode != _PROBABILISTIC)
     listed = keys, bins.start, bins.gaussian, bins.means, bins.form, bins.lo, bins.hi
-    if bins.kind == _MASS:
+    if bins.mode == _INTEGRATED:
         return _probability_by_mass(*listed)
-    return _probability(*listed, bins.opacities, bins.squared_cutoff, bins.kind == _POISSON)
+    return _probability(*listed, bins.opacities, bins.squared_cutoff, bins.mode != _PROBABILISTIC)
 
 
 def posterior_mean(
@@ -168,7 +155,7 @@ def posterior_mean(
     """(V, D) posterior expectation of per-Gaussian values (N, D) at some voxels: equations (C) and (D).
 
     slots: (B, 512) row of the output for each voxel of the bins' blocks, -1 for voxels that are not asked for. A voxel
-    without a neighbouring Gaussian gets zeros.
+    without a neighbouring Gaussian gets zeros. values: float16 ones are taken as they are, without a copy of all.
     """
     rows = int(slots.max(initial=-1)) + 1
     if bins.device != "cpu":
@@ -177,17 +164,28 @@ def posterior_mean(
         return splat_torch.posterior_mean(bins, keys, slots, values, rows)
     return _posterior_mean(
         keys, bins.start, bins.gaussian, bins.means, bins.form, bins.lo, bins.hi, bins.log_weight, bins.squared_cutoff,
-        bins.kind == _MASS, slots, values, rows,
+        bins.mode == _INTEGRATED, slots, values.view(np.uint16) if values.dtype == np.float16 else values, rows,
     )  # fmt: skip
 
 
 @njit(parallel=True, cache=True)
-def _rotated(quats: NDArray[np.float32], diagonal: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N, 6) R diag R^T as xx, xy, xz, yy, yz, zz."""
-    n = len(quats)
-    out = np.empty((n, 6), np.float32)
+def _prepared(
+    world: NDArray[np.float32],
+    deviations: NDArray[np.float32],
+    quats_wxyz: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    origin: NDArray[np.float64],
+    size: float,
+    cutoff: float,
+    mode: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]]:
+    """Means, forms, logarithms of weights, first and last voxels, as in ``Bins``; lo > hi if no voxel is near."""
+    n = len(world)
+    means, form = np.empty((n, 3), np.float32), np.empty((n, 6), np.float32)
+    log_weight = np.empty(n, np.float32)
+    lo, hi = np.empty((n, 3), np.int32), np.empty((n, 3), np.int32)
     for g in prange(n):
-        w, x, y, z = quats[g, 0], quats[g, 1], quats[g, 2], quats[g, 3]
+        w, x, y, z = quats_wxyz[g, 0], quats_wxyz[g, 1], quats_wxyz[g, 2], quats_wxyz[g, 3]
         norm = math.sqrt(w * w + x * x + y * y + z * z)
         w, x, y, z = w / norm, x / norm, y / norm, z / norm
         R = (
@@ -195,33 +193,36 @@ def _rotated(quats: NDArray[np.float32], diagonal: NDArray[np.float32]) -> NDArr
             (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
             (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
         )
+        s0, s1, s2 = (
+            max(deviations[g, 0], _SMALLEST_SCALE) / size,
+            max(deviations[g, 1], _SMALLEST_SCALE) / size,
+            max(deviations[g, 2], _SMALLEST_SCALE) / size,
+        )
+        log_weight[g] = math.log(max(opacities[g], 1e-6))
+        d0, d1, d2 = s0 * s0, s1 * s1, s2 * s2
+        if mode in (_PROBABILISTIC, _POISSON):
+            d0, d1, d2 = 1 / d0, 1 / d1, 1 / d2
+            log_weight[g] -= math.log(s0 * s1 * s2)
+        elif mode == _RELEASED:
+            d0, d1, d2 = d0 * size**4, d1 * size**4, d2 * size**4
+        dilation = math.ceil(cutoff * max(s0, s1, s2))
         entry = 0
         for i in range(3):
             a = R[i]
             for j in range(i, 3):
                 b = R[j]
-                out[g, entry] = (
-                    a[0] * b[0] * diagonal[g, 0] + a[1] * b[1] * diagonal[g, 1] + a[2] * b[2] * diagonal[g, 2]
-                )
+                form[g, entry] = a[0] * b[0] * d0 + a[1] * b[1] * d1 + a[2] * b[2] * d2
                 entry += 1
-    return out
-
-
-@njit(parallel=True, cache=True)
-def _boxes(
-    means: NDArray[np.float32], covariance: NDArray[np.float32], cutoff: np.float32, whole_voxels: bool
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """First and last voxel whose centre, or any part of whom, lies in the bounding box of each neighbourhood; lo > hi
-    if none does."""
-    n = len(means)
-    lo, hi = np.empty((n, 3), np.int32), np.empty((n, 3), np.int32)
-    for g in prange(n):
-        for i in range(3):
-            reach = cutoff * math.sqrt(covariance[g, (0, 3, 5)[i]])
-            first, last = means[g, i] - reach, means[g, i] + reach
-            lo[g, i] = math.floor(first) if whole_voxels else math.ceil(first - np.float32(0.5))
-            hi[g, i] = math.floor(last if whole_voxels else last - np.float32(0.5))
-    return lo, hi
+            mean = np.float32((world[g, i] - origin[i]) / size)
+            means[g, i] = mean
+            reach = cutoff * math.sqrt((a[0] * s0) ** 2 + (a[1] * s1) ** 2 + (a[2] * s2) ** 2)
+            if mode == _RELEASED:
+                lo[g, i], hi[g, i] = math.floor(mean) - dilation, math.floor(mean) + dilation
+            elif mode == _INTEGRATED:  # any part of the voxel
+                lo[g, i], hi[g, i] = math.floor(mean - reach), math.floor(mean + reach)
+            else:  # its centre
+                lo[g, i], hi[g, i] = math.ceil(mean - reach - 0.5), math.floor(mean + reach - 0.5)
+    return means, form, log_weight, lo, hi
 
 
 def _sort_by_block(
@@ -363,6 +364,25 @@ def _window(
     )  # fmt: skip
 
 
+def _load(values: NDArray[np.generic], g: int, bits: NDArray[np.int32], row: NDArray[np.float32]) -> None:
+    """Row g of the values as float32. bits: the memory of ``row``."""
+
+
+@overload(_load)
+def _load_of_kind(values, g, bits, row):  # type: ignore[no-untyped-def]
+    def halves(values, g, bits, row):  # type: ignore[no-untyped-def]
+        for d in range(len(row)):  # exponents are smaller by 112 until they are scaled, which is exact
+            bits[d] = (np.int32(values[g, d] & 0x7FFF) << 13) | (np.int32(values[g, d] >> 15) << 31)
+        for d in range(len(row)):
+            row[d] *= np.float32(2.0**112)
+
+    def floats(values, g, bits, row):  # type: ignore[no-untyped-def]
+        for d in range(len(row)):
+            row[d] = values[g, d]
+
+    return halves if values.dtype == types.uint16 else floats
+
+
 @njit(parallel=True, cache=True)
 def _posterior_mean(
     keys: NDArray[np.int32],
@@ -385,6 +405,8 @@ def _posterior_mean(
     for b in prange(len(keys)):
         x0, y0, z0 = keys[b, 0] * BLOCK, keys[b, 1] * BLOCK, keys[b, 2] * BLOCK
         total, mass = np.zeros(BLOCK**3, np.float32), np.empty((BLOCK, BLOCK, BLOCK))
+        bits = np.empty(dimension, np.int32)
+        own = bits.view(np.float32)
         # Densities of thin and of wide Gaussians differ by orders of magnitude: the block's largest is the unit.
         unit = np.float32(-np.inf)
         for pair in range(start[b], start[b + 1]):
@@ -393,6 +415,7 @@ def _posterior_mean(
             g = gaussian[pair]
             fxx, fxy, fxz, fyy, fyz, fzz = form[g, 0], form[g, 1], form[g, 2], form[g, 3], form[g, 4], form[g, 5]
             i0, j0, k0, i1, j1, k1 = _window(keys[b], lo[g], hi[g])
+            loaded = False
             if by_mass:
                 box_masses(means[g], form[g], keys[b], i0, j0, k0, i1, j1, k1, mass)
             for i in range(i0, i1):
@@ -415,8 +438,11 @@ def _posterior_mean(
                                 continue
                             weight = np.float32(math.exp(-half * squared + log_weight[g] - unit))  # (C), numerator
                         total[voxel] += weight
+                        if not loaded:
+                            _load(values, g, bits, own)
+                            loaded = True
                         for d in range(dimension):
-                            mean[row, d] += weight * values[g, d]  # (D)
+                            mean[row, d] += weight * own[d]  # (D)
         for voxel in range(BLOCK**3):
             row = slots[b, voxel]
             if row >= 0 and total[voxel] > 0:

@@ -1,0 +1,173 @@
+"""Figures of layer 4 beyond the projection's speed: carving, features in voxels, their codes, and updates."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+from kernels import surface_gaussians
+
+Figures = dict[str, Any]
+Line = tuple[str, str, str]
+
+FEATURES, GAUSSIANS = 512, 200_000
+VOXELS, WORDS = 1_000_000, 20
+MODELS = (
+    Path(os.environ.get("FREEOCC3D_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data").parent / "models"
+)
+
+
+def measure_voxels() -> Figures:
+    """Everything below, in one process."""
+    return {"features": _features(), "carving": _carving(), "codes": _codes(), "update": _update()}
+
+
+def _features() -> Figures:
+    """Gaussians a second with 512-dimensional features, from binning to normalised voxels; the floor is the reading of
+    each feature from memory once."""
+    import numpy as np
+    from kernels import copy_bytes_per_second
+
+    from freeocc3d.occupancy import build, carve, splat
+
+    def run(count: int) -> tuple[float, int]:
+        gaussians = surface_gaussians(count)
+        features = np.random.default_rng(0).normal(size=(count, FEATURES)).astype(np.float16)
+        evidence = carve.Evidence(np.zeros(3), 0.08, carve.Options())
+        mark = time.perf_counter()
+        bins = splat.bin_gaussians(gaussians, np.zeros(3), splat.Options())
+        made = build.of_blocks(bins.packed, bins, gaussians, features, evidence, splat.Options(), carve.Options())
+        return time.perf_counter() - mark, len(made.features)
+
+    run(2000)  # compiles
+    seconds, voxels = run(GAUSSIANS)
+    floor = GAUSSIANS * FEATURES * 2 / copy_bytes_per_second()
+    return {"gaussians_per_second": GAUSSIANS / seconds, "voxels": voxels, "seconds": seconds, "floor_seconds": floor}
+
+
+def _carving() -> Figures:
+    """Depth images a second at 640 x 480 and 8 cm, in the built-in room."""
+    import numpy as np
+
+    from freeocc3d.capture import open_capture
+    from freeocc3d.occupancy import carve
+
+    room = open_capture("builtin:room")
+    indices = range(0, len(room), 6)
+    frames, poses = [room[index] for index in indices], np.stack([room.pose(index) for index in indices])
+    carve.Evidence(np.zeros(3), 0.08, carve.Options()).add(frames[0], poses[0])  # compiles
+    evidence = carve.Evidence(np.zeros(3), 0.08, carve.Options())
+    mark = time.perf_counter()
+    for frame, T in zip(frames, poses, strict=True):
+        evidence.add(frame, T)
+    seconds = time.perf_counter() - mark
+    return {
+        "frames": len(frames),
+        "pixels": int(frames[0].depth_m.size),
+        "frames_per_second": len(frames) / seconds,
+        "blocks": len(evidence.packed),
+    }
+
+
+def _codes() -> Figures:
+    """What is lost by coding: mean cosine to the features, and voxels whose best of 20 words stays. A million codes
+    asked for 20 words."""
+    import numpy as np
+
+    from freeocc3d.language.codec import Codec
+
+    rng = np.random.default_rng(0)
+    points = np.concatenate(
+        [np.insert(rng.uniform(0, 4, (8000, 2)), axis, 4.0 * side, 1) for axis in range(3) for side in (0, 1)]
+    )
+    found: Figures = {}
+    sets = {f"smooth over {length:g} m": _smooth(points, length) for length in (2.0, 1.0, 0.5)}
+    if (MODELS / "clip_text_names.npz").is_file():
+        names = np.load(MODELS / "clip_text_names.npz")["embeddings"].astype(np.float32)
+        things = names[rng.choice(len(names), 40, replace=False)]
+        mixed = rng.dirichlet(np.full(40, 0.05), len(points)) @ things
+        sets["posteriors over 40 text embeddings"] = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
+        words = np.concatenate((things[::4], names[:10]))
+    for name, features in sets.items():
+        codec = Codec.fit(features.astype(np.float16))
+        codes = codec.encode(features)
+        text = words if "text" in name else rng.normal(size=(WORDS, FEATURES)).astype(np.float32)
+        same = (codec.cosines(codes, text).argmax(axis=1) == (features @ text.T).argmax(axis=1)).mean()
+        cosine = (codec.decode(codes).astype(np.float32) * features).sum(axis=1).mean()
+        found[name] = {"bytes": codec.code_bytes, "cosine": float(cosine), "same_word": float(same)}
+    many = np.tile(codes, (VOXELS // len(codes) + 1, 1))[:VOXELS]
+    codec.cosines(many, text)  # compiles
+    times = []
+    for _ in range(5):
+        mark = time.perf_counter()
+        codec.cosines(many, text)
+        times.append(time.perf_counter() - mark)
+    return {"sets": found, "million_voxels_seconds": statistics.median(times)}
+
+
+def _smooth(points: Any, length: float) -> Any:
+    """(P, 512) unit features that change over a length, metres."""
+    import numpy as np
+
+    rng = np.random.default_rng(0)
+    values = np.cos(points @ (rng.normal(size=(3, FEATURES)) / length) + rng.uniform(0, 2 * np.pi, FEATURES))
+    return (values / np.linalg.norm(values, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _update() -> Figures:
+    """Seconds to take one more keyframe's Gaussians into a map of a hundred, over those of making it anew."""
+    import numpy as np
+
+    from freeocc3d.occupancy import carve, splat
+    from freeocc3d.occupancy.incremental import IncrementalOccupancy
+    from freeocc3d.types import Frame, Intrinsics
+
+    camera = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5)
+    gaussians = surface_gaussians(100 * 2500)
+    nothing = np.zeros((2500, 0), np.float16)
+
+    def add(to: IncrementalOccupancy, number: int) -> None:
+        own = gaussians[slice(2500 * number, 2500 * (number + 1))]
+        depth = np.full((48, 64), 2.0, np.float32)
+        T = np.eye(4)
+        T[:3, 3] = own.means.mean(axis=0) - (0, 0, 2)
+        to.add(number, Frame(number, 0.0, np.zeros((48, 64, 3), np.uint8), depth, camera), T, own, nothing)
+
+    seconds = []
+    for _ in range(3):
+        growing = IncrementalOccupancy(splat.Options(), carve.Options())
+        for number in range(99):
+            add(growing, number)
+        mark = time.perf_counter()
+        growing.update()
+        whole = time.perf_counter() - mark
+        add(growing, 99)
+        mark = time.perf_counter()
+        growing.update()
+        seconds.append((time.perf_counter() - mark, whole))
+    one, whole = seconds[-1]
+    return {"one_keyframe_seconds": one, "all_seconds": whole}
+
+
+def voxels_lines(figures: Figures) -> list[Line]:
+    """What was measured, and what is asked for."""
+    features, carving, codes, update = (figures[name] for name in ("features", "carving", "codes", "update"))
+    lines = [
+        ("Gaussians with 512 features to voxels", f"{features['gaussians_per_second'] / 1e6:.2f} million/s", "0.5"),
+        (
+            "  floor: reading their features",
+            f"{1e3 * features['floor_seconds']:.0f} of {1e3 * features['seconds']:.0f} ms",
+            "",
+        ),
+        ("depth images carved, 640 x 480, 8 cm", f"{carving['frames_per_second']:.0f} frames/s", "30"),
+        ("a million voxels scored for 20 words", f"{1e3 * codes['million_voxels_seconds']:.0f} ms", "100 ms"),
+    ]
+    for name, coded in codes["sets"].items():
+        said = f"cosine {coded['cosine']:.4f}, same word {100 * coded['same_word']:.1f} %"
+        lines.append((f"  {name}, {coded['bytes']} bytes", said, "0.98, 99 %"))
+    milliseconds = [1e3 * update[name] for name in ("one_keyframe_seconds", "all_seconds")]
+    lines.append(("one keyframe of a hundred updated; all", "{:.0f}; {:.0f} ms".format(*milliseconds), ""))
+    return lines
