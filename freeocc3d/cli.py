@@ -154,19 +154,18 @@ def query(
         options["threshold"] = threshold
     loaded = load_map(map_path)
     results = loaded.query_words(words, **options)
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder:  # for a map that nobody keeps
         if refine_to is not None and results[0].matched:
             loaded = _refined(loaded, results[0].regions[0], refine_to, output or Path(folder) / "refined", overwrite)
             results = loaded.query_words(words, **options)
-            _ = loaded.gaussians  # read before the folder is gone
-    if ply is not None:
-        from .export.ply import write_query_ply
+        if ply is not None:
+            from .export.ply import write_query_ply
 
-        write_query_ply(loaded.occupancy, results, ply, overwrite)
-    if picture is not None:
-        from .viewer import pictures
+            write_query_ply(loaded.occupancy, results, ply, overwrite)
+        if picture is not None:
+            from .viewer import pictures
 
-        pictures.query_picture(loaded, results, picture, overwrite)
+            pictures.query_picture(loaded, results, picture, overwrite)
     if as_json:
         print(json.dumps(asking.to_json(map_path, results)))
     else:

@@ -36,6 +36,7 @@ from .work import WorkFolder
 
 SMALLEST_VOXEL_M = 0.001
 _MOST_BLOCKS = 1 << 18  # 13 bytes a voxel: 1.7 GB
+_LOOK_STRIDE = 2  # pixels from which it is decided whether a keyframe sees the box
 _AROUND = 3.0
 """Voxels of the box's new size around it, from where Gaussians reach into it."""
 
@@ -168,15 +169,17 @@ def _seeing(
     progress.stage("keyframes", len(keyframes))
     seen = np.zeros(len(keyframes), bool)
     for row, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True)):
-        seen[row] = box.contains(_points(frame, T)[1], margin).any()
+        seen[row] = box.contains(_points(frame, T, _LOOK_STRIDE)[1], margin).any()
         progress.advance(row + 1)
     rows = np.flatnonzero(seen)
     return _Decoded(keyframes, rows), rows, trajectory
 
 
-def _points(frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(P, 2) measured pixels u, v, and (P, 3) where they are in the world."""
-    v, u = np.nonzero(frame.depth_m)
+def _points(
+    frame: Frame, T_world_cam: NDArray[np.float64], stride: int = 1
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(P, 2) measured pixels u, v, and (P, 3) where they are in the world; every n-th pixel in both directions."""
+    v, u = stride * np.stack(np.nonzero(frame.depth_m[::stride, ::stride]))
     pixels = np.stack((u, v), axis=1)
     points = back_project(pixels, frame.depth_m[v, u], frame.intrinsics)
     return pixels, transform(T_world_cam, points.astype(np.float64))

@@ -101,4 +101,8 @@ def test_from_the_command_line(room: Map, tmp_path: Path) -> None:
     fine = json.loads(run("query", room.path, word, "--refine", 0.02, "--json").stdout)["results"][0]["regions"][0]
     assert np.linalg.norm(np.subtract(fine["centroid"], coarse["centroid"])) < 1.0
     assert fine["voxels"] > coarse["voxels"]
+    picture = tmp_path / "cups.png"
+    run("query", room.path, word, "--refine", 0.02, "--picture", picture, "--ply", tmp_path / "cups.ply")
+    assert picture.stat().st_size > 10_000
+    assert "one word" in run("query", room.path, word, "sofa", "--refine", 0.02, code=2).stderr
     assert "-o keeps" in run("query", room.path, word, "-o", tmp_path / "other", code=2).stderr
