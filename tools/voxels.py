@@ -22,7 +22,7 @@ MODELS = (
 
 def measure_voxels() -> Figures:
     """Everything below, in one process."""
-    return {"features": _features(), "carving": _carving(), "codes": _codes(), "update": _update()}
+    return {"features": _features(), "insertion": _insertion(), "codes": _codes(), "update": _update()}
 
 
 def _features() -> Figures:
@@ -48,28 +48,52 @@ def _features() -> Figures:
     return {"gaussians_per_second": GAUSSIANS / seconds, "voxels": voxels, "seconds": seconds, "floor_seconds": floor}
 
 
-def _carving() -> Figures:
-    """Depth images a second at 640 x 480 and 8 cm, in the built-in room."""
+def _insertion() -> Figures:
+    """Depth images a second at 640 x 480 and 8 cm, in the built-in room: carving alone, carving and taking the surface
+    into cells, and OctoMap's insertion of all their pixels and of every 16th."""
     import numpy as np
 
     from freeocc3d.capture import open_capture
+    from freeocc3d.gaussians.cells import CellSums
+    from freeocc3d.geometry import back_project, transform
     from freeocc3d.occupancy import carve
+    from freeocc3d.types import PosedFrame
 
     room = open_capture("builtin:room")
-    indices = range(0, len(room), 6)
-    frames, poses = [room[index] for index in indices], np.stack([room.pose(index) for index in indices])
-    carve.Evidence(np.zeros(3), 0.08, carve.Options()).add(frames[0], poses[0])  # compiles
-    evidence = carve.Evidence(np.zeros(3), 0.08, carve.Options())
-    mark = time.perf_counter()
-    for frame, T in zip(frames, poses, strict=True):
-        evidence.add(frame, T)
-    seconds = time.perf_counter() - mark
-    return {
-        "frames": len(frames),
-        "pixels": int(frames[0].depth_m.size),
-        "frames_per_second": len(frames) / seconds,
-        "blocks": len(evidence.packed),
-    }
+    looks = [PosedFrame(room[index], room.pose(index), 0) for index in range(0, len(room), 6)]
+
+    def carving() -> None:
+        evidence = carve.Evidence(np.zeros(3), 0.08, carve.Options())
+        for look in looks:
+            evidence.add(look.frame, look.T_world_cam)
+
+    def mapping() -> None:
+        carving()
+        cells = CellSums(0.04)
+        for look in looks:
+            cells.add_frame(look, 2, 0.05)
+
+    found: Figures = {"frames": len(looks)}
+    for name, work in (("carving", carving), ("mapping", mapping)):
+        work()  # compiles
+        mark = time.perf_counter()
+        work()
+        found[name] = len(looks) / (time.perf_counter() - mark)
+    try:
+        import pyoctomap
+    except ImportError:
+        return found
+    for name, stride, few in (("octomap", 1, looks[::8]), ("octomap_every_16th", 4, looks)):
+        tree = pyoctomap.OcTree(0.08)
+        mark = time.perf_counter()
+        for look in few:
+            depth_m = look.frame.depth_m[::stride, ::stride]
+            rows, columns = np.nonzero(depth_m)
+            pixels = stride * np.stack((columns, rows), axis=1).astype(np.float64)
+            points = back_project(pixels, depth_m[rows, columns].astype(np.float64), look.frame.intrinsics)
+            tree.insertPointCloud(transform(look.T_world_cam, points), look.T_world_cam[:3, 3].copy())
+        found[name] = len(few) / (time.perf_counter() - mark)
+    return found
 
 
 def _codes() -> Figures:
@@ -154,15 +178,24 @@ def _update() -> Figures:
 
 def voxels_lines(figures: Figures) -> list[Line]:
     """What was measured, and what is asked for."""
-    features, carving, codes, update = (figures[name] for name in ("features", "carving", "codes", "update"))
-    lines = [
+    features, insertion, codes, update = (figures[name] for name in ("features", "insertion", "codes", "update"))
+    octomap = []
+    if "octomap" in insertion:
+        times = [insertion["mapping"] / insertion[name] for name in ("octomap", "octomap_every_16th")]
+        octomap = [
+            ("  OctoMap's insertion of all pixels", f"{insertion['octomap']:.1f} frames/s: 1/{times[0]:.0f}", "1/5"),
+            ("  of every 16th pixel", f"{insertion['octomap_every_16th']:.0f} frames/s: 1/{times[1]:.1f}", "1/5"),
+        ]
+    lines: list[Line] = [
         ("Gaussians with 512 features to voxels", f"{features['gaussians_per_second'] / 1e6:.2f} million/s", "0.5"),
         (
             "  floor: reading their features",
             f"{1e3 * features['floor_seconds']:.0f} of {1e3 * features['seconds']:.0f} ms",
             "",
         ),
-        ("depth images carved, 640 x 480, 8 cm", f"{carving['frames_per_second']:.0f} frames/s", "30"),
+        ("depth images carved, 640 x 480, 8 cm", f"{insertion['carving']:.0f} frames/s", "30"),
+        ("  and their surface taken into cells", f"{insertion['mapping']:.0f} frames/s", ""),
+        *octomap,
         ("a million voxels scored for 20 words", f"{1e3 * codes['million_voxels_seconds']:.0f} ms", "100 ms"),
     ]
     for name, coded in codes["sets"].items():
