@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import config, registry, store
-from .capture import open_capture
+from .capture import Capture, open_capture
+from .capture import base as capture_base
+from .capture.reregistered import Reregistered
 from .config import Config
 from .errors import FreeOccError, MapError
 from .gaussians import anchors
@@ -211,7 +213,7 @@ def _features(
     name = scan_map.manifest["encoder"]["name"]
     module = registry.load("language.encoders", name)
     try:
-        capture = open_capture(scan_map.manifest["capture"]["path"])
+        capture = _capture(scan_map, settings) if getattr(module, "NEEDS_CAPTURE", True) else None
         encoder = module.load(registry.build_options(module, settings["language"].get(name, {})), capture)
     except FreeOccError as error:
         progress.warn(f"The encoder '{name}' cannot be used again, so features stay as coarse as the map's: {error}")
@@ -225,6 +227,14 @@ def _features(
     for look in posed():
         fusion.add(gaussians, look.frame, look.T_world_cam, encoder.encode(look.frame))
     return fusion.features()
+
+
+def _capture(scan_map: Map, settings: Config) -> Capture:
+    """The capture that the map was made of, as it was read then. Raises FreeOccError."""
+    options = registry.build_options(capture_base, config.options(settings, "capture"))
+    capture = open_capture(scan_map.manifest["capture"]["path"], options, settings["capture"])
+    color_focal = float(scan_map.report.get("color_focal", 1.0))
+    return capture if color_focal == 1 else Reregistered(capture, color_focal)
 
 
 def _manifest(

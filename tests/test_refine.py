@@ -10,6 +10,8 @@ from test_cli import refused, run
 from freeocc3d import pipeline, refine
 from freeocc3d.capture.room import CUP_HEIGHT, CUPS
 from freeocc3d.errors import MapError
+from freeocc3d.language.encoders import colour
+from freeocc3d.progress import Progress
 from freeocc3d.query import connected
 from freeocc3d.store import Map
 from freeocc3d.types import FREE
@@ -89,6 +91,20 @@ def test_boxes_that_cannot_be_refined(room: Map, tmp_path: Path) -> None:
     with pytest.raises(MapError, match="cannot be had"):
         refine.refine(room, refine.Box(np.zeros(3), np.ones(3)), 0.2, tmp_path / "map")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("needed", [False, True])
+def test_a_map_that_has_moved_to_another_machine(room: Map, needed: bool, tmp_path: Path, monkeypatch) -> None:
+    """Colours are found in the keyframes; where an encoder needs the capture, features are the map's own."""
+    monkeypatch.setattr(colour, "NEEDS_CAPTURE", needed)
+    told = []
+    progress = Progress()
+    progress.warn = told.append  # type: ignore[method-assign]
+    moved = Map(room.path, {**room.manifest, "capture": {**room.manifest["capture"], "path": "/gone"}})
+    found = refine.refine(moved, refine.Box(MIDDLE - REACH, MIDDLE + REACH), 0.01, tmp_path / "map", progress=progress)
+    assert len(told) == needed
+    assert not told or "cannot be used again" in told[0]
+    assert found.occupancy.features.shape == (len(found.occupancy.colors), room.occupancy.features.shape[1])
 
 
 def test_from_the_command_line(room: Map, tmp_path: Path) -> None:

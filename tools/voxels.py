@@ -54,12 +54,13 @@ def _insertion() -> Figures:
     import numpy as np
 
     from freeocc3d.capture import open_capture
+    from freeocc3d.capture.base import Options
     from freeocc3d.gaussians.cells import CellSums
     from freeocc3d.geometry import back_project, transform
     from freeocc3d.occupancy import carve
     from freeocc3d.types import PosedFrame
 
-    room = open_capture("builtin:room")
+    room = open_capture("builtin:room", Options(), {"synthetic": {"width": 640, "height": 480}})
     looks = [PosedFrame(room[index], room.pose(index), 0) for index in range(0, len(room), 6)]
 
     def carving() -> None:

@@ -1,8 +1,9 @@
 """The contract of an encoder: images to dense unit features, words to unit features in the same space.
 
 An encoder is one file of this folder with ``load(options, capture) -> Encoder`` for building a map, and
-``load_text(state) -> TextEncoder`` for asking one. The second half must import fast (numpy only where it can): it runs
-in ``tools/query.py``, where neither the capture nor the images are at hand.
+``load_text(state) -> TextEncoder`` for asking one; one that asks nothing of the capture says ``NEEDS_CAPTURE = False``.
+The second half must import fast (numpy only where it can): it runs in ``tools/query.py``, where neither the capture nor
+the images are at hand.
 """
 
 from __future__ import annotations

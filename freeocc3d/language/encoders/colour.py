@@ -239,7 +239,11 @@ class ColourWords(TextEncoder):
         return list(TERMS)
 
 
-def load(options: Options, capture: Capture) -> ColourEncoder:
+NEEDS_CAPTURE = False
+"""Whether ``load`` asks the capture for anything: a map's keyframes alone are enough to encode them again."""
+
+
+def load(options: Options, capture: Capture | None) -> ColourEncoder:
     """The encoder; it needs nothing of the capture."""
     return ColourEncoder(options)
 
