@@ -94,6 +94,8 @@ def refine(
             f"The box holds {math.prod(blocks) * BLOCK**3:,} voxels of {voxel_size:g} m, more than can be kept: take "
             f"one of up to {edge:.1f} m an edge, or larger voxels."
         )
+    if Path(output).resolve() == scan_map.path.resolve():
+        raise MapError(f"A box of {scan_map.path} cannot take the map's own place: choose another folder.")
     work = WorkFolder.open(Path(output), overwrite, resume=False)
     settings = _settings(scan_map, voxel_size)
     seeing, rows, trajectory = _seeing(scan_map, box, _AROUND * voxel_size, progress)
@@ -119,6 +121,8 @@ def refine(
         blocks=(blocks[0], blocks[1], blocks[2]),
         progress=progress.advance,
     )
+    if not len(occupancy.colors):
+        raise MapError(f"No voxel of {voxel_size:g} m in the box is occupied: {scan_map.path} holds no surface there.")
     progress.stage("saving")
     try:
         work.begin([str(scan_map.path), *box.low.tolist(), *box.high.tolist()], settings)

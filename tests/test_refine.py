@@ -90,6 +90,11 @@ def test_boxes_that_cannot_be_refined(room: Map, tmp_path: Path) -> None:
         refine.refine(room, refine.Box(np.full(3, -50.0), np.full(3, 50.0)), 0.01, tmp_path / "map")
     with pytest.raises(MapError, match="cannot be had"):
         refine.refine(room, refine.Box(np.zeros(3), np.ones(3)), 0.2, tmp_path / "map")
+    with pytest.raises(MapError, match="own place"):
+        refine.refine(room, refine.Box(MIDDLE - REACH, MIDDLE + REACH), 0.01, room.path, overwrite=True)
+    in_the_air = MIDDLE + (0, 0, 0.5)
+    with pytest.raises(MapError, match=r"No keyframe|No voxel"):
+        refine.refine(room, refine.Box(in_the_air - 0.05, in_the_air + 0.05), 0.01, tmp_path / "map")
     assert not list(tmp_path.iterdir())
 
 
