@@ -146,9 +146,10 @@ def refine(
 
 
 def _settings(scan_map: Map, voxel_size: float) -> Config:
-    """The map's own, at the new voxel size, with cells that follow it."""
+    """The map's own, at the new voxel size, with cells that follow it; on the processor wherever the map was made."""
     settings = config.load(scan_map.path / store.CONFIG)
     settings["occupancy"]["voxel_size"] = voxel_size
+    settings["occupancy"]["device"] = "cpu"
     settings["gaussians"]["cell_size"] = None
     settings["gaussians"]["pixel_stride"] = None
     return settings

@@ -1,5 +1,7 @@
 """Layer 4 as a whole: a wall in front of a camera; an empty map."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scenes import CAMERA, dense, gaussians, lifted, posed, wall_frame
@@ -66,3 +68,24 @@ def test_an_empty_map_has_no_voxels() -> None:
 def test_unknown_features_stay_zero_and_known_ones_become_unit() -> None:
     rows = build.normalized(np.array([[0, 0, 0], [3, 4, 0]], np.float32))
     np.testing.assert_allclose(rows.astype(float), [[0, 0, 0], [0.6, 0.8, 0]], atol=1e-3)
+
+
+def test_a_hall_of_200_metres_costs_what_is_in_it() -> None:
+    """Its dense array would hold 400 million voxels."""
+    corners = [(-100.0, -100.0, 0.0), (100.0, 100.0, 5.0), (-100.0, 99.0, 2.0)]
+    frames = [wall_frame(2.0, n) for n in range(3)]
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, 3] = corners
+    g = lifted(frames, poses)
+    features = np.ones((len(g), 2), np.float16)
+    tracemalloc.start()
+    occupancy = build.build_occupancy(g, features, posed(frames, poses), splat.Options(), carve.Options())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+    assert len(occupancy.keys) < 600
+    extent = np.ptp(occupancy.centers(occupancy.occupied_voxels()), axis=0)
+    assert (extent > (199, 198, 4)).all()
+    for low, high in ((-110, -90), (90, 110)):  # the same wall at either end
+        x = occupancy.centers(occupancy.occupied_voxels())[:, 0]
+        assert np.count_nonzero((x > low) & (x < high)) > 0.15 * len(x)

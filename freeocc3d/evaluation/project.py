@@ -187,9 +187,10 @@ def _scaled(scan_map: Map, alignment: Alignment) -> Iterator[PosedFrame]:
 
 
 def _splatting(settings: Config, truth: GroundTruth) -> splat.Options:
-    """Layer 4's options at the truth's voxel size."""
-    options: splat.Options = registry.build_options(splat, settings["occupancy"])
-    return replace(options, voxel_size=truth.voxel_size)
+    """Layer 4's options at the truth's voxel size, on the processor wherever the map was made."""
+    here = {**settings["occupancy"], "device": "cpu", "voxel_size": truth.voxel_size}
+    options: splat.Options = registry.build_options(splat, here)
+    return options
 
 
 def _words(

@@ -64,7 +64,7 @@ class Options:
     """Where Gaussians are projected: "cpu" (compiled), or a GPU for torch, such as "cuda:0"."""
     contradiction: float = 4.0
     """A voxel above the threshold is free all the same when the log-odds of what depth images saw there (see carving)
-    are at most minus this: 4 is ten more images that saw through it than are made up for by some that ended in it."""
+    are at most minus this: 4 is ten images that saw through it, or more where others ended in it."""
 
     def __post_init__(self) -> None:
         require_positive(self, "voxel_size", "cutoff", "threshold", "contradiction")
