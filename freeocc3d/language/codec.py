@@ -8,6 +8,7 @@ for Minimum Distortion, IRE Trans. Inf. Theory 6(1), 1960.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -114,14 +115,14 @@ class Codec:
         in the codec's coordinates, the dot product is c (scale t) + offset t, and the squared norm a quadratic in c.
         Zero features give zero."""
         t = (text.astype(np.float32) @ self.basis.T).astype(np.float32)
-        if len(codes) >= _MANY:
+        if len(codes) >= _MANY or f"{__package__}.scoring" in sys.modules:
             from . import scoring  # numba takes longer to import than fewer scores to compute
 
             fours, twos = (int(np.count_nonzero(self.bits == bits)) * bits // 8 for bits in _BITS[1:])
             return np.asarray(scoring.cosines(codes, fours, twos, self.scale, self.offset, t))
         linear = np.concatenate((t * self.scale, [2 * self.scale * self.offset])).T
         constant, squared_offset = t @ self.offset, float(self.offset @ self.offset)
-        scores = np.empty((len(codes), len(text)), np.float32)
+        scores = np.empty((len(text), len(codes)), np.float32).T  # a word's scores lie together
         for rows, out in zip(_chunks(codes), _chunks(scores), strict=True):
             c = self._levels(rows)
             products = c @ linear
@@ -191,10 +192,10 @@ def cosines(features: Features, text: NDArray[np.floating]) -> NDArray[np.float3
     """(V, W) cosines of unit features, coded or not, with (W, D) unit text features; zero features give zero."""
     if isinstance(features, CodedFeatures):
         return features.codec.cosines(features.codes, text)
-    found = np.empty((len(features), len(text)), np.float32)
+    found = np.empty((len(text), len(features)), np.float32).T
     t = text.astype(np.float32).T
     for rows, out in zip(_chunks(features), _chunks(found), strict=True):
-        np.matmul(rows.astype(np.float32), t, out=out)
+        out[:] = rows.astype(np.float32) @ t
     return found
 
 

@@ -23,7 +23,7 @@ def cosines(
     """``Codec.cosines`` with (W, R) texts in the codec's coordinates. fours, twos: bytes that hold levels of 4 and of 2
     bits, behind those of 8."""
     eights = codes.shape[1] - fours - twos
-    out = np.empty((len(codes), len(text)), np.float32)
+    out = np.empty((len(text), len(codes)), np.float32)
     for tile in prange((len(codes) + _TILE - 1) // _TILE):
         x = np.empty(len(scale), np.float32)
         for v in range(tile * _TILE, min((tile + 1) * _TILE, len(codes))):
@@ -48,5 +48,5 @@ def cosines(
                 dot = np.float32(0)
                 for r in range(len(x)):
                     dot += x[r] * text[w, r]
-                out[v, w] = dot * inverse
-    return out
+                out[w, v] = dot * inverse
+    return out.T
