@@ -446,6 +446,7 @@ def _info(loaded: Any) -> dict[str, Any]:
         "gaussians": counts["gaussians"],
         "voxels": {"occupied": counts["voxels"]["occupied"], "free": counts["voxels"]["free"]},
         "voxel_size_m": manifest["voxel_size_m"],
+        "refined": manifest.get("refined"),
         "encoder": manifest["encoder"]["name"],
         "encoder_knows": loaded.text_encoder.knows,
         "bytes": {
@@ -468,6 +469,11 @@ def _info_text(facts: dict[str, Any]) -> str:
         f"capture    {facts['capture']['path']}  ({facts['capture']['format']})",
         f"frames     {facts['frames']} in the capture, {used} used, {facts['frames_with_pose']} with a pose, "
         f"{facts['keyframes']} keyframe{plural['keyframes']}, {facts['submaps']} submap{plural['submaps']}",
+        *(
+            [f"refined    a box of {facts['refined']['map']}, whose frames and times these are"]
+            if facts["refined"]
+            else []
+        ),
         f"gaussians  {facts['gaussians']:,}",
         f"voxels     {facts['voxels']['occupied']:,} occupied, {facts['voxels']['free']:,} free, "
         f"edge {facts['voxel_size_m']:g} m",

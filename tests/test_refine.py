@@ -116,6 +116,7 @@ def test_from_the_command_line(room: Map, tmp_path: Path) -> None:
     low, high = (MIDDLE - REACH).tolist(), (MIDDLE + REACH).tolist()
     done = run("refine", room.path, "--box", *low, *high, "--voxel", 0.01, "-o", tmp_path / "map")
     assert "edge 0.01 m" in done.stdout
+    assert f"a box of {room.path}" in done.stdout
     assert "exists" in refused("refine", room.path, "--box", *low, *high, "--voxel", 0.01, "-o", tmp_path / "map")
     word = "red cup"
     coarse = json.loads(run("query", room.path, word, "--json").stdout)["results"][0]["regions"][0]
