@@ -137,10 +137,10 @@ def refine(
         (work.folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
         store.write_manifest(work.folder, _manifest(scan_map, box, trajectory.keyframes, gaussians, occupancy))
         work.finish(Path(output))
-    except OSError as error:
-        raise MapError(f"Cannot write {output}: {error.strerror}.") from error
-    except BaseException:
+    except BaseException as error:
         work.discard()
+        if isinstance(error, OSError):
+            raise MapError(f"Cannot write {output}: {error.strerror}.") from error
         raise
     return load_map(output)
 

@@ -35,10 +35,10 @@ class Options:
     cells are small."""
     every: int = 1
     """Every n-th tracked frame shows the surface, besides the keyframes; 0 = keyframes alone, as in the paper, which
-    loses one to seven points of IoU on the shipped captures."""
+    loses two to nine points of IoU on the shipped captures."""
     denoise: bool = True
-    """Move the cells' points to where all keyframes' depth images together have the surface, and leave out those that
-    most see through: adds 3 to 9 points of IoU on the shipped captures and halves the number of Gaussians."""
+    """Move the cells' points to where all frames' depth images together have the surface, and leave out those that
+    most see through: adds 6 to 22 points of IoU on the shipped captures and halves the number of Gaussians."""
     coverage: float = 0.7
     """s_perp over the spacing of the Gaussians, which is the cell's edge or, where that is greater, the footprint of a
     pixel on the surface. At 0.7 a flat wall reaches alpha = 0.5 at 0.6 voxels from its surface: a voxel's centre is
