@@ -186,24 +186,34 @@ def _refined(loaded: Any, region: Any, voxel_size: float, output: Path, overwrit
 @app.command()
 def refine(
     map_path: MapPath,
-    box: Annotated[
-        tuple[float, float, float, float, float, float],
-        typer.Option("--box", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Lower and upper corner, map frame, metres."),
-    ],
-    voxel: Annotated[float, typer.Option("--voxel", metavar="METRES", help="Edge of the finer voxels.")],
+    voxel: Annotated[float, typer.Option("--voxel", metavar="METRES", help="Edge of the finest voxels.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="MAP", help="Map folder to write.")],
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            "--box",
+            metavar="X0 Y0 Z0 X1 Y1 Z1",
+            help="Lower and upper corner, map frame, metres: a map of this box alone, all of finer voxels. "
+            "[default: the whole map, voxels finer only where they show more]",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Make a map of a box of another map, with finer voxels."""
+    """Make a map of another one with finer voxels: in a box, or wherever they show more."""
     import numpy as np
 
+    from . import adaptive
     from . import refine as refining
     from .store import load_map
 
-    corners = refining.Box(np.array(box[:3]), np.array(box[3:]))
     progress = ConsoleProgress()
     try:
-        made = refining.refine(load_map(map_path), corners, voxel, output, overwrite=overwrite, progress=progress)
+        scan_map = load_map(map_path)
+        if box is None:
+            made = adaptive.refine_where_needed(scan_map, voxel, output, overwrite=overwrite, progress=progress)
+        else:
+            corners = refining.Box(np.array(box[:3]), np.array(box[3:]))
+            made = refining.refine(scan_map, corners, voxel, output, overwrite=overwrite, progress=progress)
     finally:
         progress.close()
     print(_info_text(_info(made)))
@@ -446,6 +456,7 @@ def _info(loaded: Any) -> dict[str, Any]:
         "gaussians": counts["gaussians"],
         "voxels": {"occupied": counts["voxels"]["occupied"], "free": counts["voxels"]["free"]},
         "voxel_size_m": manifest["voxel_size_m"],
+        "finest_voxel_m": manifest.get("finest_voxel_m", manifest["voxel_size_m"]),
         "refined": manifest.get("refined"),
         "encoder": manifest["encoder"]["name"],
         "encoder_knows": loaded.text_encoder.knows,
@@ -462,6 +473,7 @@ def _info(loaded: Any) -> dict[str, Any]:
 def _info_text(facts: dict[str, Any]) -> str:
     size = sum(facts["bytes"].values())
     used = facts["frames"] - facts["frame_status"].get("unused", 0)
+    largest, smallest = facts["voxel_size_m"], facts["finest_voxel_m"]
     plural = {name: "s" if facts[name] != 1 else "" for name in ("keyframes", "submaps")}
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in facts["seconds"].items())
     lines = [
@@ -476,7 +488,7 @@ def _info_text(facts: dict[str, Any]) -> str:
         ),
         f"gaussians  {facts['gaussians']:,}",
         f"voxels     {facts['voxels']['occupied']:,} occupied, {facts['voxels']['free']:,} free, "
-        f"edge {facts['voxel_size_m']:g} m",
+        + (f"edge {largest:g} m" if largest == smallest else f"edges {largest:g} to {smallest:g} m"),
         f"encoder    {facts['encoder']}, which knows {facts['encoder_knows']}",
         f"time       {sum(facts['seconds'].values()):.1f} s: {seconds}",
         f"memory     {facts['peak_memory_bytes'] / 1e9:.2f} GB at most",

@@ -43,7 +43,7 @@ def highlighted(colors: NDArray[np.uint8], words: list[list[Region]]) -> NDArray
 
 def height_colors(occupancy: Occupancy, up: NDArray[np.float64]) -> NDArray[np.uint8]:
     """(V, 3) colour of each occupied voxel by its height along ``up``, lowest dark blue, highest yellow."""
-    height = occupancy.centers(occupancy.occupied_voxels()) @ up
+    height = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges()) @ up
     return ramp((height - height.min()) / max(float(np.ptp(height)), 1e-9))
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import __version__, config, registry, store
+from . import __version__, adaptive, config, registry, store
 from .capture import Capture, check_depth_scale, open_capture, read_ahead, used_frames
 from .capture import base as capture_base
 from .capture.reregistered import Reregistered
@@ -210,6 +210,31 @@ class Mapper:
             progress=progress.advance,
         )
 
+    def refine_occupancy(
+        self,
+        occupancy: Occupancy,
+        gaussians: Gaussians,
+        features: NDArray[np.float16],
+        encoder: Encoder,
+        progress: Progress | None = None,
+    ) -> Occupancy:
+        """Layer 4 with smaller voxels where they show more, if the configuration asks for them."""
+        finest = self.settings["occupancy"]["finest"]
+        if finest is None:
+            return occupancy
+        trajectory, progress = self.trajectory(), progress or Progress()
+        return adaptive.adaptive(
+            occupancy,
+            gaussians,
+            features,
+            lambda: self.posed(trajectory, 0),
+            trajectory.T_world_keyframe,
+            lambda more: self.build_features(more, encoder, progress),
+            self.settings,
+            finest,
+            progress,
+        )
+
 
 def reconstruct(
     capture: str | Path,
@@ -283,6 +308,7 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
         features = work.features(lambda: mapper.build_features(gaussians, encoder, progress))
     with work.timed("occupancy"):
         occupancy = mapper.build_occupancy(gaussians, features, progress)
+        occupancy = mapper.refine_occupancy(occupancy, gaussians, features, encoder, progress)
     if not len(occupancy.colors):
         raise TrackingError(
             f"No voxel of {capture.path} is occupied: is its depth in the right unit (capture.depth_scale), and is "
@@ -464,7 +490,7 @@ def _manifest(
         "capture": {"path": _absolute(capture.path), "format": capture.format, "frames": len(capture)},
         "frame": mapper.tracker.world,
         "poses": "camera to world",
-        "voxel_size_m": occupancy.voxel_size,
+        **store.sizes(occupancy),
         "origin": occupancy.origin.tolist(),
         "up": estimate_up(trajectory.T_world_keyframe, gaussians.means).tolist(),
         "T_world_map": np.eye(4).tolist(),
@@ -530,6 +556,8 @@ def check(settings: Config) -> None:
     layers = {"gaussians": anchors, "fitting": fit, "language": lift, "occupancy": splat, "carving": carve}
     for section, module in layers.items():
         _options(module, config.options(settings, section))
+    if settings["occupancy"]["finest"] is not None:
+        adaptive.halvings(settings["occupancy"]["voxel_size"], settings["occupancy"]["finest"])
     for section, key in (("tracking", "backend"), ("fitting", "rasterizer"), ("language", "encoder")):
         name = settings[section][key]
         backend = registry.load(str(config.SECTIONS[section][1]), name)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from . import __version__
 from .errors import ConfigError, FreeOccError, MapError
 from .language.codec import Features, cosines, known
+from .lattice import AXIS_BITS, contains, packed_voxels
 from .registry import require_positive
 from .types import Occupancy
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from .language.encoders.base import TextEncoder, TextFeatures
 
 _LONGEST_WORD = 200
-_AXIS_BITS = 21
 _ROWS = 16384  # voxels worked on at once, so that float32 copies of all features never exist
 _DOUBT_M3 = 0.001
 """Volume of non-matching matter that is added to each region when it is scored: a speck of a voxel or two does not
@@ -117,7 +117,7 @@ def query(
     competes = text.features @ contrast.features.T < text_encoder.same_word
     competes &= contrast.features.any(axis=1)
     scores = similarity(occupancy.features, text)
-    voxels = occupancy.occupied_voxels()
+    voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
     threshold = text_encoder.threshold if options.threshold is None else options.threshold
     results = []
     for w, (word, understood) in enumerate(zip(words, text.understood, strict=True)):
@@ -125,7 +125,7 @@ def query(
         rows, confidence = _against_contrasts(
             occupancy.features, rows, scores[rows, w], _some(contrast, competes[w]), text_encoder.temperature
         )
-        regions = _regions(occupancy, voxels, rows, scores[rows, w], confidence, options)
+        regions = _regions(occupancy, voxels, edges, rows, scores[rows, w], confidence, options)
         note = _note(word, understood, text_encoder, scores[:, w], threshold, bool(regions))
         results.append(QueryResult(word, understood, note, regions, np.ascontiguousarray(scores[:, w])))
     return results
@@ -182,6 +182,7 @@ def _against_contrasts(
 def _regions(
     occupancy: Occupancy,
     voxels: NDArray[np.int32],
+    edges: NDArray[np.int32],
     rows: NDArray[np.int64],
     scores: NDArray[np.float32],
     confidence: NDArray[np.float32],
@@ -190,17 +191,18 @@ def _regions(
     """The best regions among matching voxels, given by their rows with their scores and confidences."""
     if len(rows) == 0:
         return []
-    component = connected(voxels[rows])
+    component = connected(voxels[rows], edges[rows])
     size = np.bincount(component)
-    volume = size * occupancy.voxel_size**3
-    score = np.bincount(component, scores) / size * volume / (volume + _DOUBT_M3)
+    own_volume = (edges[rows] * occupancy.finest) ** 3
+    volume = np.bincount(component, own_volume)
+    score = np.bincount(component, scores * own_volume) / (volume + _DOUBT_M3)
     large = np.flatnonzero(size >= options.min_voxels)
     chosen = large if len(large) else np.arange(len(size))
     chosen = chosen[np.argsort(-score[chosen], kind="stable")][: options.top_k]
     order, end = np.argsort(component, kind="stable"), np.cumsum(size)
     members = [order[end[c] - size[c] : end[c]] for c in chosen]
     return [
-        _region(occupancy, voxels, rows[own], score[c], confidence[own].mean())
+        _region(occupancy, voxels, edges, rows[own], score[c], confidence[own])
         for c, own in zip(chosen, members, strict=True)
     ]
 
@@ -208,28 +210,29 @@ def _regions(
 def _region(
     occupancy: Occupancy,
     voxels: NDArray[np.int32],
+    edges: NDArray[np.int32],
     rows: NDArray[np.int64],
     score: float,
-    confidence: float,
+    confidence: NDArray[np.float32],
 ) -> Region:
-    own = voxels[rows]
-    size = occupancy.voxel_size
+    own, edge = voxels[rows], edges[rows]
+    size = occupancy.finest
+    volume = (edge * size) ** 3
     return Region(
         score=float(score),
-        confidence=float(confidence),
-        centroid=occupancy.centers(own).mean(axis=0),
+        confidence=float(np.average(confidence, weights=volume)),
+        centroid=np.average(occupancy.centers(own, edge), axis=0, weights=volume),
         box_min=occupancy.origin + own.min(axis=0) * size,
-        box_max=occupancy.origin + (own.max(axis=0) + 1) * size,
-        volume_m3=len(rows) * size**3,
+        box_max=occupancy.origin + (own + edge[:, None]).max(axis=0) * size,
+        volume_m3=float(volume.sum()),
         rows=rows,
     )
 
 
-def connected(voxels: NDArray[np.int32]) -> NDArray[np.int32]:
+def connected(voxels: NDArray[np.int32], edges: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
     """(V,) component number of each of (V, 3) distinct voxels; voxels that share a face, edge or corner are connected.
 
-    The dense box is never made: among sorted keys, a voxel's three neighbours in a column along k are successive, so
-    that one search serves each of the four columns that hold half of the 26 neighbours but for the one above.
+    edges: (V,) powers of two that divide their voxel's lower corner; 1 by default. The dense box is never made.
     """
     n = len(voxels)
     if n == 0:
@@ -237,27 +240,52 @@ def connected(voxels: NDArray[np.int32]) -> NDArray[np.int32]:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    keys = _keys(voxels)
+    edges = np.ones(n, np.int32) if edges is None else edges
+    sizes = np.unique(edges)
+    of_size = {size: np.flatnonzero(edges == size) for size in sizes}
+    pairs = [of_size[size][_touching(voxels[of_size[size]] // size)] for size in sizes]
+    for size in sizes:
+        for larger in sizes[sizes > size]:
+            pairs.append(_touching_larger(voxels, of_size[size], size, of_size[larger], larger))
+    touching = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(touching.shape[1], bool), tuple(touching)), shape=(n, n))
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def _touching_larger(
+    voxels: NDArray[np.int32], rows: NDArray[np.int64], size: int, rows_larger: NDArray[np.int64], larger: int
+) -> NDArray[np.int64]:
+    """(2, P) pairs of rows of voxels of one size that touch voxels of a larger one."""
+    keys = packed_voxels(voxels[rows_larger] // larger)
+    order = np.argsort(keys)
+    ascending, pairs = keys[order], [np.zeros((2, 0), np.int64)]
+    for step in np.ndindex(3, 3, 3):
+        wanted = packed_voxels((voxels[rows] + (np.array(step) - 1) * size) // larger)
+        found = contains(ascending, wanted)
+        pairs.append(np.stack((rows[found], rows_larger[order[np.searchsorted(ascending, wanted[found])]])))
+    return np.concatenate(pairs, axis=1)
+
+
+def _touching(voxels: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(2, P) pairs of rows of (V, 3) distinct voxels of one size that touch.
+
+    Among sorted keys, a voxel's three neighbours in a column along k are successive, so that one search serves each of
+    the four columns that hold half of the 26 neighbours but for the one above.
+    """
+    n = len(voxels)
+    keys = packed_voxels(voxels)
     order = np.argsort(keys)
     ascending = np.append(keys[order], np.full(3, np.iinfo(np.int64).max))
     here = np.arange(n)
     above = ascending[1 : n + 1] == ascending[:n] + 1
     pairs = [np.stack((here[above], here[above] + 1))]
     for i, j in ((0, 1), (1, -1), (1, 0), (1, 1)):
-        first = ascending[:n] + (i << 2 * _AXIS_BITS) + (j << _AXIS_BITS) - 1
+        first = ascending[:n] + (i << 2 * AXIS_BITS) + (j << AXIS_BITS) - 1
         at = np.searchsorted(ascending[:n], first)
         for step in range(3):
             touches = ascending[at + step] <= first + 2
             pairs.append(np.stack((here[touches], at[touches] + step)))
-    edges = order[np.concatenate(pairs, axis=1)]
-    graph = coo_array((np.ones(edges.shape[1], bool), tuple(edges)), shape=(n, n))
-    return np.asarray(connected_components(graph, directed=False)[1])
-
-
-def _keys(voxels: NDArray[np.int32]) -> NDArray[np.int64]:
-    """(V,) one integer a voxel, in the order of (i, j, k)."""
-    index = voxels.astype(np.int64) + (1 << _AXIS_BITS - 1)
-    return (index[:, 0] << 2 * _AXIS_BITS) + (index[:, 1] << _AXIS_BITS) + index[:, 2]
+    return np.asarray(order[np.concatenate(pairs, axis=1)])
 
 
 def _note(

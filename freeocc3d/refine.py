@@ -9,10 +9,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,7 @@ from .work import WorkFolder
 SMALLEST_VOXEL_M = 0.001
 _MOST_BLOCKS = 1 << 18  # 13 bytes a voxel: 1.7 GB
 _LOOK_STRIDE = 2  # pixels from which it is decided whether a keyframe sees the box
-_AROUND = 3.0
+AROUND = 3.0
 """Voxels of the box's new size around it, from where Gaussians reach into it."""
 
 
@@ -97,8 +97,9 @@ def refine(
     if Path(output).resolve() == scan_map.path.resolve():
         raise MapError(f"A box of {scan_map.path} cannot take the map's own place: choose another folder.")
     work = WorkFolder.open(Path(output), overwrite, resume=False)
-    settings = _settings(scan_map, voxel_size)
-    seeing, rows, trajectory = _seeing(scan_map, box, _AROUND * voxel_size, progress)
+    settings = settings_of(scan_map)
+    settings["occupancy"]["voxel_size"] = voxel_size
+    seeing, rows, trajectory = _seeing(scan_map, box, AROUND * voxel_size, progress)
     trajectory = trajectory.only_keyframes(trajectory.keyframes[rows])
     poses = trajectory.T_world_keyframe
 
@@ -106,10 +107,10 @@ def refine(
         for row, frame in enumerate(seeing):
             yield PosedFrame(frame, poses[row], row)
 
-    gaussians = _gaussians(posed, box, voxel_size, settings, poses, progress)
+    gaussians = lifted(posed, box, voxel_size, settings, poses, progress)
     if not len(gaussians):
         raise MapError(f"No keyframe of {scan_map.path} shows a surface in the box: nothing can be refined there.")
-    features = _features(scan_map, posed, gaussians, settings, progress)
+    features = features_again(scan_map, posed, gaussians, settings, progress)
     progress.stage("occupancy", len(seeing))
     occupancy = build.build_occupancy(
         gaussians,
@@ -145,13 +146,10 @@ def refine(
     return load_map(output)
 
 
-def _settings(scan_map: Map, voxel_size: float) -> Config:
-    """The map's own, at the new voxel size, with cells that follow it; on the processor wherever the map was made."""
+def settings_of(scan_map: Map) -> Config:
+    """The map's own; on the processor wherever the map was made."""
     settings = config.load(scan_map.path / store.CONFIG)
-    settings["occupancy"]["voxel_size"] = voxel_size
     settings["occupancy"]["device"] = "cpu"
-    settings["gaussians"]["cell_size"] = None
-    settings["gaussians"]["pixel_stride"] = None
     return settings
 
 
@@ -192,27 +190,47 @@ def _points(
     return pixels, transform(T_world_cam, points.astype(np.float64))
 
 
-def _gaussians(
-    posed: Any, box: Box, voxel_size: float, settings: Config, poses: NDArray[np.float64], progress: Progress
+class Space(Protocol):
+    """A part of space."""
+
+    def contains(self, points: NDArray[np.floating], margin: float) -> NDArray[np.bool_]:
+        """(P,) whether each of (P, 3) points is inside, or no farther outside than the margin along any axis."""
+
+
+def lifted(
+    posed: Callable[[], Iterator[PosedFrame]],
+    space: Space,
+    voxel_size: float,
+    settings: Config,
+    T_world_keyframe: NDArray[np.float64],
+    progress: Progress,
 ) -> Gaussians:
-    """Layer 2 of what lies in the box."""
-    options: anchors.Options = registry.build_options(anchors, settings["gaussians"])
-    margin = _AROUND * voxel_size
-    progress.stage("gaussians", len(poses))
-    cells = anchors.AnchoredCells(options, 0.5 * voxel_size, poses)
+    """Layer 2 of what lies in a part of space, in cells of half a voxel, from keyframes with (K, 4, 4) poses.
+
+    posed: gives the keyframes, each time that it is called.
+    """
+    own = {**settings["gaussians"], "cell_size": None, "pixel_stride": None}  # both follow the voxels
+    options: anchors.Options = registry.build_options(anchors, own)
+    margin = AROUND * voxel_size
+    progress.stage("gaussians", len(T_world_keyframe))
+    cells = anchors.AnchoredCells(options, 0.5 * voxel_size, T_world_keyframe)
     for done, look in enumerate(posed(), 1):
         pixels, points = _points(look.frame, look.T_world_cam)
-        outside = pixels[~box.contains(points, margin)]
+        outside = pixels[~space.contains(points, margin)]
         depth_m = look.frame.depth_m.copy()
         depth_m[outside[:, 1], outside[:, 0]] = 0
         cells.add(look._replace(frame=dataclasses.replace(look.frame, depth_m=depth_m)))
         progress.advance(done)
     gaussians = cells.gaussians(posed())
-    return gaussians[box.contains(gaussians.means, margin)]
+    return gaussians[space.contains(gaussians.means, margin)]
 
 
-def _features(
-    scan_map: Map, posed: Any, gaussians: Gaussians, settings: Config, progress: Progress
+def features_again(
+    scan_map: Map,
+    posed: Callable[[], Iterator[PosedFrame]],
+    gaussians: Gaussians,
+    settings: Config,
+    progress: Progress,
 ) -> NDArray[np.float16]:
     """Layer 3 of these Gaussians; where the encoder cannot be had again, the features of the map's own nearest."""
     name = scan_map.manifest["encoder"]["name"]
@@ -245,7 +263,8 @@ def _capture(scan_map: Map, settings: Config) -> Capture:
 def _manifest(
     scan_map: Map, box: Box, keyframes: NDArray[np.int32], gaussians: Gaussians, occupancy: Occupancy
 ) -> dict[str, Any]:
-    kept = {key: value for key, value in scan_map.manifest.items() if key not in ("format_version", "files")}
+    others = "format_version", "files", "finest_voxel_m"
+    kept = {key: value for key, value in scan_map.manifest.items() if key not in others}
     return {
         **kept,
         "voxel_size_m": occupancy.voxel_size,

@@ -34,7 +34,9 @@ if TYPE_CHECKING:
     from .language.encoders.base import TextEncoder
     from .query import QueryResult
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
+_UNIFORM_VERSION = 2
+"""Of maps whose voxels are all of one size, which earlier versions read as well."""
 MANIFEST, CONFIG, REPORT, TRAJECTORY = "map.yaml", "config.yaml", "report.json", "trajectory.txt"
 PATH_PICTURE, RENDER_PICTURE = "trajectory.png", "gaussians.png"
 GAUSSIANS, OCCUPANCY, FEATURES, KEYFRAMES = "gaussians.ply", "occupancy.npz", "features.npz", "keyframes"
@@ -74,6 +76,7 @@ class Map:
             and all(arrays[name].shape == (blocks, BLOCK**3) for name in ("probability", "free", "hits", "state"))
             and arrays["colors"].shape == (occupied, 3)
             and arrays["feature_codes"].shape == (occupied, self._codec.code_bytes)
+            and ("levels" not in arrays or arrays["levels"].shape == (blocks,))
         )
         if not shapes_fit:
             raise MapError(f"{self.path / OCCUPANCY} is damaged: its arrays do not belong together.")
@@ -87,6 +90,7 @@ class Map:
             state=arrays["state"].astype(np.uint8),
             features=cast(Any, CodedFeatures(self._codec, arrays["feature_codes"])),
             colors=arrays["colors"].astype(np.uint8),
+            levels=arrays["levels"].astype(np.uint8) if "levels" in arrays else np.zeros(blocks, np.uint8),
         )
 
     @functools.cached_property
@@ -214,7 +218,7 @@ def load_map(path: str | Path) -> Map:
         raise MapError(
             f"The map {path} has format {version}, this freeocc3d reads up to {FORMAT_VERSION}: upgrade freeocc3d."
         )
-    if version < FORMAT_VERSION:
+    if version < _UNIFORM_VERSION:
         raise MapError(f"The map {path} has format {version}, of an earlier freeocc3d: map the capture again.")
     _check_manifest(manifest, path)
     loaded = Map(path, manifest)
@@ -229,12 +233,14 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     pictures = (folder / name for name in (PATH_PICTURE, RENDER_PICTURE) if (folder / name).is_file())
     paths = [*(folder / name for name in parts), *pictures, *sorted((folder / KEYFRAMES).iterdir())]
     files = {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
-    content = {"format_version": FORMAT_VERSION, **manifest, "files": files}
+    version = FORMAT_VERSION if "finest_voxel_m" in manifest else _UNIFORM_VERSION
+    content = {"format_version": version, **manifest, "files": files}
     (folder / MANIFEST).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
 
 def write_occupancy(folder: Path, occupancy: Occupancy, codec: Codec, gaussian_features: NDArray[np.float16]) -> None:
     """Write occupancy.npz and features.npz. Raises OSError."""
+    levels: dict[str, Any] = {"levels": occupancy.levels} if occupancy.deepest else {}
     np.savez_compressed(
         folder / OCCUPANCY,
         keys=occupancy.keys,
@@ -244,6 +250,7 @@ def write_occupancy(folder: Path, occupancy: Occupancy, codec: Codec, gaussian_f
         state=occupancy.state,
         colors=occupancy.colors,
         feature_codes=codec.encode(occupancy.features),
+        **levels,
     )
     tables: dict[str, Any] = {f"codec_{name}": table for name, table in codec.tables().items()}
     np.savez_compressed(folder / FEATURES, gaussian_codes=codec.encode(gaussian_features), **tables)
@@ -344,8 +351,14 @@ def _check_manifest(manifest: dict[str, Any], path: Path) -> None:
             raise MapError(f"{path / MANIFEST} is damaged: '{name}' lies outside the map's folder.")
 
 
+def sizes(occupancy: Occupancy) -> dict[str, Any]:
+    """What a manifest says of the voxels' sizes: their edges, metres."""
+    several = {"finest_voxel_m": occupancy.finest} if occupancy.deepest else {}
+    return {"voxel_size_m": occupancy.voxel_size, **several}
+
+
 def counts(occupancy: Occupancy) -> dict[str, int]:
-    """Number of occupied, free and (within the blocks) unknown voxels."""
+    """Number of occupied, free and (within the blocks) unknown voxels, of any size."""
     return {
         name: int(np.count_nonzero(occupancy.state == value))
         for name, value in (("occupied", OCCUPIED), ("free", FREE), ("unknown", UNKNOWN))

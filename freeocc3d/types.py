@@ -168,8 +168,11 @@ class Gaussians:
 class Occupancy:
     """Occupancy in sparse blocks of 8 x 8 x 8 voxels; what no block covers is unknown.
 
-    voxel_size: edge of a voxel, metres.  origin: (3,) float64 world position of the lower corner of voxel (0, 0, 0).
-    keys: (B, 3) int32, block index; block b covers voxels ``8 * keys[b] + (0…7)``; unique, in no particular order.
+    voxel_size: edge of a voxel of level 0, metres.  origin: (3,) float64 world position of the lower corner of voxel
+    (0, 0, 0).
+    keys: (B, 3) int32, block index; block b covers voxels ``8 * keys[b] + (0…7)`` of its level; unique within a level,
+    in no particular order.  levels: (B,) uint8, how often the edge of a block's voxels is halved; all 0 in a map of one
+    size, which is the default. In a map of several sizes no block covers a part of another.
     Per voxel, (B, 512), the local index being (i * 8 + j) * 8 + k:
     probability: float32 alpha(x) at the voxel's centre (paper, Gaussian-to-Occupancy Projection), in 0…1.
     free: uint16 number of depth images that saw through the voxel.  hits: uint16 number that ended in it.
@@ -188,19 +191,49 @@ class Occupancy:
     state: NDArray[np.uint8]
     features: NDArray[np.float16] = field(default_factory=lambda: np.zeros((0, 0), np.float16))
     colors: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    levels: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+
+    def __post_init__(self) -> None:
+        if not len(self.levels):
+            object.__setattr__(self, "levels", np.zeros(len(self.keys), np.uint8))
+
+    @property
+    def deepest(self) -> int:
+        """Level of the smallest voxels."""
+        return int(self.levels.max(initial=0))
+
+    @property
+    def finest(self) -> float:
+        """Edge of the smallest voxels, metres: the unit of ``voxels`` and ``edges``."""
+        return float(self.voxel_size / 2**self.deepest)
 
     def voxels(self, state: int) -> NDArray[np.int32]:
-        """(V, 3) indices (i, j, k) of the voxels in ``state``, in storage order."""
+        """(V, 3) lower corners (i, j, k) of the voxels in ``state`` on the lattice of the smallest voxels, in storage
+        order: in a map of one size, the voxels' indices."""
         block, local = np.nonzero(self.state == state)
-        return self.keys[block] * BLOCK + np.stack((local // 64, local // 8 % 8, local % 8), axis=1).astype(np.int32)
+        index = self.keys[block] * BLOCK + np.stack((local // 64, local // 8 % 8, local % 8), axis=1).astype(np.int32)
+        return index * self._edges(block)[:, None] if self.deepest else index
+
+    def edges(self, state: int) -> NDArray[np.int32]:
+        """(V,) edges of the same voxels in units of the smallest: all 1 in a map of one size."""
+        return self._edges(np.nonzero(self.state == state)[0])
+
+    def _edges(self, block: NDArray[np.int64]) -> NDArray[np.int32]:
+        return np.left_shift(1, self.deepest - self.levels[block].astype(np.int32), dtype=np.int32)
 
     def occupied_voxels(self) -> NDArray[np.int32]:
-        """(V, 3) indices of the occupied voxels: the row order of ``features`` and ``colors``."""
+        """``voxels(OCCUPIED)``: the row order of ``features`` and ``colors``."""
         return self.voxels(OCCUPIED)
 
-    def centers(self, voxels: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(V, 3) world positions of voxel centres."""
-        return self.origin + (voxels + 0.5) * self.voxel_size
+    def occupied_edges(self) -> NDArray[np.int32]:
+        """``edges(OCCUPIED)``."""
+        return self.edges(OCCUPIED)
+
+    def centers(self, voxels: NDArray[np.int32], edges: NDArray[np.int32] | None = None) -> NDArray[np.float64]:
+        """(V, 3) world positions of the centres of voxels, given by corners and edges as above; edges are 1 by
+        default."""
+        half = 0.5 if edges is None else 0.5 * edges[:, None]
+        return self.origin + (voxels + half) * self.finest
 
     def replace(self, **changes: object) -> Occupancy:
         """A copy with some fields changed."""

@@ -7,7 +7,9 @@ Keys of the dense form (`form=dense`), over the box of all known voxels:
     classes (C,) names, C = 0 without a vocabulary; at most 253, so that every label fits into a byte
     origin (3,) lower corner of voxel (0, 0, 0), metres; voxel_size metres; T_world_map (4, 4)
 Of the sparse form: voxels (V, 3) int32 indices, state (V,) uint8 as above, probability (V,), labels (V,), classes,
-origin, voxel_size, T_world_map; voxel (i, j, k) covers origin + [i, i + 1) * voxel_size in both.
+origin, voxel_size, T_world_map; voxel (i, j, k) covers origin + [i, i + 1) * voxel_size in both. Of a map of several
+voxel sizes, voxel_size is the smallest; larger voxels fill as many as they cover in the dense form, and the sparse one
+has edges (V,) int32 besides: voxel (i, j, k) covers origin + [i, i + edge) * voxel_size.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     classes = scan_map.vocabulary[:_MOST_CLASSES]
     arrays = form(scan_map.occupancy, scan_map.labels(), len(classes))
     arrays |= {
-        "voxel_size": np.float64(scan_map.occupancy.voxel_size),
+        "voxel_size": np.float64(scan_map.occupancy.finest),
         "T_world_map": np.array(scan_map.manifest["T_world_map"], np.float64),
         "classes": np.array(classes, np.str_),
     }
@@ -62,8 +64,10 @@ def sparse(occupancy: Occupancy, labels: NDArray[np.uint8], classes: int) -> dic
     offsets = np.stack((local // 64, local // 8 % 8, local % 8), axis=1)
     label = np.zeros(len(state), np.uint8)
     label[state == OCCUPIED] = np.where(labels > 0, labels, classes + 1)
+    edges = (1 << (occupancy.deepest - occupancy.levels[block].astype(np.int32))).astype(np.int32)
     return {
-        "voxels": (occupancy.keys[block] * 8 + offsets).astype(np.int32),
+        "voxels": ((occupancy.keys[block] * 8 + offsets) * edges[:, None]).astype(np.int32),
+        **({"edges": edges} if occupancy.deepest else {}),
         "state": state,
         "probability": occupancy.probability[block, local].astype(np.float16),
         "labels": label,
@@ -74,21 +78,28 @@ def sparse(occupancy: Occupancy, labels: NDArray[np.uint8], classes: int) -> dic
 def dense(occupancy: Occupancy, labels: NDArray[np.uint8], classes: int) -> dict[str, Any]:
     """The grid over the box of all known voxels; an empty map gives arrays of shape (0, 0, 0)."""
     known = sparse(occupancy, labels, classes)
-    voxels = known["voxels"]
+    voxels, edges = known["voxels"], known.get("edges", np.ones(len(known["voxels"]), np.int32))
     low = voxels.min(axis=0) if len(voxels) else np.zeros(3, np.int32)
-    shape = tuple(int(n) for n in (voxels.max(axis=0) + 1 - low if len(voxels) else np.zeros(3, int)))
+    shape = tuple(int(n) for n in ((voxels + edges[:, None]).max(axis=0) - low if len(voxels) else np.zeros(3, int)))
     size = 4 * int(np.prod([float(n) for n in shape]))
     if size > _LARGEST_DENSE:
         raise ExportError(
             f"A dense grid of {' x '.join(map(str, shape))} voxels takes {size / 2**30:.1f} GiB: use --set form=sparse."
         )
-    at = tuple((voxels - low).T)
     grid: dict[str, NDArray[Any]] = {
         "occupancy": np.full(shape, UNKNOWN, np.uint8),
         "probability": np.zeros(shape, np.float16),
         "labels": np.full(shape, UNKNOWN, np.uint8),
     }
-    grid["occupancy"][at] = np.where(known["state"] == FREE, FREE, OCCUPIED)
-    grid["probability"][at] = known["probability"]
-    grid["labels"][at] = known["labels"]
-    return {**grid, "origin": occupancy.origin + low * occupancy.voxel_size}
+    values = {
+        "occupancy": np.where(known["state"] == FREE, FREE, OCCUPIED),
+        "probability": known["probability"],
+        "labels": known["labels"],
+    }
+    for edge in np.unique(edges):
+        own = edges == edge
+        for part in np.ndindex(edge, edge, edge):
+            at = tuple((voxels[own] - low + part).T)
+            for name, value in values.items():
+                grid[name][at] = value[own]
+    return {**grid, "origin": occupancy.origin + low * occupancy.finest}

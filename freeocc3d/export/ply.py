@@ -71,7 +71,7 @@ def _colors(scan_map: Map, by: str) -> NDArray[np.uint8]:
 
 def _write(occupancy: Occupancy, colors: NDArray[np.uint8], path: Path, form: str) -> None:
     if form == "points":
-        points = occupancy.centers(occupancy.occupied_voxels()).astype(np.float32)
+        points = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges()).astype(np.float32)
         _write_ply(path, points, colors, None)
     else:
         vertices, quads, rows = exposed_faces(occupancy)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lattice import contains, packed_voxels
 from ..types import Occupancy
 
 
@@ -16,29 +17,42 @@ def exposed_faces(
 
     chosen: (V,) the occupied voxels to draw, as if there were no others; all by default.
     """
-    voxels = occupancy.occupied_voxels()
+    voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
     chosen_rows = np.arange(len(voxels)) if chosen is None else np.flatnonzero(chosen)
-    corners, quads, rows = faces_of(voxels[chosen_rows])
-    vertices = (occupancy.origin + corners * occupancy.voxel_size).astype(np.float32)
+    corners, quads, rows = faces_of(voxels[chosen_rows], edges[chosen_rows])
+    vertices = (occupancy.origin + corners * occupancy.finest).astype(np.float32)
     return vertices, quads, chosen_rows[rows]
 
 
-def faces_of(voxels: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-    """The faces of (V, 3) voxel indices, |i| < 2^20: as ``exposed_faces``, but (4 F, 3) corners on the lattice."""
-    index = voxels.astype(np.int64) + (1 << 20)
-    keys = (index[:, 0] << 42) + (index[:, 1] << 21) + index[:, 2]
-    ascending = np.sort(keys)
+def faces_of(
+    voxels: NDArray[np.integer], edges: NDArray[np.integer] | None = None
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+    """The faces of voxels as ``exposed_faces``, but with (4 F, 3) corners on the lattice.
+
+    voxels: (V, 3) lower corners, |i| < 2^20.  edges: (V,) powers of two that divide them; 1 by default. A face whose
+    neighbour is cut into smaller voxels is drawn, whichever of them are there.
+    """
+    edges = np.ones(len(voxels), np.int32) if edges is None else edges
+    sizes = np.unique(edges)
+    ascending = {size: np.sort(packed_voxels(voxels[edges == size] // size)) for size in sizes}
     corners, rows = [], []
-    for axis in range(3):
-        for side in (0, 1):
-            neighbour = keys + ((2 * side - 1) << 21 * (2 - axis))
-            at = np.minimum(np.searchsorted(ascending, neighbour), len(ascending) - 1)
-            exposed = np.flatnonzero(ascending[at] != neighbour)
-            b, c = (axis + 1) % 3, (axis + 2) % 3
-            turn = [(0, 0), (1, 0), (1, 1), (0, 1)] if side else [(0, 0), (0, 1), (1, 1), (1, 0)]
-            offset = np.zeros((4, 3), np.int32)
-            offset[:, axis], offset[:, [b, c]] = side, turn
-            corners.append(voxels[exposed, None].astype(np.int32) + offset)
-            rows.append(exposed)
+    for size in sizes:
+        own = np.flatnonzero(edges == size)
+        for axis in range(3):
+            for side in (0, 1):
+                neighbour = voxels[own].astype(np.int64)
+                neighbour[:, axis] += size * (2 * side - 1)
+                hidden = np.zeros(len(own), bool)
+                for other in sizes[sizes >= size]:  # the neighbour, or a larger voxel that holds it
+                    hidden |= contains(ascending[other], packed_voxels(neighbour // other))
+                exposed = own[~hidden]
+                b, c = (axis + 1) % 3, (axis + 2) % 3
+                turn = [(0, 0), (1, 0), (1, 1), (0, 1)] if side else [(0, 0), (0, 1), (1, 1), (1, 0)]
+                offset = np.zeros((4, 3), np.int32)
+                offset[:, axis], offset[:, [b, c]] = side, turn
+                corners.append(voxels[exposed, None].astype(np.int32) + size.astype(np.int32) * offset)
+                rows.append(exposed)
+    if not rows:
+        return np.zeros((0, 3), np.int32), np.zeros((0, 4), np.int32), np.zeros(0, np.int64)
     lattice = np.concatenate(corners).reshape(-1, 3)
     return lattice, np.arange(len(lattice), dtype=np.int32).reshape(-1, 4), np.concatenate(rows)

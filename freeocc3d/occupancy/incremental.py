@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..types import OCCUPIED, Frame, Gaussians, Occupancy
 from . import build, carve, splat
 from .grid import pack, union, unpack
+from .levels import chosen_blocks, says_something
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,8 @@ class IncrementalOccupancy:
 
 def _merged(old: Occupancy | None, new: Occupancy) -> Occupancy:
     """The new blocks in place of the old ones of the same keys, those that say nothing left out, keys ascending."""
-    parts = [new] if old is None else [_blocks(old, ~np.isin(pack(old.keys), pack(new.keys))), new]
-    parts = [_blocks(part, _says_something(part)) for part in parts]
+    parts = [new] if old is None else [chosen_blocks(old, ~np.isin(pack(old.keys), pack(new.keys))), new]
+    parts = [chosen_blocks(part, says_something(part)) for part in parts]
     packed = np.concatenate([pack(part.keys) for part in parts])
     order = np.argsort(packed)
     arrays = {
@@ -105,20 +106,4 @@ def _merged(old: Occupancy | None, new: Occupancy) -> Occupancy:
         features=np.concatenate([part.features for part in parts])[rows],
         colors=np.concatenate([part.colors for part in parts])[rows],
         **arrays,
-    )
-
-
-def _says_something(part: Occupancy) -> NDArray[np.bool_]:
-    """(B,) whether anything of each block is known."""
-    return np.asarray(((part.probability > 0) | (part.free > 0) | (part.hits > 0)).any(axis=1))
-
-
-def _blocks(occupancy: Occupancy, chosen: NDArray[np.bool_]) -> Occupancy:
-    """Some of the blocks, given by a mask (B,)."""
-    block = np.nonzero(occupancy.state == OCCUPIED)[0]
-    kept = chosen[block]
-    return occupancy.replace(
-        features=occupancy.features[kept],
-        colors=occupancy.colors[kept],
-        **{name: getattr(occupancy, name)[chosen] for name in ("keys", "probability", "free", "hits", "state")},
     )

@@ -53,6 +53,9 @@ class Options:
 
     voxel_size: float = 0.08
     """Edge of a voxel, metres."""
+    finest: float | None = None
+    """Edge of the smallest voxels, metres, such as 0.01 where the others have 0.08: voxels are cut by halves down to it
+    where the surface is not flat or its meaning changes; null = all are of one size."""
     projection: str = "probabilistic"
     """What a Gaussian adds to a voxel: "probabilistic" (the paper's equations), "poisson" (with its opacity, in the
     form of the paper's code), "integrated" (its mass within the voxel), "released" (a dilation, as that code runs)."""
@@ -67,7 +70,7 @@ class Options:
     are at most minus this: 4 is ten images that saw through it, or more where others ended in it."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "voxel_size", "cutoff", "threshold", "contradiction")
+        require_positive(self, "voxel_size", "finest", "cutoff", "threshold", "contradiction")
         if self.threshold >= 1:
             raise ConfigError(f"'threshold' must be less than 1, got {self.threshold}.")
         if self.projection not in _MODES:

@@ -27,7 +27,10 @@ def to_voxel_block_grid(
     """The same blocks in a grid with attributes "probability", "free", "hits", "state", "color" and "feature".
 
     features: False leaves "feature" out, which takes 2 D KB for every block, be its voxels occupied or not.
+    Raises FreeOccError for a map of several voxel sizes, which Open3D's grid cannot hold.
     """
+    if occupancy.deepest:
+        raise FreeOccError("A VoxelBlockGrid holds voxels of one size: make them so first, with levels.uniform.")
     occupied = occupancy.state == OCCUPIED
     arrays = {name: getattr(occupancy, name)[:, :, None] for name in _PER_VOXEL}
     arrays["color"] = _spread(occupancy.colors, occupied)

@@ -15,6 +15,7 @@ from ..occupancy.faces import exposed_faces
 from ..palette import HIGHLIGHTS, class_colors, height_colors, highlighted
 from ..query import QueryResult, Region
 from ..store import Map
+from ..types import Occupancy
 from .scene import BACKGROUND, CUT, VIEWS, Scene, cut_height, render, shaded, upright
 
 SIZE = 1600, 900
@@ -103,7 +104,7 @@ def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region,
     """The exposed faces of the voxels below the cut and of the regions that lie mostly above it, turned so that z is up
     and the longer walls lie along x."""
     occupancy = scan_map.occupancy
-    centers = occupancy.centers(occupancy.occupied_voxels())
+    centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
     R = upright(scan_map.up, centers)
     height = centers @ R[2]
     kept = height <= cut_height(height, occupancy.voxel_size)
@@ -160,10 +161,15 @@ def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: floa
     cv2.putText(picture, printable, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _TEXT, 1, cv2.LINE_AA)
 
 
+def _size(occupancy: Occupancy) -> str:
+    largest, smallest = 100 * occupancy.voxel_size, 100 * occupancy.finest
+    return f"{largest:g} cm" if largest == smallest else f"{largest:g} to {smallest:g} cm"
+
+
 def _title(scan_map: Map) -> str:
     counts = scan_map.manifest["counts"]
     name = Path(str(scan_map.manifest["capture"]["path"])).name
     return (
-        f"{name}: {counts['voxels']['occupied']:,} occupied voxels of {100 * scan_map.occupancy.voxel_size:g} cm, "
+        f"{name}: {counts['voxels']['occupied']:,} occupied voxels of {_size(scan_map.occupancy)}, "
         f"{counts['frames_with_pose']} of {counts['frames']} frames; above {CUT:.0%} of the height is cut away"
     )
