@@ -14,7 +14,7 @@ import pytest
 import tiny_models
 import torch
 from safetensors.torch import save_file
-from tiny_models import export_encoder
+from tiny_models import encoder_tokenizers, export_encoder
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -227,4 +227,4 @@ def test_open_clip_weights_that_do_not_fit_are_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("stated", [2, None])
 def test_the_end_token_of_first_configurations_is_the_largest(stated: int | None) -> None:
     end = tiny_models.vocabulary()[0][tiny_models.END]
-    assert export_encoder.end_token(end if stated is None else stated, tiny_models.tokenizer()) == end
+    assert encoder_tokenizers.end_token(end if stated is None else stated, tiny_models.tokenizer()) == end

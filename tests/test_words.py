@@ -15,7 +15,7 @@ import pytest
 import regex
 import tiny_models
 import torch
-from tiny_models import export_encoder
+from tiny_models import encoder_tokenizers, export_encoder
 from tokenizers import Tokenizer
 
 from freeocc3d.errors import MapError, ModelError
@@ -75,7 +75,7 @@ def unpadded(tokenizer: str) -> Tokenizer:
 
 
 def test_the_tokenizer_equals_clips_own_on_1000_strings() -> None:
-    made = unpadded(export_encoder.clip_tokenizer(tiny_models.tokenizer(), 77))
+    made = unpadded(encoder_tokenizers.clip_tokenizer(tiny_models.tokenizer(), 77))
     texts = strings()
     for text, encoding in zip(texts, made.encode_batch(texts), strict=True):
         assert encoding.ids == reference_tokens(text), repr(text[:80])
@@ -86,14 +86,14 @@ def test_the_tokenizer_equals_transformers_on_1000_strings() -> None:
 
     vocabulary, merges = tiny_models.vocabulary()
     theirs = CLIPTokenizer(vocab=vocabulary, merges=merges)
-    made = unpadded(export_encoder.clip_tokenizer(tiny_models.tokenizer(), 77))
+    made = unpadded(encoder_tokenizers.clip_tokenizer(tiny_models.tokenizer(), 77))
     texts = strings()
     expected = theirs(texts, truncation=True, max_length=77)["input_ids"]
     assert [encoding.ids for encoding in made.encode_batch(texts)] == [list(row) for row in expected]
 
 
 def test_texts_are_cut_to_what_clip_takes_and_padded_to_the_longest() -> None:
-    made = Tokenizer.from_str(export_encoder.clip_tokenizer(tiny_models.tokenizer(), 77))
+    made = Tokenizer.from_str(encoder_tokenizers.clip_tokenizer(tiny_models.tokenizer(), 77))
     long, short = (encoding.ids for encoding in made.encode_batch(["chair " * 500, "sofa"]))
     assert len(long) == len(short) == 77
     end = tiny_models.vocabulary()[0][tiny_models.END]
@@ -120,7 +120,7 @@ def state(package: models.Package, **options: Any) -> dict[str, Any]:
 
 def text_features(texts: list[str]) -> np.ndarray:
     """Unit features of transformers' own forward pass, one text at a time, without padding."""
-    made = unpadded(export_encoder.clip_tokenizer(tiny_models.tokenizer(), 77))
+    made = unpadded(encoder_tokenizers.clip_tokenizer(tiny_models.tokenizer(), 77))
     model, rows = tiny_models.clip(), []
     for text in texts:
         with torch.no_grad():

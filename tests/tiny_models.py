@@ -15,6 +15,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
+import encoder_tokenizers
 import export_encoder
 
 CLIP_MEAN, CLIP_STD = [0.48145466, 0.4578275, 0.40821073], [0.26862954, 0.26130258, 0.27577711]
@@ -67,7 +68,7 @@ def _merged(word: tuple[str, ...], pair: tuple[str, str]) -> tuple[str, ...]:
 
 
 def tokenizer() -> str:
-    return export_encoder.clip_tokenizer_of(*vocabulary())
+    return encoder_tokenizers.clip_tokenizer_of(*vocabulary())
 
 
 def clip(dimension: int = 24, seed: int = 0) -> Any:

@@ -66,6 +66,7 @@ def measure_encoders() -> Figures:
 
 
 def _checkpoint() -> Any:
+    import encoder_tokenizers
     import export_encoder
     import torch
     from tokenizers import pre_tokenizers
@@ -81,7 +82,7 @@ def _checkpoint() -> Any:
     model = CLIPModel(
         CLIPConfig(**own, vision_config={**SHAPE, **own, "patch_size": PATCH, "image_size": 224}, text_config=text)
     ).eval()
-    tokenizer = export_encoder.clip_tokenizer_of(vocabulary, [])
+    tokenizer = encoder_tokenizers.clip_tokenizer_of(vocabulary, [])
     return export_encoder.clip(model, tokenizer, [0.5] * 3, [0.25] * 3)
 
 

@@ -11,7 +11,6 @@ import contextlib
 import hashlib
 import os
 import zipfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -170,7 +169,7 @@ def _read_cache(path: Path, dimension: int) -> dict[str, NDArray[np.float32]]:
 
 def _write_cache(path: Path, known: dict[str, NDArray[np.float32]]) -> None:
     """Keep embeddings for later processes; where that is not possible, they are computed again."""
-    kept = [word for word in _latest(known) if len(word) <= _LONGEST]
+    kept = [word for word in list(known)[-_KEPT:] if len(word) <= _LONGEST]
     temporary = path.with_name(f"{path.stem}.{os.getpid()}.tmp.npz")
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -179,7 +178,3 @@ def _write_cache(path: Path, known: dict[str, NDArray[np.float32]]) -> None:
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
-
-
-def _latest(known: Iterable[str]) -> list[str]:
-    return list(known)[-_KEPT:]
