@@ -29,7 +29,7 @@ class Options:
     model: str = ""
     """Folder of a model package of kind "clip", or its name in the models folder (freeocc3d models list)."""
     attention: str = "naclip"
-    """Last block's attention: "plain", "maskclip", "sclip", "clearclip" or "naclip", the best of the papers' tables."""
+    """Last block's attention: "plain", "maskclip", "sclip", "clearclip" or "naclip", the best by the papers' tables."""
     short_side: int = 336
     """Frames are resized so that their shorter side has so many pixels."""
     window: int | None = None
