@@ -23,6 +23,10 @@ class DependencyError(FreeOccError):
     """A backend needs a package that is not installed; the message says which."""
 
 
+class ModelError(FreeOccError):
+    """A model package is missing, damaged, or not of the form that an encoder needs."""
+
+
 class TrackingError(FreeOccError):
     """No usable trajectory could be estimated."""
 

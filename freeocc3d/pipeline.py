@@ -552,7 +552,8 @@ def _load_backend(settings: Config, section: str, key: str, *arguments: Any) -> 
 
 def check(settings: Config) -> None:
     """Build the options of every layer and of the chosen backends, so that a value out of range is told before any
-    work. Raises ConfigError, or DependencyError for a backend whose packages are not installed."""
+    work. A backend that needs more than packages has a function ``check``. Raises ConfigError, DependencyError for a
+    backend whose packages are not installed, or what ``check`` raises."""
     layers = {"gaussians": anchors, "fitting": fit, "language": lift, "occupancy": splat, "carving": carve}
     for section, module in layers.items():
         _options(module, config.options(settings, section))
@@ -562,7 +563,9 @@ def check(settings: Config) -> None:
         name = settings[section][key]
         backend = registry.load(str(config.SECTIONS[section][1]), name)
         if hasattr(backend, "Options"):
-            _options(backend, settings[section].get(name, {}))
+            options = _options(backend, settings[section].get(name, {}))
+            if hasattr(backend, "check"):
+                backend.check(options)
 
 
 def _options(module: Any, values: dict[str, Any]) -> Any:

@@ -46,7 +46,7 @@ def test_every_part_of_a_few_frames(tmp_path: Path) -> None:
     assert {"results.json", "table.md", "iou.png", "stages.png", "trajectory_house_bedroom_rgbd.png"} <= written
     table = (tmp_path / "out" / "table.md").read_text()
     lacking = next(line for line in table.splitlines() if "rgbd_trident" in line)
-    assert "**not available**, needs the encoder" in lacking
+    assert "**not available**, needs the networks of CLIP, DINO and SAM" in lacking
     assert "0" not in lacking.split("|")[3]
     assert benchmark.moved(results, results) == "nothing moved"
 

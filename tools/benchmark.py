@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import encoders
 import held_out
 import kernels
 import rendering
@@ -56,7 +57,7 @@ PEERS = {
 
 UNFITTED = "rgbd_no_fitting"
 
-KERNELS = ("splat", "voxels", "query", "rasterizer")
+KERNELS = ("splat", "voxels", "query", "rasterizer", "encoders")
 LAYER_1 = {
     "stress": "layer 1 on altered captures: what is reached, what is lost, and whether that is told",
     "glued": "layer 1 on two captures as if they were one, which must stay two submaps",
@@ -272,7 +273,7 @@ def occupancy(kind: str, capture: str, frames: int | None, poses: str | None, tr
 
 def kernel(name: str, asked_map: Path | None) -> Figures:
     """Speed of the projection, or of queries in a map. Raises PartFailed."""
-    if name in ("splat", "voxels", "rasterizer"):
+    if name in ("splat", "voxels", "rasterizer", "encoders"):
         return _inside(name)
     if asked_map is None or not (asked_map / "map.yaml").is_file():
         raise PartFailed(f"there is no map to ask: name the variant {OURS}, too")
@@ -302,6 +303,7 @@ INSIDE = {
     "splat": lambda: kernels.measure_splat(),
     "voxels": lambda: voxels.measure_voxels(),
     "rasterizer": lambda: rendering.measure_rasterizer(),
+    "encoders": lambda: encoders.measure_encoders(),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
 }
 """What is measured in a process of its own."""
@@ -464,6 +466,7 @@ def markdown(results: Figures) -> str:
         "voxels": voxels.voxels_lines,
         "query": kernels.query_lines,
         "rasterizer": rendering.rasterizer_lines,
+        "encoders": encoders.encoders_lines,
     }
     for name, write in writers.items():
         figures = results["kernels"].get(name)
@@ -628,7 +631,7 @@ def main() -> None:
             print(f"{name:<38} {title}")
         for name, title in LAYER_1.items():
             print(f"{name:<38} {title}")
-        print(f"{', '.join(KERNELS):<38} speed of the projection, of voxels, queries and rendering")
+        print(f"{', '.join(KERNELS):<38} speed of the projection, of voxels, queries, rendering and encoders")
         return
     old = json.loads(given.compare.read_text(encoding="utf-8")) if given.compare else None
     with tempfile.TemporaryDirectory(prefix="freeocc3d-benchmark-") as temporary:

@@ -1,7 +1,8 @@
 """The contract of an encoder: images to dense unit features, words to unit features in the same space.
 
 An encoder is one file of this folder with ``load(options, capture) -> Encoder`` for building a map, and
-``load_text(state) -> TextEncoder`` for asking one; one that asks nothing of the capture says ``NEEDS_CAPTURE = False``.
+``load_text(state) -> TextEncoder`` for asking one; one that asks nothing of the capture says ``NEEDS_CAPTURE = False``;
+one that needs files of its own, such as networks, has ``check(options)``, which raises ModelError where they are not.
 The second half must import fast (numpy only where it can): it runs in ``tools/query.py``, where neither the capture nor
 the images are at hand.
 """
@@ -15,6 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import ConfigError
 from ...types import Frame
 
 
@@ -73,3 +75,13 @@ class Encoder(ABC):
     def text_state(self) -> dict[str, Any]:
         """What ``load_text`` needs to restore the word side: numbers, strings, lists and dicts only (it is saved as
         YAML in the map's manifest)."""
+
+
+def require_sizes(short_side: int, window: int | None, stride: int) -> None:
+    """Raise ConfigError unless these options of an encoder that resizes frames are sizes that images have."""
+    if not 16 <= short_side <= 4096:
+        raise ConfigError(f"'short_side' must lie between 16 and 4096, got {short_side}.")
+    if window is not None and not 0 <= window <= 4096:
+        raise ConfigError(f"'window' must be 0 (the whole frame), or up to 4096, got {window}.")
+    if stride < 0:
+        raise ConfigError(f"'stride' must be at least 0, got {stride}.")

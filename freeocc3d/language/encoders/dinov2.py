@@ -1,0 +1,95 @@
+"""DINOv2 with a text-aligned head (dino.txt, Talk2DINO) as a model package: patches in the space of words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...types import Frame
+from .. import models
+from ..words import CONTRAST, TEMPLATES, ModelWords, Wording
+from .base import Encoder, require_sizes
+
+REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which model, and how its patches become features of pixels."""
+
+    model: str = ""
+    """Folder of a model package of kind "dense", or its name in the models folder (freeocc3d models list)."""
+    short_side: int = 448
+    """Frames are resized so that their shorter side has so many pixels."""
+    window: int | None = 0
+    """Edge in pixels of windows that are encoded one by one, half overlapping; 0 = the whole frame at once; null = the
+    size of the model's training images."""
+    stride: int = 4
+    """Pixels of the frame from one feature to the next, upsampled from patches along the image's edges; 0 = patches."""
+    templates: tuple[str, ...] = ()
+    """Prompts whose mean stands for a word, which goes where they have {}; none = the built-in ones."""
+    contrast: tuple[str, ...] = ()
+    """Words that a voxel could be instead: a word matches only where none of them fits better; none = what most rooms
+    hold."""
+    threshold: float = 0.15
+    """Least cosine of a match."""
+    device: str = "cpu"
+    """Where the image network runs: "cpu", or "cuda:0" with onnxruntime-gpu."""
+
+    def __post_init__(self) -> None:
+        require_sizes(self.short_side, self.window, self.stride)
+        self.wording.check()
+
+    @property
+    def wording(self) -> Wording:
+        """How words are asked."""
+        return Wording(self.templates or TEMPLATES, self.contrast or CONTRAST, self.threshold)
+
+
+class Dinov2Encoder(Encoder):
+    """Patch features that are in the space of words already, spliced from windows and upsampled."""
+
+    name: ClassVar[str] = "dinov2"
+
+    def __init__(self, package: models.Package, options: Options):
+        self.package = package
+        self.options = options
+        self.dimension = package.dimension
+        self._image = package.session("image", options.device)
+
+    def encode(self, frame: Frame) -> NDArray[np.float16]:
+        """(ceil(H / stride), ceil(W / stride), D) float16, or (rows, columns, D) of patches."""
+        from ..dense import Splice, Tiling, finished, unit
+
+        options, package, rgb = self.options, self.package, frame.color
+        window = package.input_size if options.window is None else options.window
+        tiling = Tiling.of(rgb.shape[0], rgb.shape[1], package, options.short_side, window)
+        splice = Splice(tiling, self.dimension)
+        for images, corners in tiling.windows(tiling.image(rgb, package.mean, package.std)):
+            splice.add(unit(self._image.run(["features"], {"image": images})[0]), corners)
+        return finished(unit(splice.mean()), rgb, options.stride)
+
+    def text_state(self) -> dict[str, Any]:
+        return self.options.wording.state(self.package)
+
+
+NEEDS_CAPTURE = False
+"""The keyframes alone are enough to encode them again."""
+
+
+def check(options: Options) -> models.Package:
+    """The model that is named. Raises ModelError if it is not there."""
+    return models.find(options.model, ("dense",), "language.dinov2.model")
+
+
+def load(options: Options, capture: object = None) -> Dinov2Encoder:
+    """The encoder; it needs nothing of the capture. Raises ModelError."""
+    return Dinov2Encoder(check(options), options)
+
+
+def load_text(state: dict[str, Any]) -> ModelWords:
+    """The word side; the text network is looked for when a word is encoded."""
+    return ModelWords(state)
