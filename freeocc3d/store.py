@@ -11,19 +11,16 @@ from __future__ import annotations
 
 import functools
 import json
-import math
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import yaml
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from . import registry
+from .arrays import read_arrays
 from .errors import MapError
 from .geometry import quats_to_rotations, rotations_to_quats
 from .language.codec import Codec, CodedFeatures
@@ -39,7 +36,6 @@ MANIFEST, CONFIG, REPORT, TRAJECTORY = "map.yaml", "config.yaml", "report.json",
 PATH_PICTURE, RENDER_PICTURE = "trajectory.png", "gaussians.png"
 GAUSSIANS, OCCUPANCY, FEATURES, KEYFRAMES = "gaussians.ply", "occupancy.npz", "features.npz", "keyframes"
 
-_LARGEST_ARRAY = 8 << 30
 _OCCUPANCY_ARRAYS = {
     "keys": ("i", 2), "probability": ("f", 2), "free": ("u", 2), "hits": ("u", 2), "state": ("u", 2),
     "colors": ("u", 2), "feature_codes": ("u", 2),
@@ -280,38 +276,6 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         raise MapError(f"The trajectory {path} has a quaternion of zeros, which is no rotation.")
     T[:, :3, :3] = quats_to_rotations(quats_wxyz / lengths)
     return table[:, 0], T
-
-
-def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]]) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz file; each name in ``expected`` must be there with its kind of number and dimensions.
-
-    Sizes are read from the headers before anything is unpacked. Raises MapError.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            arrays = {
-                info.filename.removesuffix(".npy"): _read_array(archive, info, path) for info in archive.infolist()
-            }
-    except FileNotFoundError as error:
-        raise MapError(f"The map lacks its file {path}: copy the whole folder, or map again.") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        raise MapError(f"{path} is damaged: {error}.") from error
-    for name, (kind, dimensions) in expected.items():
-        if name not in arrays or arrays[name].dtype.kind != kind or arrays[name].ndim != dimensions:
-            raise MapError(f"{path} is damaged: it has no usable array '{name}'.")
-    return arrays
-
-
-def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> NDArray[Any]:
-    with archive.open(info) as stream:
-        version = npy.read_magic(stream)
-        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, _, dtype = read_header(stream)
-        size = math.prod(shape) * dtype.itemsize
-        if dtype.hasobject or size > info.file_size or size > _LARGEST_ARRAY:
-            raise MapError(f"{path} is damaged: its array {info.filename} states a size that its data do not have.")
-    with archive.open(info) as stream:
-        return np.asarray(npy.read_array(stream, allow_pickle=False))
 
 
 def _place(timestamps: NDArray[np.float64], times: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.float64]:
