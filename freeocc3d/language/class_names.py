@@ -29,7 +29,11 @@ def read_names(path: Path) -> tuple[str, ...]:
         raise CaptureError(f"Cannot read the class names in {path}: {error.strerror}.") from error
     except (ValueError, KeyError, RecursionError) as error:
         raise CaptureError(f'{path} must hold {{"classes": ["nothing", "name of class 1", …]}}: {error}.') from error
-    if not isinstance(names, list) or not 2 <= len(names) <= _MOST_CLASSES or not all(isinstance(n, str) for n in names):
+    if (
+        not isinstance(names, list)
+        or not 2 <= len(names) <= _MOST_CLASSES
+        or not all(isinstance(n, str) for n in names)
+    ):
         raise CaptureError(f"{path} must name at least 2 classes.")
     return tuple(name.strip() for name in names)
 
@@ -45,7 +49,9 @@ def read_mapping(path: Path, names: tuple[str, ...]) -> tuple[tuple[str, ...], N
     except OSError as error:
         raise ConfigError(f"Cannot read the mapping of classes {path}: {error.strerror}.") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"The mapping of classes {path} is not valid YAML: {' '.join(str(error).split())}.") from error
+        raise ConfigError(
+            f"The mapping of classes {path} is not valid YAML: {' '.join(str(error).split())}."
+        ) from error
     targets, becomes = _checked(content, path)
     row = {target.lower(): t for t, target in enumerate(targets)}
     matrix = np.zeros((len(targets), len(names)), np.float32)
@@ -63,10 +69,9 @@ def read_mapping(path: Path, names: tuple[str, ...]) -> tuple[tuple[str, ...], N
 
 
 def _checked(content: Any, path: Path) -> tuple[tuple[str, ...], dict[str, str | None]]:
-    classes, mapped = (content.get(key) for key in ("classes", "map")) if isinstance(content, dict) else (None, None)
-    mapped = {} if mapped is None else mapped
-    usable = isinstance(classes, list) and classes and all(isinstance(name, str) for name in classes)
-    if not usable or not isinstance(mapped, dict):
+    content = content if isinstance(content, dict) else {}
+    classes, mapped = content.get("classes") or [], content.get("map") or {}
+    if not isinstance(classes, list) or not isinstance(mapped, dict) or not _are_names(classes):
         raise ConfigError(f"{path} must hold 'classes', a list of names, and 'map', lines that read 'name: class'.")
     targets = tuple(name.strip() for name in classes)
     becomes = {str(name).strip().lower(): None if to is None else str(to).strip() for name, to in mapped.items()}
@@ -74,3 +79,7 @@ def _checked(content: Any, path: Path) -> tuple[tuple[str, ...], dict[str, str |
     if strange := [(name, to) for name, to in becomes.items() if to is not None and to.lower() not in known]:
         raise ConfigError(f"{path} maps '{strange[0][0]}' to '{strange[0][1]}', which is none of its classes.")
     return targets, becomes
+
+
+def _are_names(values: list[Any]) -> bool:
+    return len(values) > 0 and all(isinstance(value, str) for value in values)

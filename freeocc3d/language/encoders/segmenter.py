@@ -85,7 +85,7 @@ class SegmenterEncoder(Encoder):
     name: ClassVar[str] = "segmenter"
 
     def __init__(self, network: Network, classes: tuple[str, ...], grouping: NDArray[np.float32], options: Options):
-        """grouping: (D, C) 1 where the network's class c counts as the d-th of ``classes``; a column of zeros is void."""
+        """grouping: (D, C) 1 where the network's class c counts as the d-th of ``classes``; a void column is zero."""
         self.network = network
         self.classes = classes
         self.grouping = grouping
@@ -122,18 +122,29 @@ class Network:
         self.input, self.last, self.size = self._input()
         self.dtype = _INPUTS[self.input.type]
         self.output = self._output()
+        self._scores(
+            np.zeros((64, 64, 3), np.uint8)
+        )  # what shapes leave open is found out before there is work to lose
 
     def posteriors(self, frame: Frame, height: int, width: int) -> NDArray[np.float32]:
         """(height, width, C) float32 class posteriors that cover the frame's image evenly."""
         import cv2
 
-        given = self.session.run([self.output.name], {self.input.name: self._image(frame.color)})[0]
-        scores = self._by_class(np.asarray(given))
+        scores = self._scores(frame.color)
         if not np.isfinite(scores).all():
             raise FrameError(f"{self.path} gives numbers that are not finite for frame {frame.index}: it is left out.")
-        shrink = scores.shape[0] >= height and scores.shape[1] >= width
-        scores = cv2.resize(scores, (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
+        scores = cv2.resize(scores, (width, height), interpolation=cv2.INTER_LINEAR)
         return scores if _are_posteriors(scores) else _softmax(scores)
+
+    def _scores(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """(h, w, C) what the network gives for an image."""
+        image = self._image(rgb)
+        try:
+            given = self.session.run([self.output.name], {self.input.name: image})[0]
+        except Exception as error:  # ONNX Runtime's are of many kinds, all of them directly below Exception
+            reason = " ".join(str(error).split())[:200]
+            raise ConfigError(f"{self.path} fails with an image of shape {_shape(image.shape)}: {reason}") from error
+        return self._by_class(np.asarray(given))
 
     def _image(self, rgb: NDArray[np.uint8]) -> NDArray[np.generic]:
         """The frame as the input wants it."""
@@ -143,7 +154,9 @@ class Network:
         shrink = width <= rgb.shape[1] and height <= rgb.shape[0]
         image = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
         if self.dtype != np.uint8:
-            image = (image.astype(np.float32) / 255 - np.float32(self.options.mean)) / np.float32(self.options.std)
+            image = (image.astype(np.float32) / 255 - np.array(self.options.mean, np.float32)) / np.array(
+                self.options.std, np.float32
+            )
         if self.options.channels == "bgr":
             image = image[..., ::-1]
         return np.ascontiguousarray((image if self.last else image.transpose(2, 0, 1))[None].astype(self.dtype))
@@ -207,8 +220,8 @@ class Network:
     def _misfit(self, outputs: list[tuple[str, Any]]) -> str:
         described = ", ".join(f"{name} {_shape(shape)}" for name, shape in outputs)
         return (
-            f"{self.options.classes} names {self.n_classes} classes, but {self.path} has no output with as many channels: "
-            f"it has {described}."
+            f"{self.options.classes} names {self.n_classes} classes, but {self.path} has no output with as many "
+            f"channels: it has {described}."
         )
 
 
@@ -237,13 +250,15 @@ def load(options: Options, capture: Capture | None = None) -> SegmenterEncoder:
     """The encoder; it needs nothing of the capture. Raises ConfigError for files that cannot be used."""
     for name in ("model", "classes"):
         if not getattr(options, name):
-            raise ConfigError(f"The encoder 'segmenter' needs language.segmenter.{name}: a file. It has none of its own.")
+            raise ConfigError(
+                f"The encoder 'segmenter' needs language.segmenter.{name}: a file. It has none of its own."
+            )
     names = read_names(Path(options.classes))
     network = Network(Path(options.model), len(names), options)
     classes, grouping = read_mapping(Path(options.mapping), names) if options.mapping else (names, np.eye(len(names)))
     grouping = grouping.astype(np.float32) * ~_void(names, options)
-    said = grouping.any(axis=1)
-    classes, grouping = tuple(name for name, kept in zip(classes, said, strict=True) if kept), grouping[said]
+    said = np.asarray(grouping.any(axis=1))
+    classes, grouping = tuple(name for name, kept in zip(classes, said.tolist(), strict=True) if kept), grouping[said]
     if not classes:
         raise ConfigError(f"All classes of {options.classes} are void: nothing is left to map.")
     encoder = SegmenterEncoder(network, classes, grouping, options)
@@ -265,7 +280,9 @@ def _void(names: tuple[str, ...], options: Options) -> NDArray[np.bool_]:
         return np.isin(lower, VOID)
     void = [name.lower() for name in options.void]
     if absent := [name for name in void if name not in lower]:
-        raise ConfigError(f"{options.classes} names no class '{absent[0]}'{nearest(absent[0], lower)} that could be void.")
+        raise ConfigError(
+            f"{options.classes} names no class '{absent[0]}'{nearest(absent[0], lower)} that could be void."
+        )
     return np.isin(lower, void)
 
 
