@@ -1,9 +1,9 @@
-"""Any semantic segmentation network (ONNX) with a list of its classes; words match their names, synonyms and kin.
+"""Any segmentation network (ONNX) with a list of its classes; words match their names, synonyms and near names.
 
-The feature of a pixel is the square root of the class posteriors, sqrt(p), which is of unit length for any p that sums
-to 1: an unsure pixel weighs as much as a sure one in a mean over views, and says less of each class. The square of a
-fused feature is what the views agree on (a power mean of their posteriors, of exponent 1/2, which one wrong view moves
-less than the arithmetic mean), and a cosine between two features is a Bhattacharyya coefficient.
+The feature of a pixel is its class posteriors p / |p|, so that what is fused over views is about their mean; its cosine
+with a class is p_c / |p|, high where the network was sure and the views agree. Measured beside other powers of p with a
+network of 40 classes (bedroom, living; mIoU over the classes present): p 15.3, 12.9; sqrt(p) 15.3, 12.0; the most
+likely class alone 15.3, 12.7; p^(1/4) 12.9, 8.2.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Options:
 
 
 class SegmenterEncoder(Encoder):
-    """sqrt of class posteriors; void classes, and what is most likely one, say nothing."""
+    """Class posteriors; void classes, and what is most likely one, say nothing."""
 
     name: ClassVar[str] = "segmenter"
 
@@ -102,11 +102,11 @@ class SegmenterEncoder(Encoder):
         height, width = (-(-edge // self.options.stride) for edge in frame.color.shape[:2])
         posteriors = self.network.posteriors(frame, height, width).reshape(height * width, -1)
         known = posteriors @ self.grouping.T
-        total = known.sum(axis=1, keepdims=True)
-        void = (posteriors * ~self.grouping.any(axis=0)).max(axis=1, keepdims=True)
-        says = (total > 0) & (known.max(axis=1, keepdims=True) >= void)
-        known = np.where(says, known / np.where(says, total, 1.0), 0.0)
-        return np.sqrt(known).astype(np.float16).reshape(height, width, -1)
+        void = (posteriors * ~self.grouping.any(axis=0)).max(axis=1)
+        known[known.max(axis=1) < void] = 0
+        length = np.linalg.norm(known, axis=1, keepdims=True)
+        unit = known / np.where(length > 0, length, 1.0)
+        return unit.astype(np.float16).reshape(height, width, -1)
 
     def text_state(self) -> dict[str, Any]:
         return {"classes": list(self.classes), "aliases": self.aliases}
@@ -228,8 +228,8 @@ class Network:
 class SegmenterWords(LabelWords):
     """Class names, their synonyms and wider words, and names that text embeddings say mean one."""
 
-    threshold = 0.5
-    """Of sqrt(p): at least a quarter of what the views say, and more than of any other class."""
+    threshold = 0.6
+    """Below the 0.71 of a class that views are divided about with another."""
 
     def __init__(self, classes: list[str], aliases: dict[str, int]):
         super().__init__(["", *classes])
