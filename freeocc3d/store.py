@@ -138,8 +138,19 @@ class Map:
 
     @property
     def vocabulary(self) -> list[str]:
-        """The words that pictures and exports by class use: what the encoder tells apart without being asked."""
-        return self.text_encoder.contrast_words()
+        """The words that pictures and exports by class use: what the encoder tells apart without being asked, or of one
+        of open vocabulary, what a model has named in the scene."""
+        named = self.scene_words if self.text_encoder.open_vocabulary else []
+        return named or self.text_encoder.contrast_words()
+
+    @property
+    def scene_words(self) -> list[str]:
+        """Names that a vision-language model gave to what is in the scene, the most frequent first. A name that only
+        one of several keyframes has is left out: what is there is mostly seen twice."""
+        named = self.manifest.get("vocabulary") or {"keyframes": [], "names": {}}
+        least = 2 if len(named["keyframes"]) > 3 else 1
+        count = {name: entry["count"] for name, entry in named["names"].items() if entry["count"] >= least}
+        return sorted(count, key=lambda name: -count[name])
 
     @functools.cached_property
     def _class_labels(self) -> NDArray[np.uint8]:
@@ -161,7 +172,7 @@ class Map:
         from . import query
 
         checked = registry.build_options(query, options)
-        return query.query(self.occupancy, self.text_encoder, words, checked)
+        return query.query(self.occupancy, self.text_encoder, words, checked, self.scene_words)
 
     @functools.cached_property
     def _feature_arrays(self) -> dict[str, NDArray[Any]]:
@@ -302,10 +313,23 @@ def _check_manifest(manifest: dict[str, Any], path: Path) -> None:
     for key, names in inner.items():
         if missing := [name for name in names if name not in manifest[key]]:
             raise MapError(f"{path / MANIFEST} is damaged: '{key}' lacks {', '.join(missing)}.")
+    if (named := manifest.get("vocabulary")) is not None and not _is_vocabulary(named):
+        raise MapError(f"{path / MANIFEST} is damaged: 'vocabulary' does not hold names with their counts.")
     for name in manifest["files"]:
         inside = (path / str(name)).resolve().is_relative_to(path.resolve())
         if not inside:
             raise MapError(f"{path / MANIFEST} is damaged: '{name}' lies outside the map's folder.")
+
+
+def _is_vocabulary(named: Any) -> bool:
+    """Whether an entry of a manifest is what ``language.scene_vocabulary`` makes."""
+    if not isinstance(named, dict) or not isinstance(named.get("keyframes"), list):
+        return False
+    names = named.get("names")
+    return isinstance(names, dict) and all(
+        isinstance(name, str) and isinstance(entry, dict) and isinstance(entry.get("count"), int)
+        for name, entry in names.items()
+    )
 
 
 def counts(occupancy: Occupancy) -> dict[str, int]:

@@ -44,6 +44,9 @@ class TextEncoder(ABC):
     same_word: float = 0.9
     """A contrast word whose text feature has at least this cosine to the asked word's says the same, or a part of it:
     it does not compete."""
+    open_vocabulary: bool = False
+    """Whether any word has a meaning of its own: what a model names in a scene then competes with what is asked for,
+    and pictures by class show it."""
     knows: str = "words like those that it was trained on"
     """What can be asked, in words, for the note about a word that is not understood."""
 

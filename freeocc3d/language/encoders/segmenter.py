@@ -1,4 +1,4 @@
-"""Any segmentation network (ONNX) with a list of its classes; words match their names, synonyms and near names.
+"""Any segmentation network (ONNX) with a list of its classes; words match names, synonyms and kin.
 
 The feature of a pixel is its class posteriors p / |p|, so that what is fused over views is about their mean; its cosine
 with a class is p_c / |p|, high where the network was sure and the views agree. Measured beside other powers of p with a
