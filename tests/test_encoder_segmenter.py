@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from onnx_models import COLOURS, logits, write_classifier, write_identity, write_model
 
+import freeocc3d
+from freeocc3d import refine
 from freeocc3d.errors import CaptureError, ConfigError, FrameError
 from freeocc3d.language.encoders import segmenter
 from freeocc3d.language.encoders.segmenter import Options, SegmenterEncoder, SegmenterWords, load, load_text
@@ -294,3 +296,27 @@ def test_a_real_network_on_real_pictures(tmp_path: Path) -> None:
     assert score[:20].mean() < 0.4
     assert made.text_state()["aliases"]["carton"] == made.classes.index("box")
     assert segmenter.NEEDS_CAPTURE is False
+
+
+def test_a_map_of_a_networks_classes_is_asked_and_refined_without_its_capture(tmp_path: Path) -> None:
+    (tmp_path / "names.txt").write_text("void\nred thing\ngreen thing\nblue thing")
+    net = write_classifier(tmp_path / "net.onnx")
+    settings = {
+        "capture": {"synthetic": {"width": 160, "height": 120}, "stop": 16},
+        "fitting": {"passes": 0},
+        "language": {
+            "encoder": "segmenter",
+            "segmenter": {**PLAIN, "model": str(net), "classes": str(tmp_path / "names.txt")},
+        },
+    }
+    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings)
+    by_colour = freeocc3d.reconstruct("builtin:room", tmp_path / "colours", {**settings, "language": {}})
+    red = made.query("red thing")
+    assert red.matched
+    seen = by_colour.query("red").regions[0]
+    assert np.linalg.norm(red.regions[0].centroid - seen.centroid) < 0.3
+    nothing = made.query("purple unicorn")
+    assert not nothing.matched
+    assert "red thing" in nothing.note
+    box = refine.around(red.regions[0], 0.08)
+    assert refine.refine(made, box, 0.04, tmp_path / "refined").query("red thing").matched
