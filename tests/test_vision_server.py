@@ -83,6 +83,8 @@ def test_addresses(endpoint: str, expected: str) -> None:
         ("http://", "must be an address"),
         ("http://host:port/v1", "must be an address"),
         ("http://host/v1\r\nX: y", "must be an address"),
+        ("http://h\u00f6st/v1", "must be an address"),
+        (f"http://{'a' * 300}/v1", "must be an address"),
         ("", "must be an address"),
         ("https://me:secret@example.org/v1", "api_key_env"),
         ("https://example.org/v1?key=secret", "api_key_env"),

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 from ..errors import ConfigError, FreeOccError
 
 _MOST_BYTES = 1 << 20  # of an answer
-_MOST_TOKENS = 512
+_MOST_TOKENS = 1024
 _LONGEST_PAUSE_S = 30.0
 _AGAIN = {408, 409, 425, 429, 500, 502, 503, 504}
 """Statuses after which the same question may be answered later."""
@@ -134,11 +134,11 @@ def address(endpoint: str) -> str:
     """Where chats are completed. Raises ConfigError for what is no http or https address, or holds a password."""
     try:
         parts = urlsplit(endpoint)
-        usable = parts.scheme in ("http", "https") and bool(parts.hostname)
+        usable = parts.scheme in ("http", "https") and bool((parts.hostname or "").encode("idna"))
         _ = parts.port
-    except ValueError:
+    except ValueError:  # a port or a host that cannot be one
         usable = False
-    if not usable or any(c.isspace() or not c.isprintable() for c in endpoint):
+    if not usable or not endpoint.isascii() or any(c.isspace() or not c.isprintable() for c in endpoint):
         raise ConfigError(f"The endpoint '{endpoint}' must be an address like http://localhost:8000/v1.")
     if parts.username or parts.password or parts.query or parts.fragment:
         raise ConfigError(

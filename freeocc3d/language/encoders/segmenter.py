@@ -54,9 +54,9 @@ class Options:
     """File (.npz) with text embeddings of many names, "names" and "embeddings", those of the classes among them: a name
     whose embedding is nearer to a class's than names there commonly are to each other means the class."""
     mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
-    """Mean of the channels that images are normalised by, of colours in 0…1; an input of bytes is not normalised."""
+    """Mean of red, green and blue, in 0…1, that images are normalised by; an input of bytes is not normalised."""
     std: tuple[float, float, float] = (0.229, 0.224, 0.225)
-    """Standard deviation of the channels that images are normalised by, of colours in 0…1."""
+    """Standard deviation of red, green and blue, in 0…1, that images are normalised by."""
     channels: str = "rgb"
     """Order of the input's channels: "rgb" or "bgr"."""
     size: tuple[int, int] | None = None
@@ -122,9 +122,8 @@ class Network:
         self.input, self.last, self.size = self._input()
         self.dtype = _INPUTS[self.input.type]
         self.output = self._output()
-        self._scores(
-            np.zeros((64, 64, 3), np.uint8)
-        )  # what shapes leave open is found out before there is work to lose
+        # what shapes leave open is found out before there is work to lose
+        self._scores(np.zeros((64, 64, 3), np.uint8))
 
     def posteriors(self, frame: Frame, height: int, width: int) -> NDArray[np.float32]:
         """(height, width, C) float32 class posteriors that cover the frame's image evenly."""
@@ -154,9 +153,8 @@ class Network:
         shrink = width <= rgb.shape[1] and height <= rgb.shape[0]
         image = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
         if self.dtype != np.uint8:
-            image = (image.astype(np.float32) / 255 - np.array(self.options.mean, np.float32)) / np.array(
-                self.options.std, np.float32
-            )
+            mean, std = (np.array(values, np.float32) for values in (self.options.mean, self.options.std))
+            image = (image.astype(np.float32) / 255 - mean) / std
         if self.options.channels == "bgr":
             image = image[..., ::-1]
         return np.ascontiguousarray((image if self.last else image.transpose(2, 0, 1))[None].astype(self.dtype))
@@ -180,24 +178,24 @@ class Network:
         """The input, whether its channels come last, and its width and height if it states them."""
         inputs = self.session.get_inputs()
         described = ", ".join(f"{entry.name} {_shape(entry.shape)} {entry.type}" for entry in inputs)
-        entry = inputs[0]
-        rank_fits = len(inputs) == 1 and len(entry.shape) == 4 and entry.type in _INPUTS
-        last = rank_fits and entry.shape[3] == 3 and entry.shape[1] != 3
-        if not rank_fits or (not last and isinstance(entry.shape[1], int) and entry.shape[1] != 3):
+        fitting = [entry for entry in inputs if len(entry.shape) == 4 and entry.type in _INPUTS]
+        last = [entry.shape[3] == 3 and entry.shape[1] != 3 for entry in fitting]
+        if len(inputs) != 1 or not fitting or not (last[0] or _may_be(fitting[0].shape[1], 3)):
             raise ConfigError(
                 f"{self.path} does not take one RGB image, (1, 3, height, width) or (1, height, width, 3) floats or "
-                f"bytes: its input is {described}."
+                f"bytes: its input is {described or 'none'}."
             )
-        if isinstance(entry.shape[0], int) and entry.shape[0] != 1:
+        entry = fitting[0]
+        if not _may_be(entry.shape[0], 1):
             raise ConfigError(f"{self.path} takes {entry.shape[0]} images at once; export it for one.")
-        height, width = entry.shape[1:3] if last else entry.shape[2:4]
+        height, width = entry.shape[1:3] if last[0] else entry.shape[2:4]
         stated = (width, height) if isinstance(width, int) and isinstance(height, int) else None
         if stated and self.options.size and self.options.size != stated:
             raise ConfigError(
                 f"'size' is {self.options.size[0]} x {self.options.size[1]}, but {self.path} takes images of {width} x "
                 f"{height} only: leave it null."
             )
-        return entry, last, stated
+        return entry, last[0], stated
 
     def _output(self) -> Any:
         """The output that is taken."""
@@ -300,6 +298,11 @@ def _class_axis(shape: Any, n_classes: int, last: bool) -> int | None:
     exact = [axis for axis in order if len(shape) == 4 and shape[axis] == n_classes]
     open_ = [axis for axis in order if len(shape) == 4 and not isinstance(shape[axis], int)]
     return next(iter([*exact, *open_]), None)
+
+
+def _may_be(edge: Any, length: int) -> bool:
+    """Whether an edge of a shape has a length, or is open."""
+    return edge == length or not isinstance(edge, int)
 
 
 def _are_posteriors(scores: NDArray[np.float32]) -> bool:
