@@ -28,12 +28,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import absent_words
 import held_out
 import kernels
 import rendering
 import variants
 import voxels
-import words
 
 Figures = dict[str, Any]
 
@@ -305,7 +305,7 @@ INSIDE = {
     "splat": lambda: kernels.measure_splat(),
     "voxels": lambda: voxels.measure_voxels(),
     "rasterizer": lambda: rendering.measure_rasterizer(),
-    "words": lambda capture: words.measure_words(capture),
+    "words": lambda capture: absent_words.measure_words(capture),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
 }
 """What is measured in a process of its own."""
@@ -505,7 +505,7 @@ def _layer_1_lines(figures: Figures) -> list[str]:
 
 def _word_lines(rows: list[Figures]) -> list[str]:
     """A table of "absent_words"."""
-    table = words.words_lines(rows)
+    table = absent_words.words_lines(rows)
     return ["", "| what | measured | asked |", "|---|---|---|", *(f"| {' | '.join(line)} |" for line in table)] * bool(
         rows
     )

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Asks maps for things that are not there: how often something is returned all the same. Part of tools/benchmark.py.
 
-    python tools/words.py [CAPTURE ...] [--json]
+    python tools/absent_words.py [CAPTURE ...] [--json]
 
 A capture with class images is mapped with the encoder ``labels``, another with ``segmenter`` and the network beside the
 captures. The words are names of LVIS and Objects365 (``clip_text_names.npz``), evenly spread over those that name
@@ -70,7 +70,7 @@ def measure_words(capture: str) -> Figures:
     present = scene_classes(Path(capture))
     seen = list(present or SEEN.get(Path(capture).name, ()))
     if not seen:
-        raise SystemExit(f"what {capture} shows is not known: name it in SEEN of tools/words.py")
+        raise SystemExit(f"what {capture} shows is not known: name it in SEEN of tools/absent_words.py")
     language = {"encoder": "labels"} if present else {"encoder": "segmenter", "segmenter": SEGMENTER}
     tracking = {"backend": "known"} if present else {}
     settings = {"language": language, "tracking": tracking, "fitting": {"passes": 0}}
