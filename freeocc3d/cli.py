@@ -28,6 +28,8 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and 
 _DEVICES = ("tracking", "backend"), ("fitting", "rasterizer")
 """What may have an option ``device``."""
 
+_SHOWN_NAMES = 12
+
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set one option; repeatable.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what exists.")]
 
@@ -527,6 +529,7 @@ def _info(loaded: Any) -> dict[str, Any]:
         "refined": manifest.get("refined"),
         "encoder": manifest["encoder"]["name"],
         "encoder_knows": loaded.text_encoder.knows,
+        "vocabulary": manifest.get("vocabulary"),
         "bytes": {
             name: sum(size for file, size in manifest["files"].items() if file.split("/")[0] == name)
             for name in dict.fromkeys(file.split("/")[0] for file in manifest["files"])
@@ -557,6 +560,7 @@ def _info_text(facts: dict[str, Any]) -> str:
         f"voxels     {facts['voxels']['occupied']:,} occupied, {facts['voxels']['free']:,} free, "
         + (f"edge {largest:g} m" if largest == smallest else f"edges {largest:g} to {smallest:g} m"),
         f"encoder    {facts['encoder']}, which knows {facts['encoder_knows']}",
+        *([_vocabulary_text(facts["vocabulary"])] if facts["vocabulary"] else []),
         f"time       {sum(facts['seconds'].values()):.1f} s: {seconds}",
         f"memory     {facts['peak_memory_bytes'] / 1e9:.2f} GB at most",
     ]
@@ -568,6 +572,16 @@ def _info_text(facts: dict[str, Any]) -> str:
         ]
     lines += [f"warning    {text}" for text in facts["warnings"]]
     return "\n".join(lines)
+
+
+def _vocabulary_text(vocabulary: dict[str, Any]) -> str:
+    names = vocabulary["names"]
+    shown = ", ".join(f"{name} {entry['count']}" for name, entry in list(names.items())[:_SHOWN_NAMES])
+    return (
+        f"words      {len(names)} named by {vocabulary['model']} in {len(vocabulary['keyframes'])} keyframes"
+        + (f": {shown}" if shown else "")
+        + (", …" if len(names) > _SHOWN_NAMES else "")
+    )
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -25,6 +25,7 @@ SECTIONS: dict[str, tuple[str, str | None]] = {
     "gaussians": ("gaussians.anchors", None),
     "fitting": ("gaussians.fit", "gaussians.rasterizers"),
     "language": ("language.lift", "language.encoders"),
+    "vocabulary": ("language.scene_vocabulary", None),
     "occupancy": ("occupancy.splat", None),
     "carving": ("occupancy.carve", None),
 }

@@ -29,7 +29,7 @@ from .gaussians import anchors, fit, images
 from .gaussians.rasterizers.base import Rasterizer
 from .gaussians.upright import estimate_up
 from .keyframes import Keyframes
-from .language import lift
+from .language import lift, scene_vocabulary
 from .language.codec import Codec
 from .language.encoders.base import Encoder
 from .occupancy import build, carve, splat
@@ -298,6 +298,7 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
         progress.stage("refinement")
         mapper.refine()
     trajectory = _with_broken(mapper.trajectory(), work.broken)
+    vocabulary = _vocabulary(mapper, work, progress)
     gaussians = work.gaussians(lambda: _layer_2(mapper, work, progress))
     if len(gaussians) == 0:
         raise TrackingError(
@@ -316,9 +317,26 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
         )
     _check_result(trajectory, progress, work)
     progress.stage("saving")
-    _save(work, mapper, trajectory, gaussians, features, occupancy, encoder)
+    _save(work, mapper, trajectory, gaussians, features, occupancy, encoder, vocabulary)
     work.finish(output)
     return load_map(output)
+
+
+def _vocabulary(mapper: Mapper, work: WorkFolder, progress: Progress) -> dict[str, Any] | None:
+    """Names of what the mapped keyframes show, as the map keeps them; None if no model is to be asked."""
+    options: scene_vocabulary.Options = _options(scene_vocabulary, mapper.settings["vocabulary"])
+    namer = scene_vocabulary.load(options)
+    if namer is None:
+        return None
+    frames = mapper.trajectory().keyframes
+    chosen = mapper.keyframes.only(frames[_evenly(len(frames), options.keyframes)])
+    progress.stage("vocabulary", len(chosen))
+    with work.timed("vocabulary"):
+        found, warnings = namer.names(chosen, work.answers, progress.advance)
+    for text in warnings:
+        work.warnings.append(text)
+        progress.warn(text)
+    return found
 
 
 def _layer_2(mapper: Mapper, work: WorkFolder, progress: Progress) -> Gaussians:
@@ -452,6 +470,7 @@ def _save(
     features: NDArray[np.float16],
     occupancy: Occupancy,
     encoder: Encoder,
+    vocabulary: dict[str, Any] | None,
 ) -> None:
     capture, keyframes = mapper.capture, mapper.mapped(trajectory)
     submaps = mapper.tracker.submaps()
@@ -473,7 +492,8 @@ def _save(
         keyframes.drop_unlisted()
     report = {**_report(work, capture, trajectory, submaps), "rendering": dataclasses.asdict(fidelity)}
     (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
-    store.write_manifest(folder, _manifest(mapper, trajectory, gaussians, occupancy, encoder, submaps))
+    manifest = _manifest(mapper, trajectory, gaussians, occupancy, encoder, submaps)
+    store.write_manifest(folder, {**manifest, **({"vocabulary": vocabulary} if vocabulary else {})})
 
 
 def _manifest(
@@ -559,6 +579,7 @@ def check(settings: Config) -> None:
         _options(module, config.options(settings, section))
     if settings["occupancy"]["finest"] is not None:
         adaptive.halvings(settings["occupancy"]["voxel_size"], settings["occupancy"]["finest"])
+    scene_vocabulary.load(_options(scene_vocabulary, settings["vocabulary"]))
     for section, key in (("tracking", "backend"), ("fitting", "rasterizer"), ("language", "encoder")):
         name = settings[section][key]
         backend = registry.load(str(config.SECTIONS[section][1]), name)

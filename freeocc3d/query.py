@@ -9,6 +9,7 @@ and no contrast word (what the voxel could be instead) scores higher there: simi
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -97,10 +98,17 @@ class QueryResult:
 
 
 def query(
-    occupancy: Occupancy, text_encoder: TextEncoder, words: list[str], options: Options | None = None
+    occupancy: Occupancy,
+    text_encoder: TextEncoder,
+    words: list[str],
+    options: Options | None = None,
+    scene_words: Sequence[str] = (),
 ) -> list[QueryResult]:
-    """Ask for several words; one that nothing matches gives no regions. Raises FreeOccError for an empty or endless
-    word, MapError if the map's features are not the encoder's."""
+    """Ask for several words; one that nothing matches gives no regions.
+
+    scene_words: what is known to be in the scene; to an encoder of open vocabulary they are contrast words, too.
+    Raises FreeOccError for an empty or endless word, MapError if the map's features are not the encoder's.
+    """
     options = options or Options()
     for word in words:
         if not word.strip():
@@ -108,7 +116,8 @@ def query(
         if len(word) > _LONGEST_WORD:
             raise FreeOccError(f"'{word[:30]}…' has {len(word)} characters; a query may have up to {_LONGEST_WORD}.")
     text = text_encoder.encode_words(words)
-    contrast = text_encoder.encode_words(text_encoder.contrast_words())
+    named = scene_words if text_encoder.open_vocabulary else ()
+    contrast = text_encoder.encode_words([*text_encoder.contrast_words(), *named])
     if len(occupancy.features) and occupancy.features.shape[1] != text.features.shape[1]:
         raise MapError(
             f"The map's features have {occupancy.features.shape[1]} dimensions, its encoder's words "

@@ -11,19 +11,16 @@ from __future__ import annotations
 
 import functools
 import json
-import math
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import yaml
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from . import registry
+from .arrays import read_arrays
 from .errors import MapError
 from .geometry import quats_to_rotations, rotations_to_quats
 from .language.codec import Codec, CodedFeatures
@@ -41,7 +38,6 @@ MANIFEST, CONFIG, REPORT, TRAJECTORY = "map.yaml", "config.yaml", "report.json",
 PATH_PICTURE, RENDER_PICTURE = "trajectory.png", "gaussians.png"
 GAUSSIANS, OCCUPANCY, FEATURES, KEYFRAMES = "gaussians.ply", "occupancy.npz", "features.npz", "keyframes"
 
-_LARGEST_ARRAY = 8 << 30
 _OCCUPANCY_ARRAYS = {
     "keys": ("i", 2), "probability": ("f", 2), "free": ("u", 2), "hits": ("u", 2), "state": ("u", 2),
     "colors": ("u", 2), "feature_codes": ("u", 2),
@@ -146,8 +142,19 @@ class Map:
 
     @property
     def vocabulary(self) -> list[str]:
-        """The words that pictures and exports by class use: what the encoder tells apart without being asked."""
-        return self.text_encoder.contrast_words()
+        """The words that pictures and exports by class use: what the encoder tells apart without being asked, or of one
+        of open vocabulary, what a model has named in the scene."""
+        named = self.scene_words if self.text_encoder.open_vocabulary else []
+        return named or self.text_encoder.contrast_words()
+
+    @property
+    def scene_words(self) -> list[str]:
+        """Names that a vision-language model gave to what is in the scene, the most frequent first. A name that only
+        one of several keyframes has is left out: what is there is mostly seen twice."""
+        named = self.manifest.get("vocabulary") or {"keyframes": [], "names": {}}
+        least = 2 if len(named["keyframes"]) > 3 else 1
+        count = {name: entry["count"] for name, entry in named["names"].items() if entry["count"] >= least}
+        return sorted(count, key=lambda name: -count[name])
 
     @functools.cached_property
     def _class_labels(self) -> NDArray[np.uint8]:
@@ -169,7 +176,7 @@ class Map:
         from . import query
 
         checked = registry.build_options(query, options)
-        return query.query(self.occupancy, self.text_encoder, words, checked)
+        return query.query(self.occupancy, self.text_encoder, words, checked, self.scene_words)
 
     @functools.cached_property
     def _feature_arrays(self) -> dict[str, NDArray[Any]]:
@@ -289,38 +296,6 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return table[:, 0], T
 
 
-def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]]) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz file; each name in ``expected`` must be there with its kind of number and dimensions.
-
-    Sizes are read from the headers before anything is unpacked. Raises MapError.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            arrays = {
-                info.filename.removesuffix(".npy"): _read_array(archive, info, path) for info in archive.infolist()
-            }
-    except FileNotFoundError as error:
-        raise MapError(f"The map lacks its file {path}: copy the whole folder, or map again.") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        raise MapError(f"{path} is damaged: {error}.") from error
-    for name, (kind, dimensions) in expected.items():
-        if name not in arrays or arrays[name].dtype.kind != kind or arrays[name].ndim != dimensions:
-            raise MapError(f"{path} is damaged: it has no usable array '{name}'.")
-    return arrays
-
-
-def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> NDArray[Any]:
-    with archive.open(info) as stream:
-        version = npy.read_magic(stream)
-        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, _, dtype = read_header(stream)
-        size = math.prod(shape) * dtype.itemsize
-        if dtype.hasobject or size > info.file_size or size > _LARGEST_ARRAY:
-            raise MapError(f"{path} is damaged: its array {info.filename} states a size that its data do not have.")
-    with archive.open(info) as stream:
-        return np.asarray(npy.read_array(stream, allow_pickle=False))
-
-
 def _place(timestamps: NDArray[np.float64], times: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 4, 4) with the pose of each timestamp that a trajectory has, NaN elsewhere."""
     out = np.full((len(timestamps), 4, 4), np.nan)
@@ -345,6 +320,8 @@ def _check_manifest(manifest: dict[str, Any], path: Path) -> None:
     for key, names in inner.items():
         if missing := [name for name in names if name not in manifest[key]]:
             raise MapError(f"{path / MANIFEST} is damaged: '{key}' lacks {', '.join(missing)}.")
+    if (named := manifest.get("vocabulary")) is not None and not _is_vocabulary(named):
+        raise MapError(f"{path / MANIFEST} is damaged: 'vocabulary' does not hold names with their counts.")
     for name in manifest["files"]:
         inside = (path / str(name)).resolve().is_relative_to(path.resolve())
         if not inside:
@@ -355,6 +332,17 @@ def sizes(occupancy: Occupancy) -> dict[str, Any]:
     """What a manifest says of the voxels' sizes: their edges, metres."""
     several = {"finest_voxel_m": occupancy.finest} if occupancy.deepest else {}
     return {"voxel_size_m": occupancy.voxel_size, **several}
+
+
+def _is_vocabulary(named: Any) -> bool:
+    """Whether an entry of a manifest is what ``language.scene_vocabulary`` makes."""
+    if not isinstance(named, dict) or not isinstance(named.get("keyframes"), list):
+        return False
+    names = named.get("names")
+    return isinstance(names, dict) and all(
+        isinstance(name, str) and isinstance(entry, dict) and isinstance(entry.get("count"), int)
+        for name, entry in names.items()
+    )
 
 
 def counts(occupancy: Occupancy) -> dict[str, int]:

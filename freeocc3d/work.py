@@ -28,8 +28,10 @@ STAGES = {
 """Stages whose results are saved, and the configuration sections that they depend on."""
 
 _TRACKING, _STAGE_FEATURES, _MARKS = "tracking.npz", "features.stage.npz", "stages.json"
+_ANSWERS = "vocabulary.stage.json"
+_STAGE_FILES = (_TRACKING, "tracking.tmp.npz", _STAGE_FEATURES, _ANSWERS, f"{_ANSWERS}.tmp", _MARKS, f"{_MARKS}.tmp")
 _OWN_FILES = {
-    _TRACKING, "tracking.tmp.npz", _STAGE_FEATURES, _MARKS, f"{_MARKS}.tmp", store.MANIFEST, store.CONFIG, store.REPORT,
+    *_STAGE_FILES, store.MANIFEST, store.CONFIG, store.REPORT,
     store.TRAJECTORY, store.PATH_PICTURE, store.RENDER_PICTURE, store.GAUSSIANS, store.OCCUPANCY, store.FEATURES,
     store.KEYFRAMES,
 }  # fmt: skip
@@ -143,9 +145,14 @@ class WorkFolder:
         self._mark("language")
         return features
 
+    @property
+    def answers(self) -> Path:
+        """Where the answers about keyframes are kept, which say themselves to which questions."""
+        return self.folder / _ANSWERS
+
     def finish(self, output: Path) -> None:
         """The work folder takes the map's name; a map that it replaces is gone only when the new one stands."""
-        for name in (_TRACKING, "tracking.tmp.npz", _STAGE_FEATURES, _MARKS, f"{_MARKS}.tmp"):
+        for name in _STAGE_FILES:
             (self.folder / name).unlink(missing_ok=True)
         if not output.exists():
             self.folder.rename(output)

@@ -26,6 +26,14 @@ def data_folder() -> Path:
     return folder
 
 
+def models_folder() -> Path:
+    """The folder of small real networks beside the captures, or skip the test."""
+    folder = data_folder().parent / "models"
+    if not folder.is_dir():
+        pytest.skip(f"no networks in {folder}: they stand beside the captures, see FREEOCC3D_DATA")
+    return folder
+
+
 def color_image(index: int, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
     """(H, W, 3) RGB: red grows to the right, green downwards, blue with the index."""
     width, height = size

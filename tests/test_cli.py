@@ -2,12 +2,14 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from helpers import data_folder, write_scannet, write_seven_scenes
 
 ROOT = Path(__file__).parents[1]
@@ -164,3 +166,17 @@ def test_ctrl_c_ends_cleanly_and_resumes(tmp_path) -> None:
     assert "Traceback" not in errors
     assert not out.exists()
     assert "--resume" in refused("reconstruct", data_folder() / "7scenes-kitchen", "-o", out)
+
+
+def test_info_shows_what_a_model_named(room, tmp_path) -> None:
+    path = shutil.copytree(room, tmp_path / "map")
+    assert json.loads(run("info", path, "--json").stdout)["vocabulary"] is None
+    assert "words" not in run("info", path).stdout
+    names = {f"thing {chr(97 + n)}": {"count": 20 - n, "keyframes": list(range(20 - n))} for n in range(13)}
+    manifest = yaml.safe_load((path / "map.yaml").read_text())
+    manifest["vocabulary"] = {"model": "a-model", "keyframes": list(range(20)), "names": names}
+    (path / "map.yaml").write_text(yaml.safe_dump(manifest, sort_keys=False))
+    shown = run("info", path).stdout
+    assert "words      13 named by a-model in 20 keyframes: thing a 20, thing b 19" in shown
+    assert "thing l 9, …" in shown
+    assert json.loads(run("info", path, "--json").stdout)["vocabulary"]["names"]["thing m"]["count"] == 8

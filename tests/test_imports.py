@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1] / "freeocc3d"
 
 FLOORS = (
     ("errors", "types"),
-    ("geometry", "hashing", "lattice", "registry", "progress", "files"),
+    ("geometry", "hashing", "lattice", "registry", "progress", "files", "arrays"),
     ("config", "keyframes"),
     ("capture",),
     ("tracking",),

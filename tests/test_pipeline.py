@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers import data_folder, truncate, write_scannet, write_seven_scenes
+from vision_servers import saying, serving
 
 import freeocc3d
 from freeocc3d import config, pipeline, registry, store
@@ -412,3 +413,57 @@ def test_a_color_camera_of_another_focal_length_is_told_and_corrected(tmp_path) 
     found = freeocc3d.reconstruct(kitchen, tmp_path / "found", {"capture": {"stop": 250, "stride": 10}})
     assert found.report["color_focal"] == pytest.approx(0.903, abs=0.02)
     assert any("0.9" in text and "capture.color_focal=1" in text for text in found.report["warnings"])
+
+
+def _with_vocabulary(url: str, **more) -> dict:
+    return {**ROOM, "vocabulary": {"endpoint": url, "model": "a-model", "keyframes": 3, "retries": 0, **more}}
+
+
+def test_names_by_a_model_are_kept_in_the_map_and_its_key_is_not(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("ROOM_KEY", "sk-never-written")
+    with serving(saying('["table", "red cup"]', '["table"]')) as server:
+        settings = _with_vocabulary(server.url, api_key_env="ROOM_KEY")
+        made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings)
+    named = made.manifest["vocabulary"]
+    assert len(server.asked) == len(named["keyframes"]) == 3
+    assert set(named["keyframes"]) <= set(made.manifest["keyframes"])
+    assert named["names"]["table"] == {"count": 3, "keyframes": named["keyframes"]}
+    assert named["names"]["red cup"]["count"] == 1
+    assert made.report["seconds"]["vocabulary"] > 0
+    assert server.headers[0]["Authorization"] == "Bearer sk-never-written"
+    assert not any(b"never-written" in content for content in listing(made.path).values())
+    assert "vocabulary.stage.json" not in listing(made.path)
+
+
+def test_a_model_that_cannot_be_asked_costs_names_and_a_warning(tmp_path) -> None:
+    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", _with_vocabulary("http://127.0.0.1:9/v1"))
+    assert made.manifest["vocabulary"]["names"] == {}
+    (warning,) = (text for text in made.report["warnings"] if "vocabulary" in text)
+    assert "lacks 3 of 3 keyframes" in warning
+    assert made.query("red").matched
+
+
+def test_a_resumed_run_asks_for_no_keyframe_twice(tmp_path) -> None:
+    with serving(saying('["table"]')) as server:
+        settings = _with_vocabulary(server.url)
+        for stage, after in (("vocabulary", 2), ("language", 1)):
+            with pytest.raises(Interrupted):
+                freeocc3d.reconstruct(
+                    "builtin:room",
+                    tmp_path / "map",
+                    settings,
+                    progress=Stopper(stage, after),
+                    resume=stage != "vocabulary",
+                )
+        made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings, resume=True)
+    assert len(server.asked) == 3
+    assert made.manifest["vocabulary"]["names"]["table"]["count"] == 3
+
+
+def test_a_key_that_is_not_set_is_told_before_any_work(tmp_path, monkeypatch) -> None:
+    monkeypatch.delenv("ROOM_KEY", raising=False)
+    with pytest.raises(ConfigError, match="ROOM_KEY"):
+        freeocc3d.reconstruct(
+            "builtin:room", tmp_path / "map", _with_vocabulary("http://127.0.0.1:9/v1", api_key_env="ROOM_KEY")
+        )
+    assert not (tmp_path / "map.partial").exists()

@@ -281,3 +281,24 @@ def test_importing_the_query_imports_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+class OpenWords(LabelWords):
+    """As an encoder of open vocabulary: it contrasts with nothing of its own."""
+
+    open_vocabulary = True
+
+    def contrast_words(self) -> list[str]:
+        return []
+
+
+def test_what_a_model_named_in_the_scene_competes_where_any_word_has_a_meaning() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(CUP=0.6, WALL=0.8)))
+    words = OpenWords(CLASSES)
+    assert query(room, words, ["cup"])[0].matched
+    assert not query(room, words, ["cup"], None, ["wall"])[0].matched
+    assert query(room, words, ["wall"], None, ["wall", "cup", "unicorn"])[0].matched
+    assert query(room, words, ["cup"], None, ["mug", "sofa"])[0].matched  # the same word does not compete
+    closed = LabelWords(CLASSES)
+    for named in ((), ["wall"]):
+        assert query(room, closed, ["wall"], None, named)[0].matched

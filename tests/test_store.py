@@ -125,21 +125,6 @@ def test_files_outside_the_folder_are_refused(copy) -> None:
         store.load_map(copy)
 
 
-def test_arrays_are_never_unpickled_and_lies_about_their_size_are_refused(tmp_path) -> None:
-    np.savez(tmp_path / "a.npz", keys=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(MapError, match="damaged"):
-        store.read_arrays(tmp_path / "a.npz", {})
-    import io
-    import zipfile
-
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 40,)})
-    with zipfile.ZipFile(tmp_path / "b.npz", "w") as archive:
-        archive.writestr("keys.npy", header.getvalue() + b"\0" * 64)
-    with pytest.raises(MapError, match="states a size"):
-        store.read_arrays(tmp_path / "b.npz", {})
-
-
 def test_keyframes_come_back_and_their_damage_is_named(saved, copy) -> None:
     frames = freeocc3d.load_map(saved).keyframes
     assert len(frames) >= 1
@@ -149,3 +134,25 @@ def test_keyframes_come_back_and_their_damage_is_named(saved, copy) -> None:
     path.write_bytes(b"")
     with pytest.raises(MapError, match=r"depth\.png"):
         _ = list(Keyframes.load(copy / "keyframes"))
+
+
+def test_names_that_only_one_of_many_keyframes_has_are_left_out(copy, monkeypatch) -> None:
+    assert freeocc3d.load_map(copy).scene_words == []
+    names = {"sofa": {"count": 3, "keyframes": [0, 3, 6]}, "ghost": {"count": 1, "keyframes": [0]}}
+    for keyframes, expected in (([0, 3, 5, 6], ["sofa"]), ([0, 3, 6], ["sofa", "ghost"])):
+        edit(copy, vocabulary={"model": "m", "keyframes": keyframes, "names": names})
+        loaded = freeocc3d.load_map(copy)
+        assert loaded.scene_words == expected
+        assert "sofa" not in loaded.vocabulary
+        monkeypatch.setattr(type(loaded.text_encoder), "open_vocabulary", True)
+        assert loaded.vocabulary == expected
+        monkeypatch.undo()
+
+
+@pytest.mark.parametrize(
+    "named", ["sofa", {"names": {}}, {"keyframes": [], "names": ["sofa"]}, {"keyframes": [], "names": {"sofa": 3}}]
+)
+def test_a_damaged_vocabulary_is_told(copy, named) -> None:
+    edit(copy, vocabulary=named)
+    with pytest.raises(MapError, match="'vocabulary'"):
+        freeocc3d.load_map(copy)

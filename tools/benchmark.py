@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import absent_words
 import encoders
 import held_out
 import kernels
@@ -63,6 +64,8 @@ LAYER_1 = {
     "glued": "layer 1 on two captures as if they were one, which must stay two submaps",
     "lengths": "layer 1 on the first 250, 500 and 1000 frames: seconds, and bytes of a keyframe",
 }
+
+WORDS = {"absent_words": "names of things that are not there: how often a region is returned all the same"}
 
 SUITES = {
     "quick": (("house/bedroom",), (OURS, "rgbd_true_poses", "rgbd_true_poses_closed_set", *PEERS, *KERNELS, "lengths")),
@@ -304,6 +307,7 @@ INSIDE = {
     "voxels": lambda: voxels.measure_voxels(),
     "rasterizer": lambda: rendering.measure_rasterizer(),
     "encoders": lambda: encoders.measure_encoders(),
+    "words": lambda capture: absent_words.measure_words(capture),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
 }
 """What is measured in a process of its own."""
@@ -375,8 +379,14 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
             asked_map = job.folder / OURS
     measured = {name: _tried(name, lambda name=name: kernel(name, asked_map)) for name in KERNELS if name in names}
     layer_1 = measure_layer_1([capture.resolve() for capture in captures], names)
+    asked = [_absent_words(capture.resolve()) for capture in captures if "absent_words" in names]
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
-    return {"machine": machine, "frames": frames, "rows": rows, "kernels": measured, "layer_1": layer_1}
+    return {"machine": machine, "frames": frames, "rows": rows, "kernels": measured, "layer_1": layer_1, "words": asked}
+
+
+def _absent_words(capture: Path) -> Figures:
+    name = Job(capture, None, capture).name
+    return {"capture": name, **_tried(f"{name}: absent words", lambda: _inside("words", capture=str(capture)))}
 
 
 def measure_layer_1(captures: list[Path], names: list[str]) -> Figures:
@@ -479,6 +489,7 @@ def markdown(results: Figures) -> str:
         [
             *lines,
             *_layer_1_lines(results.get("layer_1") or {}),
+            *_word_lines(results.get("words") or []),
             *_pose_lines(results["rows"]),
             *_fit_lines(results["rows"]),
         ]
@@ -493,6 +504,14 @@ def _layer_1_lines(figures: Figures) -> list[str]:
             table = getattr(_stress(), table_of)(rows)
             lines += ["", *(f"| {' | '.join(line)} |" for line in (table[0], ["---"] * len(table[0]), *table[1:]))]
     return lines
+
+
+def _word_lines(rows: list[Figures]) -> list[str]:
+    """A table of "absent_words"."""
+    table = absent_words.words_lines(rows)
+    return ["", "| what | measured | asked |", "|---|---|---|", *(f"| {' | '.join(line)} |" for line in table)] * bool(
+        rows
+    )
 
 
 def _pose_lines(rows: list[Figures]) -> list[str]:
@@ -605,7 +624,7 @@ def arguments() -> argparse.Namespace:
     given = parser.parse_args()
     captures, names = SUITES[given.suite]
     given.captures = given.captures or [DATA / name for name in captures]
-    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1]
+    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *WORDS]
     given.variants = given.variants or list(names or known)
     if unknown := [name for name in given.variants if name not in known]:
         parser.error(f"unknown variants {', '.join(unknown)}: --list names all")
@@ -629,7 +648,7 @@ def main() -> None:
             print(f"{name:<38} {variant.title}" + (f": not available, {variant.lacking}" if variant.lacking else ""))
         for name, title in PEERS.items():
             print(f"{name:<38} {title}")
-        for name, title in LAYER_1.items():
+        for name, title in {**LAYER_1, **WORDS}.items():
             print(f"{name:<38} {title}")
         print(f"{', '.join(KERNELS):<38} speed of the projection, of voxels, queries, rendering and encoders")
         return

@@ -106,9 +106,9 @@ def matching_names(phrase: str, names: list[str]) -> tuple[list[int], str]:
     that are equal to it or a kind of it ("table": "coffee table" and "side table"), failing those its synonyms', and
     failing all that, the names of a wider word that includes it ("mug": "tableware").
     """
-    known = [_key(name) for name in names]
+    known = [key_of(name) for name in names]
     kinds = [_tail_keys(name) for name in names]
-    parts = _parts(phrase)
+    parts = parts_of(phrase)
     for part in parts:
         for words in (frozenset((part,)), synonyms(part)):
             if found := _named(words, known, kinds):
@@ -124,7 +124,7 @@ def synonyms(word: str) -> frozenset[str]:
     """The normal forms that mean the same as ``word``, itself included."""
     same = {normal(word)}
     for group in SYNONYMS:
-        if _key(word) in {_key(member) for member in group}:
+        if key_of(word) in {key_of(member) for member in group}:
             same |= {normal(member) for member in group}
     return frozenset(same)
 
@@ -141,11 +141,11 @@ def narrower(word: str) -> frozenset[str]:
 @functools.cache
 def wider(word: str) -> frozenset[str]:
     """The normal forms of what includes ``word``."""
-    key = _key(word)
-    return frozenset(normal(wide) for wide in INCLUDES if key in {_key(inner) for inner in INCLUDES[wide]})
+    key = key_of(word)
+    return frozenset(normal(wide) for wide in INCLUDES if key in {key_of(inner) for inner in INCLUDES[wide]})
 
 
-def _parts(phrase: str) -> list[str]:
+def parts_of(phrase: str) -> list[str]:
     """Normal forms to look up, most specific first."""
     tokens = re.findall(r"[^\W_]+", phrase.lower())[:_LONGEST_PHRASE]
     cut = next((at for at, token in enumerate(tokens) if at > 0 and token in _PREPOSITIONS), len(tokens))
@@ -156,17 +156,17 @@ def _parts(phrase: str) -> list[str]:
 
 def _named(words: frozenset[str], known: list[str], kinds: list[set[str]]) -> list[int]:
     """Rows of the names that are one of ``words``, or a kind of one."""
-    keys = {_key(word) for word in words}
-    keys |= {_key(name) for word in words for name in narrower(word)}
+    keys = {key_of(word) for word in words}
+    keys |= {key_of(name) for word in words for name in narrower(word)}
     return [row for row, name in enumerate(known) if name in keys or kinds[row] & keys]
 
 
 def _exactly(words: set[str], known: list[str]) -> list[int]:
-    keys = {_key(word) for word in words}
+    keys = {key_of(word) for word in words}
     return [row for row, name in enumerate(known) if name in keys]
 
 
-def _key(name: str) -> str:
+def key_of(name: str) -> str:
     """Equal for "night stand", "Nightstand" and "nightstands"."""
     return normal(name).replace(" ", "")
 

@@ -70,6 +70,7 @@ class Wording:
 class ModelWords(TextEncoder):
     """Any words; those that it was never trained on come out somewhere all the same."""
 
+    open_vocabulary = True
     knows = "words in the language of its text network"
 
     def __init__(self, state: dict[str, Any]):

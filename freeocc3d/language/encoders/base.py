@@ -1,4 +1,4 @@
-"""The contract of an encoder: images to dense unit features, words to unit features in the same space.
+"""The contract of an encoder: images to dense features, words to unit features in the same space.
 
 An encoder is one file of this folder with ``load(options, capture) -> Encoder`` for building a map, and
 ``load_text(state) -> TextEncoder`` for asking one; one that asks nothing of the capture says ``NEEDS_CAPTURE = False``;
@@ -46,6 +46,9 @@ class TextEncoder(ABC):
     same_word: float = 0.9
     """A contrast word whose text feature has at least this cosine to the asked word's says the same, or a part of it:
     it does not compete."""
+    open_vocabulary: bool = False
+    """Whether any word has a meaning of its own: what a model names in a scene then competes with what is asked for,
+    and pictures by class show it."""
     knows: str = "words like those that it was trained on"
     """What can be asked, in words, for the note about a word that is not understood."""
 
@@ -68,8 +71,9 @@ class Encoder(ABC):
 
     @abstractmethod
     def encode(self, frame: Frame) -> NDArray[np.float16]:
-        """(h, w, D) float16 features that cover the frame's image evenly (h, w may be smaller than H, W); each is of
-        unit length, or zero where the encoder has nothing to say."""
+        """(h, w, D) float16 features that cover the frame's image evenly (h, w may be smaller than H, W). Of each the
+        direction is what the encoder says, and the length how sure of it the encoder is: 1 for one that does not say,
+        0 where it has nothing to say. It is the weight of that feature when views are fused."""
 
     @abstractmethod
     def text_state(self) -> dict[str, Any]:

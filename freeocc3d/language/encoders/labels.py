@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from ...capture.base import Capture
 from ...errors import CaptureError, ConfigError
 from ...types import Frame
 from .. import vocabulary
+from ..class_names import read_names
 from .base import Encoder, TextEncoder, TextFeatures
 
 REQUIRES: tuple[str, ...] = ()
@@ -107,12 +107,16 @@ class LabelWords(TextEncoder):
         attainable = np.ones(len(words), np.float32)
         understood = []
         for row, word in enumerate(words):
-            matched, part = vocabulary.matching_names(word, self.classes[1:])
+            matched, part = self.matching(word)
             understood.append(part)
             if matched:
                 attainable[row] = 1.0 / np.sqrt(len(matched))
                 features[row, matched] = attainable[row]
         return TextFeatures(features, tuple(understood), attainable)
+
+    def matching(self, word: str) -> tuple[list[int], str]:
+        """Dimensions of the classes that a phrase means, and the part of it that was used."""
+        return vocabulary.matching_names(word, self.classes[1:])
 
     def contrast_words(self) -> list[str]:
         return self.classes[1:]
@@ -121,7 +125,7 @@ class LabelWords(TextEncoder):
 def load(options: Options, capture: Capture) -> LabelsEncoder:
     """The encoder. Raises CaptureError if there are no class images or no names for them."""
     if options.folder is None:
-        classes = _read_classes(Path(options.classes)) if options.classes else capture.classes
+        classes = read_names(Path(options.classes)) if options.classes else capture.classes
         if len(classes) < 2 or all(capture.labels(index) is None for index in range(min(len(capture), 10))):
             raise CaptureError(
                 f"{capture.path} brings no class images with names: give them with language.labels.folder and "
@@ -136,7 +140,7 @@ def load(options: Options, capture: Capture) -> LabelsEncoder:
             f"There is no classes.json or classes.txt in {folder}: add one, or give language.labels.classes, a file "
             "with the classes' names."
         )
-    return LabelsEncoder(_read_classes(named), _FolderImages(folder, len(capture)), options.stride)
+    return LabelsEncoder(read_names(named), _FolderImages(folder, len(capture)), options.stride)
 
 
 def load_text(state: dict[str, Any]) -> LabelWords:
@@ -148,21 +152,6 @@ def _sampled(size: int, stride: int, own_size: int) -> NDArray[np.int64]:
     """Pixels along an axis of a class image of ``own_size`` at the centres of blocks of ``stride`` of ``size``."""
     count = -(-size // stride)
     return np.minimum(((np.arange(count) + 0.5) * own_size / count).astype(np.int64), own_size - 1)
-
-
-def _read_classes(path: Path) -> tuple[str, ...]:
-    """Names in a JSON document {"classes": [...]} or a list, or one a line."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        names = json.loads(text) if path.suffix == ".json" else [line for line in text.splitlines() if line.strip()]
-        names = names["classes"] if isinstance(names, dict) else names
-    except OSError as error:
-        raise CaptureError(f"Cannot read the class names in {path}: {error.strerror}.") from error
-    except (ValueError, KeyError) as error:
-        raise CaptureError(f'{path} must hold {{"classes": ["nothing", "name of class 1", …]}}: {error}.') from error
-    if not isinstance(names, list) or not 2 <= len(names) <= 65536 or not all(isinstance(name, str) for name in names):
-        raise CaptureError(f"{path} must name at least 2 classes, the first of which means nothing.")
-    return tuple(name.strip() for name in names)
 
 
 class _FolderImages:

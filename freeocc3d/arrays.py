@@ -1,0 +1,50 @@
+"""Arrays in .npz files, read with care: nothing is unpickled, and sizes are checked before memory is taken."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from .errors import MapError
+
+_LARGEST_ARRAY = 8 << 30
+
+
+def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]]) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz file; each name in ``expected`` must be there with its kind of number and dimensions.
+
+    Sizes are read from the headers before anything is unpacked. Raises MapError.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            arrays = {
+                info.filename.removesuffix(".npy"): _read_array(archive, info, path) for info in archive.infolist()
+            }
+    except FileNotFoundError as error:
+        raise MapError(f"{path} is missing: copy the whole folder, or map again.") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        raise MapError(f"{path} is damaged: {error}.") from error
+    for name, (kind, dimensions) in expected.items():
+        if name not in arrays or arrays[name].dtype.kind != kind or arrays[name].ndim != dimensions:
+            raise MapError(f"{path} is damaged: it has no usable array '{name}'.")
+    return arrays
+
+
+def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> NDArray[Any]:
+    with archive.open(info) as stream:
+        version = npy.read_magic(stream)
+        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, _, dtype = read_header(stream)
+        size = math.prod(shape) * dtype.itemsize
+        if dtype.hasobject or size > info.file_size or size > _LARGEST_ARRAY:
+            raise MapError(f"{path} is damaged: its array {info.filename} states a size that its data do not have.")
+    with archive.open(info) as stream:
+        return np.asarray(npy.read_array(stream, allow_pickle=False))

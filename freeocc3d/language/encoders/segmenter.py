@@ -1,0 +1,321 @@
+"""Any segmentation network (ONNX) with a list of its classes; words match names, synonyms and kin.
+
+The feature of a pixel is its class posteriors p, so that what is fused over views is their mean: the length |p| is 1
+where the network is sure, and less where it is not. The cosine of a fused feature with a class is p_c / |p|. Measured
+with a network of 40 classes (bedroom, living; mIoU over the classes present): p 15.4, 12.9; p / |p| 15.3, 12.9; sqrt(p)
+15.3, 12.0; the most likely class alone 15.3, 12.7; p^(1/4) 12.9, 8.2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...capture.base import Capture
+from ...errors import ConfigError, FrameError
+from ...registry import nearest
+from ...types import Frame
+from .. import vocabulary
+from ..class_names import read_mapping, read_names
+from ..name_embeddings import NameEmbeddings
+from ..onnx_model import load_session
+from .base import Encoder
+from .labels import LabelWords
+
+REQUIRES: tuple[str, ...] = ("onnxruntime",)
+
+NEEDS_CAPTURE = False
+
+VOID = ("unlabeled", "unlabelled", "unannotated", "unknown", "undefined", "void", "nothing", "none", "ignore")
+"""Names of classes that mean nothing, where an option does not say which do."""
+
+_INPUTS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
+_FREE_SIZE_STEP = 32
+"""A network of any input size is given a multiple of this, which is what its strides multiply to."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """A network, what its classes are called, and how it wants its images."""
+
+    model: str = ""
+    """ONNX file. One input, an RGB image; one output, with logits or posteriors of each class or with class numbers."""
+    classes: str = ""
+    """File with the names of its classes in the order of its channels: JSON {"classes": [...]}, or one name a line."""
+    void: tuple[str, ...] | None = None
+    """Names of classes that mean nothing; null = those that are called so ("unlabeled", "void" and the like)."""
+    mapping: str | None = None
+    """YAML file that says what the classes become in another taxonomy: classes: [wall, ...], map: {name: class}."""
+    embeddings: str | None = None
+    """File (.npz) with text embeddings of many names, "names" and "embeddings", those of the classes among them: a name
+    whose embedding is nearer to a class's than names there commonly are to each other means the class."""
+    mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
+    """Mean of red, green and blue, in 0…1, that images are normalised by; an input of bytes is not normalised."""
+    std: tuple[float, float, float] = (0.229, 0.224, 0.225)
+    """Standard deviation of red, green and blue, in 0…1, that images are normalised by."""
+    channels: str = "rgb"
+    """Order of the input's channels: "rgb" or "bgr"."""
+    size: tuple[int, int] | None = None
+    """Width and height of the input; null = as the network says, or about the frame's where it takes any."""
+    output: str | None = None
+    """Name of the output with a channel for each class; null = the first that has one."""
+    stride: int = 4
+    """Pixels of the frame between features; logits are interpolated."""
+    device: str = "cpu"
+    """Where the network runs: "cpu", or "cuda:0" and so on with onnxruntime-gpu."""
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise ConfigError(f"'stride' must be at least 1, got {self.stride}.")
+        if self.size is not None and min(self.size) < 1:
+            raise ConfigError(f"'size' must be a width and a height of at least 1, got {self.size}.")
+        if self.channels not in ("rgb", "bgr"):
+            raise ConfigError(f"'channels' must be rgb or bgr, got {self.channels}.")
+        if min(self.std) <= 0:
+            raise ConfigError(f"'std' must be greater than 0, got {self.std}.")
+
+
+class SegmenterEncoder(Encoder):
+    """Class posteriors; void classes, and what is most likely one, say nothing."""
+
+    name: ClassVar[str] = "segmenter"
+
+    def __init__(self, network: Network, classes: tuple[str, ...], grouping: NDArray[np.float32], options: Options):
+        """grouping: (D, C) 1 where the network's class c counts as the d-th of ``classes``; a void column is zero."""
+        self.network = network
+        self.classes = classes
+        self.grouping = grouping
+        self.options = options
+        self.dimension = len(classes)
+        self.aliases: dict[str, int] = {}
+
+    def encode(self, frame: Frame) -> NDArray[np.float16]:
+        """(ceil(H / stride), ceil(W / stride), D) float16 posteriors, which sum to 1 less what is void.
+
+        Raises FrameError where the network gives numbers that are not finite, ConfigError where it gives a class that
+        has no name.
+        """
+        height, width = (-(-edge // self.options.stride) for edge in frame.color.shape[:2])
+        posteriors = self.network.posteriors(frame, height, width).reshape(height * width, -1)
+        known = posteriors @ self.grouping.T
+        void = (posteriors * ~self.grouping.any(axis=0)).max(axis=1)
+        known[known.max(axis=1) < void] = 0
+        return known.astype(np.float16).reshape(height, width, -1)
+
+    def text_state(self) -> dict[str, Any]:
+        return {"classes": list(self.classes), "aliases": self.aliases}
+
+
+class Network:
+    """A session with one image input and one output that is taken; what it wants and gives is asked of the file."""
+
+    def __init__(self, path: Path, n_classes: int, options: Options):
+        """Raises ConfigError for a file that cannot be used, in one sentence that says why."""
+        self.path, self.n_classes, self.options = path, n_classes, options
+        self.session = load_session(path, options.device)
+        self.input, self.last, self.size = self._input()
+        self.dtype = _INPUTS[self.input.type]
+        self.output = self._output()
+        # what shapes leave open is found out before there is work to lose
+        self._scores(np.zeros((64, 64, 3), np.uint8))
+
+    def posteriors(self, frame: Frame, height: int, width: int) -> NDArray[np.float32]:
+        """(height, width, C) float32 class posteriors that cover the frame's image evenly."""
+        import cv2
+
+        scores = self._scores(frame.color)
+        if not np.isfinite(scores).all():
+            raise FrameError(f"{self.path} gives numbers that are not finite for frame {frame.index}: it is left out.")
+        scores = cv2.resize(scores, (width, height), interpolation=cv2.INTER_LINEAR)
+        return scores if _are_posteriors(scores) else _softmax(scores)
+
+    def _scores(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """(h, w, C) what the network gives for an image."""
+        image = self._image(rgb)
+        try:
+            given = self.session.run([self.output.name], {self.input.name: image})[0]
+        except Exception as error:  # ONNX Runtime's are of many kinds, all of them directly below Exception
+            reason = " ".join(str(error).split())[:200]
+            raise ConfigError(f"{self.path} fails with an image of shape {_shape(image.shape)}: {reason}") from error
+        return self._by_class(np.asarray(given))
+
+    def _image(self, rgb: NDArray[np.uint8]) -> NDArray[np.generic]:
+        """The frame as the input wants it."""
+        import cv2
+
+        width, height = self.options.size or self.size or (_free_size(rgb.shape[1]), _free_size(rgb.shape[0]))
+        shrink = width <= rgb.shape[1] and height <= rgb.shape[0]
+        image = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
+        if self.dtype != np.uint8:
+            mean, std = (np.array(values, np.float32) for values in (self.options.mean, self.options.std))
+            image = (image.astype(np.float32) / 255 - mean) / std
+        if self.options.channels == "bgr":
+            image = image[..., ::-1]
+        return np.ascontiguousarray((image if self.last else image.transpose(2, 0, 1))[None].astype(self.dtype))
+
+    def _by_class(self, given: NDArray[Any]) -> NDArray[np.float32]:
+        """(h, w, C) logits or posteriors of an output; one-hot where it holds class numbers."""
+        if np.issubdtype(given.dtype, np.integer):
+            numbers = given.reshape(given.shape[-2:]) if given.size == np.prod(given.shape[-2:]) else given[0, ..., 0]
+            if numbers.min(initial=0) < 0 or numbers.max(initial=0) >= self.n_classes:
+                raise ConfigError(
+                    f"{self.path} gives class {numbers.max()}, but only {self.n_classes} classes have names: complete "
+                    "language.segmenter.classes."
+                )
+            return np.eye(self.n_classes, dtype=np.float32)[numbers]
+        axis = _class_axis(given.shape, self.n_classes, self.last)
+        if given.ndim != 4 or axis is None:
+            raise ConfigError(self._misfit([(self.output.name, given.shape)]))
+        return np.ascontiguousarray(np.moveaxis(given[0], axis - 1, -1), np.float32)
+
+    def _input(self) -> tuple[Any, bool, tuple[int, int] | None]:
+        """The input, whether its channels come last, and its width and height if it states them."""
+        inputs = self.session.get_inputs()
+        described = ", ".join(f"{entry.name} {_shape(entry.shape)} {entry.type}" for entry in inputs)
+        fitting = [entry for entry in inputs if len(entry.shape) == 4 and entry.type in _INPUTS]
+        last = [entry.shape[3] == 3 and entry.shape[1] != 3 for entry in fitting]
+        if len(inputs) != 1 or not fitting or not (last[0] or _may_be(fitting[0].shape[1], 3)):
+            raise ConfigError(
+                f"{self.path} does not take one RGB image, (1, 3, height, width) or (1, height, width, 3) floats or "
+                f"bytes: its input is {described or 'none'}."
+            )
+        entry = fitting[0]
+        if not _may_be(entry.shape[0], 1):
+            raise ConfigError(f"{self.path} takes {entry.shape[0]} images at once; export it for one.")
+        height, width = entry.shape[1:3] if last[0] else entry.shape[2:4]
+        stated = (width, height) if isinstance(width, int) and isinstance(height, int) else None
+        if stated and self.options.size and self.options.size != stated:
+            raise ConfigError(
+                f"'size' is {self.options.size[0]} x {self.options.size[1]}, but {self.path} takes images of {width} x "
+                f"{height} only: leave it null."
+            )
+        return entry, last[0], stated
+
+    def _output(self) -> Any:
+        """The output that is taken."""
+        outputs = {entry.name: entry for entry in self.session.get_outputs()}
+        if self.options.output is not None and self.options.output not in outputs:
+            raise ConfigError(
+                f"{self.path} has no output '{self.options.output}'{nearest(self.options.output, outputs)}; there are: "
+                f"{', '.join(outputs)}."
+            )
+        wanted = [outputs[self.options.output]] if self.options.output else list(outputs.values())
+        for entry in wanted:
+            if "int" in entry.type:
+                fits = len(entry.shape) in (3, 4)
+            else:
+                fits = len(entry.shape) == 4 and _class_axis(entry.shape, self.n_classes, self.last) is not None
+            if fits:
+                return entry
+        raise ConfigError(self._misfit([(entry.name, entry.shape) for entry in wanted]))
+
+    def _misfit(self, outputs: list[tuple[str, Any]]) -> str:
+        described = ", ".join(f"{name} {_shape(shape)}" for name, shape in outputs)
+        return (
+            f"{self.options.classes} names {self.n_classes} classes, but {self.path} has no output with as many "
+            f"channels: it has {described}."
+        )
+
+
+class SegmenterWords(LabelWords):
+    """Class names, their synonyms and wider words, and names that text embeddings say mean one."""
+
+    threshold = 0.6
+    """Below the 0.71 of a class that views are divided about with another."""
+
+    def __init__(self, classes: list[str], aliases: dict[str, int]):
+        super().__init__(["", *classes])
+        self.aliases = aliases
+
+    def matching(self, word: str) -> tuple[list[int], str]:
+        """Of the parts of a phrase, most specific first, the first that either knows."""
+        found, used = super().matching(word)
+        for part in vocabulary.parts_of(word):
+            if part == used:
+                break
+            if vocabulary.key_of(part) in self.aliases:
+                return [self.aliases[vocabulary.key_of(part)]], part
+        return found, used
+
+
+def load(options: Options, capture: Capture | None = None) -> SegmenterEncoder:
+    """The encoder; it needs nothing of the capture. Raises ConfigError for files that cannot be used."""
+    for name in ("model", "classes"):
+        if not getattr(options, name):
+            raise ConfigError(
+                f"The encoder 'segmenter' needs language.segmenter.{name}: a file. It has none of its own."
+            )
+    names = read_names(Path(options.classes))
+    network = Network(Path(options.model), len(names), options)
+    classes, grouping = read_mapping(Path(options.mapping), names) if options.mapping else (names, np.eye(len(names)))
+    grouping = grouping.astype(np.float32) * ~_void(names, options)
+    said = np.asarray(grouping.any(axis=1))
+    classes, grouping = tuple(name for name, kept in zip(classes, said.tolist(), strict=True) if kept), grouping[said]
+    if not classes:
+        raise ConfigError(f"All classes of {options.classes} are void: nothing is left to map.")
+    encoder = SegmenterEncoder(network, classes, grouping, options)
+    if options.embeddings is not None:
+        encoder.aliases = _aliases(NameEmbeddings.read(Path(options.embeddings)), classes)
+    return encoder
+
+
+def load_text(state: dict[str, Any]) -> SegmenterWords:
+    """The word side."""
+    aliases = {str(name): int(row) for name, row in state.get("aliases", {}).items()}
+    return SegmenterWords([str(name) for name in state["classes"]], aliases)
+
+
+def _void(names: tuple[str, ...], options: Options) -> NDArray[np.bool_]:
+    """(C,) which classes mean nothing."""
+    lower = [name.lower() for name in names]
+    if options.void is None:
+        return np.isin(lower, VOID)
+    void = [name.lower() for name in options.void]
+    if absent := [name for name in void if name not in lower]:
+        raise ConfigError(
+            f"{options.classes} names no class '{absent[0]}'{nearest(absent[0], lower)} that could be void."
+        )
+    return np.isin(lower, void)
+
+
+def _aliases(names: NameEmbeddings, classes: tuple[str, ...]) -> dict[str, int]:
+    """Names that mean a class by their embeddings, and that the vocabulary knows nothing of."""
+    known = {name: vocabulary.matching_names(name, list(classes))[1] for name in names.names}
+    whole = {vocabulary.key_of(name) for name, part in known.items() if part == vocabulary.normal(name)}
+    return {key: row for key, row in names.meaning(classes).items() if key not in whole}
+
+
+def _class_axis(shape: Any, n_classes: int, last: bool) -> int | None:
+    """Which axis of a (1, C, h, w) or (1, h, w, C) output is the classes', by its length; None where neither fits.
+    last: of the input, which decides where both do. Lengths that are not known before a run (names) fit."""
+    order = (3, 1) if last else (1, 3)
+    exact = [axis for axis in order if len(shape) == 4 and shape[axis] == n_classes]
+    open_ = [axis for axis in order if len(shape) == 4 and not isinstance(shape[axis], int)]
+    return next(iter([*exact, *open_]), None)
+
+
+def _may_be(edge: Any, length: int) -> bool:
+    """Whether an edge of a shape has a length, or is open."""
+    return edge == length or not isinstance(edge, int)
+
+
+def _are_posteriors(scores: NDArray[np.float32]) -> bool:
+    """Whether (h, w, C) scores sum to one everywhere: a network with a softmax of its own."""
+    return bool(scores.min() >= -1e-6 and np.abs(scores.sum(axis=-1) - 1).max() < 1e-2)
+
+
+def _softmax(logits: NDArray[np.float32]) -> NDArray[np.float32]:
+    odds = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    return np.asarray(odds / odds.sum(axis=-1, keepdims=True))
+
+
+def _free_size(edge: int) -> int:
+    return max(round(edge / _FREE_SIZE_STEP), 1) * _FREE_SIZE_STEP
+
+
+def _shape(shape: Any) -> str:
+    return f"({', '.join(str(edge) for edge in shape)})"

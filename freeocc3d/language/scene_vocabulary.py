@@ -1,0 +1,226 @@
+"""Names of what a scene holds, by a vision-language model: off unless an endpoint is given.
+
+Paper, supplement, "Open-vocabulary semantic cue generation": a VLM (Qwen3-VL there) names the object categories that it
+sees in each frame; aggregated over time, they are the scene's vocabulary. Here a budget of keyframes is asked, evenly
+spread; names are brought to normal form and counted. What an encoder of open vocabulary is asked for then has to match
+better than all these (``query``), and pictures by class use them. A model that does not answer, or not with names,
+costs names and a warning, never the map.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError
+from ..registry import require_positive
+from ..types import Frame
+from .vision_server import ServerError, VisionServer, address, one_line
+from .vocabulary import normal
+
+QUESTION = (
+    "Name every kind of object, furniture and surface that is clearly visible in this picture of a room, walls and "
+    "floor included. Answer with a JSON list of short singular English nouns and nothing else, for example "
+    '["wall", "floor", "office chair", "mug"].'
+)
+
+_MOST_NAMES = 100
+"""In one picture: a model that lists more is repeating itself."""
+_LONGEST_NAME = 40
+_MOST_WORDS = 4
+_MOSTLY = 0.8
+"""Share of the entries of a list without JSON that must be names: sentences have commas, too."""
+_SENTENCE = {"i", "it", "you", "we", "is", "are", "there", "can", "cannot", "not", "sorry", "and", "or", "see", "which"}
+"""Words that no name has."""
+_MOST_FAILURES = 3
+"""Questions in a row that are not answered before the others are not asked."""
+_WIDTH = 768  # of the pictures that are sent
+_JPEG_QUALITY = 85
+
+
+@dataclass(frozen=True)
+class Options:
+    """Names of what is in the scene, by a vision-language model; they are what a word competes with."""
+
+    endpoint: str | None = None
+    """Address of an OpenAI-compatible server, such as http://localhost:11434/v1 (Ollama); null = no model is asked. The
+    keyframes that are asked about are sent there."""
+    model: str = ""
+    """What the server calls the model."""
+    api_key_env: str | None = None
+    """Name of the environment variable that holds the server's key; null = it wants none."""
+    keyframes: int = 24
+    """At most so many keyframes are asked about, evenly spread."""
+    timeout: float = 60.0
+    """Seconds that one answer may take."""
+    retries: int = 2
+    """Times that a question is asked again after an answer that did not come."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "keyframes", "timeout")
+        if self.retries < 0:
+            raise ConfigError(f"'retries' must not be negative, got {self.retries}.")
+        if self.endpoint is not None:
+            address(self.endpoint)
+            if not self.model:
+                raise ConfigError("'vocabulary.endpoint' is given, so 'vocabulary.model' must say what to ask there.")
+
+
+class Namer:
+    """Asks for the names in keyframes, and keeps the answers in a file as they come, for a run that goes on later."""
+
+    def __init__(self, options: Options, server: VisionServer):
+        self.options = options
+        self.server = server
+
+    def names(
+        self, keyframes: Sequence[Frame], path: Path, advance: Callable[[int], None]
+    ) -> tuple[dict[str, Any], list[str]]:
+        """What a map keeps: the model, the frames that were answered, and the names with their counts and frames, the
+        most frequent first; and sentences about what did not work.
+
+        path: where answers are kept meanwhile.
+        """
+        answers = self._restored(path)
+        asked: list[int] = []
+        nothing: list[str] = []
+        failed, failures = "", 0
+        for keyframe in keyframes:
+            asked.append(keyframe.index)
+            if keyframe.index in answers or failures == _MOST_FAILURES:
+                continue
+            try:
+                said = self.server.ask(QUESTION, _jpeg(keyframe.color))
+            except ServerError as error:
+                failed, failures = str(error), _MOST_FAILURES if error.final else failures + 1
+                continue
+            failures = 0
+            answers[keyframe.index] = parse(said) or []
+            if not answers[keyframe.index]:
+                nothing.append(said)
+            self._keep(path, answers)
+            advance(len(asked))
+        answered = {frame: answers[frame] for frame in asked if frame in answers}
+        warnings = []
+        if failed:
+            lacking = len(asked) - len(answered)
+            warnings.append(f"The scene's vocabulary lacks {lacking} of {len(asked)} keyframes: {failed.rstrip('.')}.")
+        if nothing:
+            shown = one_line(nothing[0], 60) or "nothing"
+            warnings.append(
+                f"{len(nothing)} of {len(answered)} answers of {self.options.model} name nothing, the first: '{shown}'."
+            )
+        return aggregated(answered, self.options.model), warnings
+
+    def _marks(self) -> str:
+        """Of what answers depend on."""
+        asked = [self.options.endpoint, self.options.model, QUESTION]
+        return hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:16]
+
+    def _keep(self, path: Path, answers: dict[int, list[str]]) -> None:
+        temporary = path.with_name(path.name + ".tmp")
+        temporary.write_text(json.dumps({"of": self._marks(), "answers": answers}), encoding="utf-8")
+        temporary.replace(path)
+
+    def _restored(self, path: Path) -> dict[int, list[str]]:
+        """Answers of an interrupted run to the same questions; none where there are none that can be read."""
+        try:
+            kept = json.loads(path.read_text(encoding="utf-8"))
+            if kept["of"] != self._marks():
+                return {}
+            return {int(frame): [str(name) for name in names] for frame, names in kept["answers"].items()}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return {}
+
+
+def load(options: Options) -> Namer | None:
+    """What asks, None if no endpoint is given. Raises ConfigError if the key's environment variable is not set."""
+    if options.endpoint is None:
+        return None
+    key = os.environ.get(options.api_key_env, "").strip() if options.api_key_env else None
+    if options.api_key_env and not key:
+        raise ConfigError(
+            f"The environment variable {options.api_key_env}, which vocabulary.api_key_env names, is not set: it must "
+            "hold the server's key."
+        )
+    if key and not (key.isascii() and key.isprintable()):
+        raise ConfigError(f"The key in the environment variable {options.api_key_env} is none: it is not plain text.")
+    server = VisionServer(options.endpoint, options.model, key, options.timeout, options.retries)
+    return Namer(options, server)
+
+
+def aggregated(answers: dict[int, list[str]], model: str) -> dict[str, Any]:
+    """Names over frames, as a map keeps them: plain numbers and strings."""
+    frames: dict[str, list[int]] = {}
+    for frame, names in answers.items():
+        for name in dict.fromkeys(names):
+            frames.setdefault(name, []).append(frame)
+    order = sorted(frames, key=lambda name: (-len(frames[name]), name))
+    counted = {name: {"count": len(frames[name]), "keyframes": frames[name]} for name in order}
+    return {"model": model, "keyframes": list(answers), "names": counted}
+
+
+def parse(text: str) -> list[str] | None:
+    """The names in an answer in normal form, each once; None for an answer that is no list of names.
+
+    Taken are a JSON list, alone or with words around it, a JSON object that holds one, lines with bullets or numbers,
+    and names with commas between. What a model thinks aloud first (<think>) is passed over.
+    """
+    text = re.sub(r"<think>.*?(</think>|\Z)", " ", text, flags=re.DOTALL)
+    names = list(filter(None, map(_name, _json_list(text))))
+    for entries in (_lines(text), text.strip().rstrip(".").split(",")):
+        if not names:
+            found = list(filter(None, map(_name, entries)))
+            names = found if len(found) >= max(2, _MOSTLY * len(entries)) else []
+    distinct = list(dict.fromkeys(names))
+    return distinct if 0 < len(distinct) <= _MOST_NAMES else None
+
+
+def _json_list(text: str) -> list[Any]:
+    """The first JSON list of a text that is not empty."""
+    decoder = json.JSONDecoder()
+    for match in list(re.finditer(r"\[", text))[:20]:
+        try:
+            found, _ = decoder.raw_decode(text, match.start())
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(found, list) and found:
+            return found
+    return []
+
+
+def _lines(text: str) -> list[str]:
+    """What follows the bullets or numbers of a list."""
+    return re.findall(r"^\s*(?:[-*•]|\d{1,3}[.)])\s+(.+?)\s*$", text, flags=re.MULTILINE)
+
+
+def _name(entry: Any) -> str:
+    """A name in normal form, empty for what is none."""
+    if isinstance(entry, dict):
+        entry = next((entry[key] for key in ("name", "object", "label") if key in entry), None)
+    if not isinstance(entry, str) or len(entry) > 4 * _LONGEST_NAME:
+        return ""
+    name = normal(re.sub(r"\(.*?\)|[*_`\"]", " ", entry))
+    words = name.split()
+    long_enough = len(name) > 1 or not name.isascii()
+    fits = long_enough and len(name) <= _LONGEST_NAME and len(words) <= _MOST_WORDS and not _SENTENCE & set(words)
+    return name if fits and not any(c.isdigit() for c in name) else ""
+
+
+def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
+    """A picture as it is sent."""
+    import cv2
+
+    height, width = rgb.shape[:2]
+    if width > _WIDTH:
+        rgb = cv2.resize(rgb, (_WIDTH, max(round(height * _WIDTH / width), 1)), interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()

@@ -1,0 +1,157 @@
+#!/usr/bin/env python3
+"""Asks maps for things that are not there: how often something is returned all the same. Part of tools/benchmark.py.
+
+    python tools/absent_words.py [CAPTURE ...] [--json]
+
+A capture with class images is mapped with the encoder ``labels``, another with ``segmenter`` and the network beside the
+captures. The words are names of LVIS and Objects365 (``clip_text_names.npz``), evenly spread over those that name
+nothing in the scene: a name is absent unless it, a synonym, what it is a kind of by its last word, or a wider or
+narrower word is something that the scene holds. What a scene holds is what its ground truth holds; where that has no
+classes, what one sees in its images (``SEEN``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Figures = dict[str, Any]
+
+DATA = Path(os.environ.get("FREEOCC3D_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+MODELS = DATA.parent / "models"
+ABSENT = 200
+ASKED = 0.05
+
+SEEN = {
+    "7scenes-kitchen": (
+        "wall", "floor", "carpet", "door", "window", "table", "chair", "cabinet", "counter", "shelf", "sink", "tap",
+        "television", "monitor", "cup", "bowl", "box", "plastic box", "book", "magazine", "brochure", "newspaper",
+        "paper", "envelope", "postcard", "poster", "picture", "power outlet", "switch", "cable", "game controller",
+        "remote control", "trash can",
+    ),
+}  # fmt: skip
+"""What is in captures whose truth has no classes, by looking at their images."""
+
+SEGMENTER = {
+    "model": str(MODELS / "enet_nyu40.onnx"),
+    "classes": str(MODELS / "nyu40.txt"),
+    "embeddings": str(MODELS / "clip_text_names.npz"),
+    "mean": [0.496342, 0.466664, 0.440796],
+    "std": [0.277856, 0.28623, 0.291129],
+}
+
+
+def absent_names(names: list[str], present: list[str]) -> list[str]:
+    """The names that name nothing of what is present, in alphabetical order."""
+    from freeocc3d.language.vocabulary import matching_names
+
+    return sorted({name for name in names if not matching_names(name, present)[0]})
+
+
+def spread(names: list[str]) -> list[str]:
+    """ABSENT of the names, evenly spread."""
+    return [names[int((n + 0.5) * len(names) / ABSENT)] for n in range(ABSENT)] if len(names) > ABSENT else names
+
+
+def measure_words(capture: str) -> Figures:
+    """Shares of absent names, and of the present classes' names, that return a region."""
+    from freeocc3d.pipeline import reconstruct
+    from freeocc3d.progress import Progress
+
+    if not MODELS.is_dir():
+        raise SystemExit(f"there are no names to ask for: {MODELS} is missing")
+    names = [str(name) for name in np.load(MODELS / "clip_text_names.npz")["names"]]
+    present = scene_classes(Path(capture))
+    seen = list(present or SEEN.get(Path(capture).name, ()))
+    if not seen:
+        raise SystemExit(f"what {capture} shows is not known: name it in SEEN of tools/absent_words.py")
+    language = {"encoder": "labels"} if present else {"encoder": "segmenter", "segmenter": SEGMENTER}
+    tracking = {"backend": "known"} if present else {}
+    settings = {"language": language, "tracking": tracking, "fitting": {"passes": 0}}
+    with tempfile.TemporaryDirectory() as folder:
+        made = reconstruct(capture, Path(folder) / "map", settings, progress=Progress())
+        occupied = len(made.occupancy.colors)
+        absent = absent_names(names, seen)
+        asked = spread(absent)
+        answered = {result.word: result for result in made.query_words(absent) if result.matched}
+        classes = [name for name in made.vocabulary if name in seen]
+        found = [result.word for result in made.query_words(classes) if result.matched]
+    return {
+        "encoder": language["encoder"],
+        "absent": len(asked),
+        "absent_answered": sum(word in answered for word in asked) / len(asked),
+        "all_absent": len(absent),
+        "all_absent_answered": len(answered) / len(absent),
+        "answered": {
+            word: {
+                "understood": result.understood,
+                "voxels": sum(region.voxels for region in result.regions) / occupied,
+                "score": result.regions[0].score,
+            }
+            for word, result in answered.items()
+        },
+        "present": len(classes),
+        "present_found": len(found) / max(len(classes), 1),
+        "not_found": [name for name in classes if name not in found],
+    }
+
+
+def scene_classes(capture: Path) -> tuple[str, ...]:
+    """Names of the classes that a capture's ground truth holds; none where it knows geometry only."""
+    from freeocc3d.evaluation.ground_truth import load_ground_truth
+
+    path = capture / "ground_truth.npz"
+    if not path.is_file():
+        return ()
+    truth = load_ground_truth(path)
+    held = np.unique(truth.labels)
+    names = tuple(truth.classes[k] for k in held if 0 < k < len(truth.classes))
+    return names if len(truth.classes) > 2 else ()
+
+
+def words_lines(rows: list[Figures]) -> list[tuple[str, str, str]]:
+    """Rows of a table: what, measured, asked."""
+    lines = []
+    for row in rows:
+        where = f"{row['capture']}, `{row.get('encoder', '?')}`"
+        if "error" in row:
+            lines.append((where, f"not available, {row['error']}", ""))
+            continue
+        lines.append(
+            (f"{where}: {row['absent']} absent names that return a region", f"{row['absent_answered']:.1%}", "≤ 5 %")
+        )
+        lines.append(
+            (f"{where}: all {row['all_absent']} that return a region", f"{row['all_absent_answered']:.1%}", "")
+        )
+        missing = f" (not: {', '.join(row['not_found'])})" if row["not_found"] else ""
+        lines.append(
+            (f"{where}: {row['present']} present classes that are found", f"{row['present_found']:.0%}{missing}", "")
+        )
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", nargs="*", type=Path, help="folders of scans [default: those of the data folder]")
+    parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
+    given = parser.parse_args()
+    captures = given.captures or [DATA / name for name in ("7scenes-kitchen", "house/bedroom", "house/living")]
+    rows = [{"capture": path.name, **measure_words(str(path.resolve()))} for path in captures]
+    if given.json:
+        print(json.dumps(rows))
+        return
+    for line in words_lines(rows):
+        print(f"| {' | '.join(line)} |")
+    for row in rows:
+        for word, answer in row["answered"].items():
+            print(f"{row['capture']}: {word!r} as {answer['understood']!r}: {answer['voxels']:.2%} of the voxels")
+
+
+if __name__ == "__main__":
+    main()
