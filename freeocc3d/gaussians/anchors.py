@@ -87,7 +87,7 @@ class AnchoredCells:
 
     def add(self, posed: PosedFrame) -> None:
         """Take a keyframe, or a frame between keyframes: what it shows is anchored to the keyframe that it hangs on."""
-        self._sums.add_frame(posed, self.options.pixel_stride or self._stride(posed.frame), self.options.edge)
+        self._sums.add_frame(posed, self.stride(posed.frame), self.options.edge)
 
     def gaussians(self, frames: Iterable[PosedFrame]) -> Gaussians:
         """One Gaussian per cell with enough measurements. frames: those that were taken, again, to denoise the
@@ -124,8 +124,11 @@ class AnchoredCells:
         sums.add(moved[found.kept])
         return sums.cells()
 
-    def _stride(self, frame: Frame) -> int:
-        """As many pixels as leave 320 columns, or more where cells are small: about two to a cell's edge."""
+    def stride(self, frame: Frame) -> int:
+        """Every how many-th pixel of a frame is taken: the option, or as many as leave 320 columns, more where cells
+        are small: about two to a cell's edge."""
+        if self.options.pixel_stride is not None:
+            return self.options.pixel_stride
         measured = frame.depth_m[::4, ::4]
         measured = measured[measured > 0]
         usual = float(np.median(measured)) if len(measured) else 1.0
