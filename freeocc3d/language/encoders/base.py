@@ -1,4 +1,4 @@
-"""The contract of an encoder: images to dense unit features, words to unit features in the same space.
+"""The contract of an encoder: images to dense features, words to unit features in the same space.
 
 An encoder is one file of this folder with ``load(options, capture) -> Encoder`` for building a map, and
 ``load_text(state) -> TextEncoder`` for asking one; one that asks nothing of the capture says ``NEEDS_CAPTURE = False``.
@@ -66,8 +66,9 @@ class Encoder(ABC):
 
     @abstractmethod
     def encode(self, frame: Frame) -> NDArray[np.float16]:
-        """(h, w, D) float16 features that cover the frame's image evenly (h, w may be smaller than H, W); each is of
-        unit length, or zero where the encoder has nothing to say."""
+        """(h, w, D) float16 features that cover the frame's image evenly (h, w may be smaller than H, W). Of each the
+        direction is what the encoder says, and the length how sure of it the encoder is: 1 for one that does not say,
+        0 where it has nothing to say. It is the weight of that feature when views are fused."""
 
     @abstractmethod
     def text_state(self) -> dict[str, Any]:
