@@ -14,7 +14,7 @@ import json
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -160,12 +160,12 @@ class Map:
         """Where ``word`` is: regions with score, box, centroid and volume. ``options``: fields of ``query.Options``."""
         return self.query_words([word], **options)[0]
 
-    def query_words(self, words: list[str], **options: Any) -> list[QueryResult]:
-        """``query`` for several words."""
+    def query_words(self, words: list[str], contrast: Sequence[str] = (), **options: Any) -> list[QueryResult]:
+        """``query`` for several words. contrast: words for what else is there, besides the encoder's own."""
         from . import query
 
         checked = registry.build_options(query, options)
-        return query.query(self.occupancy, self.text_encoder, words, checked)
+        return query.query(self.occupancy, self.text_encoder, words, checked, contrast)
 
     @functools.cached_property
     def _feature_arrays(self) -> dict[str, NDArray[Any]]:
