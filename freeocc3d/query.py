@@ -139,7 +139,7 @@ def query(
             f"{text.features.shape[1]}: make the map again with this version."
         )
     expressed = others.features.any(axis=1)
-    competes = np.asarray((text.features @ others.features.T < text_encoder.same_word) & expressed)
+    competes: NDArray[np.bool_] = np.asarray((text.features @ others.features.T < text_encoder.same_word) & expressed)
     cosine = similarity(features, text)
     says = known(features)
     voxels = occupancy.occupied_voxels()
@@ -228,7 +228,7 @@ def _probability(
     others = contrast
     if way == "relevancy":
         canonical = text_encoder.encode_words(list(matching.CANONICAL))
-        expressed = canonical.features.any(axis=1)
+        expressed = np.asarray(canonical.features.any(axis=1))
         others = _some(canonical, expressed) if expressed.any() else contrast
     largest, odds = _beside(features, np.arange(len(scores)), scores, others, text_encoder.temperature)
     made = matching.softmax(odds) if way == "softmax" else matching.relevancy(largest, text_encoder.temperature)

@@ -152,6 +152,12 @@ def test_codes_keep_features_to_less_than_a_percent() -> None:
     assert (decoded * features[::2]).sum(axis=1).min() > 0.999
 
 
+def test_halves_are_widened_exactly() -> None:
+    finite = np.arange(1 << 16, dtype=np.uint16).view(np.float16)
+    finite = finite[np.isfinite(finite)][None, None]
+    np.testing.assert_array_equal(fusion._widened(finite.view(np.uint16)), finite.astype(np.float32))
+
+
 def test_agreement_is_numpys_leave_one_out_cosine() -> None:
     rng = np.random.default_rng(0)
     total, weights = rng.normal(size=(30, 16)).astype(np.float32), np.full(30, 2.0, np.float32)

@@ -70,10 +70,10 @@ class FeatureFusion:
         self.weights = np.zeros(n_gaussians, np.float32)
         self._views: list[_View] = []
 
-    def add(self, seen: Seen, features: NDArray[np.floating]) -> None:
+    def add(self, seen: Seen, features: NDArray[np.float16]) -> None:
         """Fuse the (h, w, D) features of a frame that shows ``seen``; their lengths are weights, zeros say nothing."""
         h, w, dimension = features.shape
-        cells = np.ascontiguousarray(features, np.float32)
+        cells = _widened(np.ascontiguousarray(features, np.float16).view(np.uint16))
         first, shared = _regions(cells, np.float32(_ALIKE), np.float32(_SAME))
         cells, own = cells.reshape(h * w, dimension), seen.cells((h, w))
         length = np.sqrt(np.einsum("cd,cd->c", cells, cells))
@@ -137,6 +137,21 @@ class FeatureFusion:
             rows, slots, weights = view.rows[moved], view.slots[moved], step[moved] * view.weights[moved]
             _add(rows, slots, weights, view.codes, view.scales, self.sum, self.weights)
         view.kept = kept
+
+
+@njit(parallel=True, cache=True)
+def _widened(halves: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """The float32 of finite float16 (h, w, D), given by their bits: NumPy takes four times as long."""
+    bits = np.empty(halves.shape, np.int32)
+    wide = bits.view(np.float32)
+    for row in prange(halves.shape[0]):
+        for column in range(halves.shape[1]):
+            for d in range(halves.shape[2]):  # exponents are smaller by 112 until they are scaled, which is exact
+                half = halves[row, column, d]
+                bits[row, column, d] = (np.int32(half & 0x7FFF) << 13) | (np.int32(half >> 15) << 31)
+            for d in range(halves.shape[2]):
+                wide[row, column, d] *= np.float32(2.0**112)
+    return wide
 
 
 @njit(cache=True)
