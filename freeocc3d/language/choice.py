@@ -1,13 +1,13 @@
 """Which keyframes an encoder is given, when it may not have all: sharp ones that together show the most surface.
 
-Greedily, the next keyframe is the one that adds most,
+Greedily, the next keyframe is the one that adds most to
 
-    gain(t) = sharpness_t sum_k min(w_t, (W_k - W'_k)+),
+    sum_k log(1 + c W_k),   gain(t) = sharpness_t sum_k log((1 + c (W_k + w_t)) / (1 + c W_k)),
 
-each in units of Gaussian k's best view: W'_k is the weight with which the keyframes chosen so far show it (see
-``visibility``), and W_k what is enough, ``_ENOUGH`` such views. Such a gain only falls as more is chosen, so that a
-keyframe whose old gain is below another's new one need not be looked at again (lazy greedy: M. Minoux, 1978); what is
-chosen is at least 1 - 1/e as good as the best choice of as many.
+W_k being the weight with which the keyframes chosen so far show Gaussian k (see ``visibility``), in units of its best
+view: what is not seen yet counts most, then what is seen badly or once. Such a gain only falls as more is chosen, so
+that a keyframe whose old gain is below another's new one need not be looked at again (lazy greedy: M. Minoux, 1978).
+Where all are equally sharp, what is chosen is at least 1 - 1/e as good as the best choice of as many.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 
 from .visibility import Seen
 
-_ENOUGH = 4.0
-"""Views as good as its best one, after which a Gaussian asks for no more."""
+_STEEP = 100.0
+"""c: a view a hundred times worse than the best one is worth a seventh of it, for what nothing else shows."""
+_LEAST_SHARP = 0.05
+"""Of a blurred keyframe's gain, for what only it shows."""
 _WIDTH = 320
 """Columns at which sharpness is measured, where the sensor's noise is averaged out."""
 
@@ -43,14 +45,13 @@ def choose(views: Sequence[Seen], sharp: Sequence[float], n_gaussians: int, most
     best = np.zeros(n_gaussians, np.float32)
     for view in views:
         best[view.rows] = np.maximum(best[view.rows], view.weights)
-    missing = np.float32(_ENOUGH) * best
-    scale = max(float(np.median(sharp)), 1e-9) if len(views) else 1.0
+    so_far = np.zeros(n_gaussians, np.float32)  # c W_k
+    own = [np.float32(_STEEP) * view.weights / best[view.rows] for view in views]
+    usual = max(float(np.median(sharp)), 1e-9) if len(views) else 1.0
+    factor = np.clip(np.asarray(sharp) / usual, _LEAST_SHARP, 1.0)
 
     def gain(row: int) -> float:
-        view = views[row]
-        # Weights of near and far surface differ by orders of magnitude: each Gaussian counts in its own unit.
-        shares = np.minimum(view.weights, missing[view.rows]) / best[view.rows]
-        return min(sharp[row] / scale, 1.0) * float(shares.sum())
+        return float(factor[row] * np.log1p(own[row] / (1 + so_far[views[row].rows])).sum())
 
     queue = [(-gain(row), row) for row in range(len(views))]
     heapq.heapify(queue)
@@ -62,5 +63,5 @@ def choose(views: Sequence[Seen], sharp: Sequence[float], n_gaussians: int, most
             heapq.heappush(queue, (-now, row))
         elif now > 0:
             chosen.append(row)
-            missing[views[row].rows] = np.maximum(missing[views[row].rows] - views[row].weights, 0)
+            so_far[views[row].rows] += own[row]
     return sorted(chosen)
