@@ -143,7 +143,7 @@ def refine_where_needed(
             yield PosedFrame(frame, T, row)
 
     def encode(gaussians: Gaussians) -> NDArray[np.float16]:
-        return features_again(scan_map, posed, gaussians, settings, progress)
+        return features_again(scan_map, scan_map.keyframes, trajectory.T_world_keyframe, gaussians, settings, progress)
 
     occupancy = adaptive(
         base, scan_map.gaussians, scan_map.gaussian_features, posed, trajectory.T_world_keyframe, encode, settings,

@@ -129,7 +129,8 @@ def query(
     words: Annotated[list[str], typer.Argument(metavar="WORD...", help="Words or quoted phrases.")],
     as_json: Json = False,
     top: Annotated[int | None, typer.Option("--top", metavar="K", help="At most K regions a word.")] = None,
-    threshold: Annotated[float | None, typer.Option("--threshold", help="Least similarity, 0…1.")] = None,
+    threshold: Annotated[float | None, typer.Option("--threshold", help="Least score, 0…1.")] = None,
+    scores: Annotated[str | None, typer.Option("--scores", help="cosine, softmax or relevancy.")] = None,
     ply: Annotated[Path | None, typer.Option("--ply", help="Write the map as PLY, matches coloured.")] = None,
     picture: Annotated[Path | None, typer.Option("--picture", help="Write a picture, matches coloured (PNG).")] = None,
     refine_to: Annotated[
@@ -154,6 +155,8 @@ def query(
         options["top_k"] = top
     if threshold is not None:
         options["threshold"] = threshold
+    if scores is not None:
+        options["scores"] = scores
     loaded = load_map(map_path)
     results = loaded.query_words(words, **options)
     with tempfile.TemporaryDirectory() as folder:  # for a map that nobody keeps

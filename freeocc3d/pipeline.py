@@ -179,19 +179,10 @@ class Mapper:
         self, gaussians: Gaussians, encoder: Encoder, progress: Progress | None = None
     ) -> NDArray[np.float16]:
         """Layer 3: (N, D) unit features of the Gaussians, fused over the keyframes that see them."""
-        progress = progress or Progress()
-        options = _options(lift, config.options(self.settings, "language"))
-        fusion = lift.FeatureFusion(len(gaussians), encoder.dimension, options)
         trajectory = self.trajectory()
+        options: lift.Options = _options(lift, config.options(self.settings, "language"))
         keyframes = self.mapped(trajectory)
-        progress.stage("language", len(keyframes))
-        for done, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True), 1):
-            try:
-                fusion.add(gaussians, frame, T, encoder.encode(frame))
-            except FrameError as error:  # a broken class image: the other keyframes see most of what it showed
-                progress.warn(str(error))
-            progress.advance(done)
-        return fusion.features()
+        return lift.lift(gaussians, keyframes, trajectory.T_world_keyframe, encoder, options, progress)
 
     def build_occupancy(
         self, gaussians: Gaussians, features: NDArray[np.float16], progress: Progress | None = None

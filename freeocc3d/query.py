@@ -1,13 +1,15 @@
 """Words to voxels to regions: what ``freeocc3d query`` and ``Map.query`` do. Imports little, to start fast.
 
 A voxel's score for a word is the paper's s(x, c) = f(x)^T t_c, the cosine of its feature and the word's, over the
-cosine that the word allows (see ``TextFeatures.attainable``). It matches when the score reaches the encoder's threshold
-and no contrast word (what the voxel could be instead) scores higher there: similarities alone do not tell "is" from
-"is a little like". Matching voxels that touch form a region.
+cosine that the word allows (see ``TextFeatures.attainable``), or that in relation to other words (``matching``). It
+matches when the score reaches the threshold and no contrast word (what the voxel could be instead) is nearer to it:
+similarities alone do not tell "is" from "is a little like". Voxels that hang together with these and fit nearly as well
+match, too. Matching voxels that touch form a region.
 """
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 
 from . import __version__
 from .errors import ConfigError, FreeOccError, MapError
+from .language import matching
 from .language.codec import Features, cosines, known
 from .lattice import AXIS_BITS, contains, packed_voxels
 from .registry import require_positive
@@ -28,7 +31,11 @@ if TYPE_CHECKING:
     from .language.encoders.base import TextEncoder, TextFeatures
 
 _LONGEST_WORD = 200
+_SCORES = ("cosine", "softmax", "relevancy")
+_EVEN = 0.5  # a probability
+_NOWHERE: NDArray[np.int64] = np.zeros(0, np.int64)
 _ROWS = 16384  # voxels worked on at once, so that float32 copies of all features never exist
+_MANY_ROWS = 1 << 18  # by compiled code, whose threads are worth starting for many only
 _DOUBT_M3 = 0.001
 """Volume of non-matching matter that is added to each region when it is scored: a speck of a voxel or two does not
 outrank a large object, and the size of the voxels has no part in it."""
@@ -38,8 +45,13 @@ outrank a large object, and the size of the voxels has no part in it."""
 class Options:
     """What counts as a match, and which regions are reported."""
 
+    scores: str = "cosine"
+    """What a score is: "cosine" (over the cosine that the word allows), "softmax" (the word's probability against the
+    contrast words) or "relevancy" (the least against each of some phrases that fit anything, as in LERF)."""
     threshold: float | None = None
-    """Least score of a matching voxel, 0…1; null = the encoder's own."""
+    """Least score of a matching voxel, 0…1; null = the encoder's own for cosines, 0.5 for probabilities."""
+    grow: float = 0.8
+    """A region goes on over voxels that touch it down to this share of the threshold; 1 = it does not."""
     top_k: int = 20
     """At most so many regions a word."""
     min_voxels: int = 2
@@ -49,6 +61,10 @@ class Options:
         require_positive(self, "top_k", "min_voxels")
         if self.threshold is not None and not -1 <= self.threshold <= 1:
             raise ConfigError(f"'threshold' must lie between 0 and 1, got {self.threshold:g}.")
+        if not 0 < self.grow <= 1:
+            raise ConfigError(f"'grow' must be greater than 0 and at most 1, got {self.grow:g}.")
+        if self.scores not in _SCORES:
+            raise ConfigError(f"'scores' must be one of {', '.join(_SCORES)}, got '{self.scores}'.")
 
 
 @dataclass(frozen=True)
@@ -102,11 +118,11 @@ def query(
     text_encoder: TextEncoder,
     words: list[str],
     options: Options | None = None,
-    scene_words: Sequence[str] = (),
+    contrast: Sequence[str] = (),
 ) -> list[QueryResult]:
     """Ask for several words; one that nothing matches gives no regions.
 
-    scene_words: what is known to be in the scene; to an encoder of open vocabulary they are contrast words, too.
+    contrast: words for what else is there, besides those that the encoder names itself.
     Raises FreeOccError for an empty or endless word, MapError if the map's features are not the encoder's.
     """
     options = options or Options()
@@ -116,27 +132,34 @@ def query(
         if len(word) > _LONGEST_WORD:
             raise FreeOccError(f"'{word[:30]}…' has {len(word)} characters; a query may have up to {_LONGEST_WORD}.")
     text = text_encoder.encode_words(words)
-    named = scene_words if text_encoder.open_vocabulary else ()
-    contrast = text_encoder.encode_words([*text_encoder.contrast_words(), *named])
-    if len(occupancy.features) and occupancy.features.shape[1] != text.features.shape[1]:
+    others = text_encoder.encode_words(list(dict.fromkeys((*text_encoder.contrast_words(), *contrast))))
+    features = occupancy.features
+    if len(features) and features.shape[1] != text.features.shape[1]:
         raise MapError(
-            f"The map's features have {occupancy.features.shape[1]} dimensions, its encoder's words "
+            f"The map's features have {features.shape[1]} dimensions, its encoder's words "
             f"{text.features.shape[1]}: make the map again with this version."
         )
-    competes = text.features @ contrast.features.T < text_encoder.same_word
-    competes &= contrast.features.any(axis=1)
-    scores = similarity(occupancy.features, text)
+    expressed = others.features.any(axis=1)
+    competes: NDArray[np.bool_] = np.asarray((text.features @ others.features.T < text_encoder.same_word) & expressed)
+    cosine = similarity(features, text)
+    says = known(features)
     voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
-    threshold = text_encoder.threshold if options.threshold is None else options.threshold
+    plain = options.scores == "cosine"
+    default = text_encoder.threshold if plain else _EVEN
+    threshold = default if options.threshold is None else options.threshold
     results = []
     for w, (word, understood) in enumerate(zip(words, text.understood, strict=True)):
-        rows = np.flatnonzero(scores[:, w] >= threshold) if understood else np.zeros(0, np.int64)
-        rows, confidence = _against_contrasts(
-            occupancy.features, rows, scores[rows, w], _some(contrast, competes[w]), text_encoder.temperature
-        )
-        regions = _regions(occupancy, voxels, edges, rows, scores[rows, w], confidence, options)
-        note = _note(word, understood, text_encoder, scores[:, w], threshold, bool(regions))
-        results.append(QueryResult(word, understood, note, regions, np.ascontiguousarray(scores[:, w])))
+        rivals = _some(others, competes[w])
+        scores = cosine[:, w]
+        if not plain and understood:
+            scores = _probability(features, scores, rivals, text_encoder, options.scores)
+        rows = np.flatnonzero(says & (scores >= min(options.grow * threshold, threshold))) if understood else _NOWHERE
+        rows, confidence = _against_contrasts(features, rows, cosine[rows, w], rivals, text_encoder.temperature)
+        kept = matching.grown(scores[rows] >= threshold, functools.partial(connected, voxels[rows], edges[rows]))
+        rows, confidence = rows[kept], confidence[kept]
+        regions = _regions(occupancy, voxels, edges, rows, scores[rows], confidence, options)
+        note = _note(word, understood, text_encoder, scores, threshold, bool(regions))
+        results.append(QueryResult(word, understood, note, regions, np.ascontiguousarray(scores)))
     return results
 
 
@@ -167,6 +190,23 @@ def _some(text: TextFeatures, words: NDArray[np.bool_]) -> TextFeatures:
     return type(text)(text.features[words], understood, attainable)
 
 
+def _beside(
+    features: Features,
+    rows: NDArray[np.int64],
+    scores: NDArray[np.float32],
+    others: TextFeatures,
+    temperature: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """``matching.beside`` of other words at some voxels, whose cosines for a word are given."""
+    largest, odds = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
+    step = _ROWS if len(rows) < matching.MANY else _MANY_ROWS
+    for start in range(0, len(rows), step):
+        chunk = slice(start, start + step)
+        against = similarity(features[rows[chunk]], others)
+        largest[chunk], odds[chunk] = matching.beside(scores[chunk], against, temperature)
+    return largest, odds
+
+
 def _against_contrasts(
     features: Features,
     rows: NDArray[np.int64],
@@ -174,18 +214,26 @@ def _against_contrasts(
     contrast: TextFeatures,
     temperature: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Of the voxels in ``rows``, whose scores for a word are given, those where no contrast word scores higher and
-    something is known; and their confidences."""
-    kept, confidences = [rows[:0]], [scores[:0]]
-    for start in range(0, len(rows), _ROWS):
-        chunk = rows[start : start + _ROWS]
-        feature = features[chunk]
-        margin = similarity(feature, contrast) - scores[start : start + _ROWS, None]
-        best = known(feature) & (margin.max(axis=1, initial=-1.0) <= 0)
-        odds = np.exp(margin[best] / np.float32(temperature)).sum(axis=1)
-        kept.append(chunk[best])
-        confidences.append(1.0 / (1.0 + odds))
-    return np.concatenate(kept), np.concatenate(confidences)
+    """Of the voxels in ``rows``, whose cosines for a word are given, those where no contrast word scores higher;
+    and their confidences."""
+    largest, odds = _beside(features, rows, scores, contrast, temperature)
+    best = largest <= 0
+    return rows[best], matching.softmax(odds[best])
+
+
+def _probability(
+    features: Features, scores: NDArray[np.float32], contrast: TextFeatures, text_encoder: TextEncoder, way: str
+) -> NDArray[np.float32]:
+    """(V,) softmax or relevancy of a word whose cosines are given; 0 where nothing is known. An encoder that cannot
+    express the phrases that fit anything is asked for its contrast words in their place."""
+    others = contrast
+    if way == "relevancy":
+        canonical = text_encoder.encode_words(list(matching.CANONICAL))
+        expressed = np.asarray(canonical.features.any(axis=1))
+        others = _some(canonical, expressed) if expressed.any() else contrast
+    largest, odds = _beside(features, np.arange(len(scores)), scores, others, text_encoder.temperature)
+    made = matching.softmax(odds) if way == "softmax" else matching.relevancy(largest, text_encoder.temperature)
+    return np.where(known(features), made, np.float32(0))
 
 
 def _regions(
@@ -246,11 +294,17 @@ def connected(voxels: NDArray[np.int32], edges: NDArray[np.int32] | None = None)
     n = len(voxels)
     if n == 0:
         return np.zeros(0, np.int32)
+    edges = np.ones(n, np.int32) if edges is None else edges
+    sizes = np.unique(edges)
+    if len(sizes) == 1 and matching.compiled(n):
+        from .occupancy import components
+
+        found = components.connected(voxels // sizes[0])
+        if found is not None:
+            return found
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    edges = np.ones(n, np.int32) if edges is None else edges
-    sizes = np.unique(edges)
     of_size = {size: np.flatnonzero(edges == size) for size in sizes}
     pairs = [of_size[size][_touching(voxels[of_size[size]] // size)] for size in sizes]
     for size in sizes:

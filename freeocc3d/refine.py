@@ -9,10 +9,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,7 +110,7 @@ def refine(
     gaussians = lifted(posed, box, voxel_size, settings, poses, progress)
     if not len(gaussians):
         raise MapError(f"No keyframe of {scan_map.path} shows a surface in the box: nothing can be refined there.")
-    features = features_again(scan_map, posed, gaussians, settings, progress)
+    features = features_again(scan_map, seeing, poses, gaussians, settings, progress)
     progress.stage("occupancy", len(seeing))
     occupancy = build.build_occupancy(
         gaussians,
@@ -153,8 +153,8 @@ def settings_of(scan_map: Map) -> Config:
     return settings
 
 
-class _Decoded:
-    """Some keyframes of a map, decoded anew each time that they are gone through."""
+class _Decoded(Sequence[Frame]):
+    """Some keyframes of a map, decoded anew each time that they are asked for."""
 
     def __init__(self, keyframes: Keyframes, rows: NDArray[np.int64]):
         self.keyframes, self.rows = keyframes, rows
@@ -162,8 +162,14 @@ class _Decoded:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def __iter__(self) -> Iterator[Frame]:
-        return (self.keyframes[int(row)] for row in self.rows)
+    @overload
+    def __getitem__(self, row: int) -> Frame: ...
+    @overload
+    def __getitem__(self, row: slice) -> list[Frame]: ...
+    def __getitem__(self, row: int | slice) -> Frame | list[Frame]:
+        if isinstance(row, slice):
+            return [self.keyframes[int(own)] for own in self.rows[row]]
+        return self.keyframes[int(self.rows[row])]
 
 
 def _seeing(
@@ -227,7 +233,8 @@ def lifted(
 
 def features_again(
     scan_map: Map,
-    posed: Callable[[], Iterator[PosedFrame]],
+    frames: Sequence[Frame],
+    T_world_cam: NDArray[np.float64],
     gaussians: Gaussians,
     settings: Config,
     progress: Progress,
@@ -245,11 +252,7 @@ def features_again(
         nearest = cKDTree(scan_map.gaussians.means).query(gaussians.means)[1]
         return scan_map.gaussian_features[nearest]
     options: lift.Options = registry.build_options(lift, config.options(settings, "language"))
-    fusion = lift.FeatureFusion(len(gaussians), encoder.dimension, options)
-    progress.stage("language")
-    for look in posed():
-        fusion.add(gaussians, look.frame, look.T_world_cam, encoder.encode(look.frame))
-    return fusion.features()
+    return lift.lift(gaussians, frames, T_world_cam, encoder, options, progress)
 
 
 def _capture(scan_map: Map, settings: Config) -> Capture:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -171,12 +171,13 @@ class Map:
         """Where ``word`` is: regions with score, box, centroid and volume. ``options``: fields of ``query.Options``."""
         return self.query_words([word], **options)[0]
 
-    def query_words(self, words: list[str], **options: Any) -> list[QueryResult]:
-        """``query`` for several words."""
+    def query_words(self, words: list[str], contrast: Sequence[str] = (), **options: Any) -> list[QueryResult]:
+        """``query`` for several words. contrast: words for what else is there, besides the encoder's own."""
         from . import query
 
         checked = registry.build_options(query, options)
-        return query.query(self.occupancy, self.text_encoder, words, checked, self.scene_words)
+        named = self.scene_words if self.text_encoder.open_vocabulary else []
+        return query.query(self.occupancy, self.text_encoder, words, checked, [*named, *contrast])
 
     @functools.cached_property
     def _feature_arrays(self) -> dict[str, NDArray[Any]]:

@@ -81,6 +81,24 @@ def test_components_are_those_of_flooding(seed: int) -> None:
     assert {frozenset(np.flatnonzero(component == c)) for c in np.unique(component)} == components_by_flooding(voxels)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_compiled_components_are_the_same(seed: int) -> None:
+    from freeocc3d.occupancy import components
+
+    rng = np.random.default_rng(seed)
+    voxels = np.unique(rng.integers(-12, 12, (2000, 3)) + (300_000, -5, 0), axis=0).astype(np.int32)
+    if seed % 2:
+        rng.shuffle(voxels)
+    component = components.connected(voxels)
+    assert component is not None
+    found = {frozenset(np.flatnonzero(component == c)) for c in np.unique(component)}
+    assert found == components_by_flooding(voxels)
+    assert component[np.unique(component, return_index=True)[1]].tolist() == list(range(len(found)))
+    apart = (voxels[:40] * 100).astype(np.int32)
+    assert components.connected(apart) is None
+    assert len(np.unique(connected(apart))) == 40
+
+
 def test_each_of_26_neighbours_connects_and_no_other_does() -> None:
     for step in product((-2, -1, 0, 1, 2), repeat=3):
         if any(step):
@@ -215,7 +233,9 @@ def test_features_of_another_encoder_are_refused() -> None:
         query(room, LabelWords(["nothing", "cup"]), ["cup"])
 
 
-@pytest.mark.parametrize("bad", [{"top_k": 0}, {"min_voxels": 0}, {"threshold": 1.5}])
+@pytest.mark.parametrize(
+    "bad", [{"top_k": 0}, {"min_voxels": 0}, {"threshold": 1.5}, {"grow": 0.0}, {"grow": 1.5}, {"scores": "best"}]
+)
 def test_options_out_of_range_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
         Options(**bad)
@@ -228,7 +248,7 @@ class CloseWords(TextEncoder):
     rows: ClassVar = {"cup": (1.0, 0.0, 2.0, 0, 0), "sofa": (0.0, 1.0, 2.0, 0, 0), "mug": (1.0, 0.05, 2.0, 0, 0)}
 
     def encode_words(self, words: list[str]) -> TextFeatures:
-        features = np.array([self.rows[word] for word in words], np.float32)
+        features = np.array([self.rows[word] for word in words], np.float32).reshape(-1, 5)
         return TextFeatures(features / np.linalg.norm(features, axis=1, keepdims=True), tuple(words))
 
     def contrast_words(self) -> list[str]:
@@ -243,6 +263,61 @@ def test_contrast_decides_where_all_similarities_are_high() -> None:
     assert region.box_min[0] == 0
     assert region.confidence > 0.99
     assert similarity(room.features, encoder.encode_words(["cup"])).min() > 0.7
+
+
+def test_contrast_words_of_the_scene_compete_like_the_encoders_own() -> None:
+    class NoContrasts(CloseWords):
+        def contrast_words(self) -> list[str]:
+            return []
+
+    encoder = NoContrasts()
+    cup, sofa = encoder.encode_words(["cup", "sofa"]).features
+    room = occupancy(box((0, 0, 0), (2, 2, 2), cup) | box((5, 0, 0), (7, 2, 2), sofa))
+    assert len(query(room, encoder, ["cup"])[0].regions) == 2
+    assert len(query(room, encoder, ["cup"], contrast=["sofa"])[0].regions) == 1
+
+
+@pytest.mark.parametrize("scores", ["softmax", "relevancy"])
+def test_probabilities_tell_apart_what_cosines_hardly_do(scores: str) -> None:
+    """Every cosine is 0.8 to 1; "lamp" is nearest to nothing that is there."""
+
+    class WithCanonical(CloseWords):
+        rows: ClassVar = CloseWords.rows | {
+            "lamp": (0.0, 0.0, 2.0, 1.0, 0),
+            **dict.fromkeys(("object", "things", "stuff", "texture"), (0.3, 0.3, 2.0, 0.3, 0)),
+        }
+
+    encoder = WithCanonical()
+    cup, sofa = encoder.encode_words(["cup", "sofa"]).features
+    room = occupancy(box((0, 0, 0), (2, 2, 2), cup) | box((5, 0, 0), (7, 2, 2), sofa))
+    asked, absent = query(room, encoder, ["cup", "lamp"], Options(scores=scores))
+    assert [region.box_min[0] for region in asked.regions] == [0]
+    assert not absent.matched
+    assert absent.scores.max() < 0.5 < 0.95 < asked.scores.max()
+
+
+def test_relevancy_without_phrases_that_fit_anything_is_against_the_contrast_words() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(CUP=1)) | {(9, 0, 0): feature()})
+    result = query(room, WORDS, ["cup"], Options(scores="relevancy"))[0]
+    assert result.matched
+    assert np.count_nonzero(result.scores) == 8
+
+
+def test_a_region_goes_on_over_what_fits_nearly_as_well_and_begins_nowhere_else() -> None:
+    faint = feature(CUP=0.45, **dict.fromkeys(("SOFA", "COFFEE", "DINING", "WALL"), 0.44))
+    assert 0.4 < faint[CUP] < 0.5
+    room = occupancy(
+        box((0, 0, 0), (2, 2, 2), feature(CUP=1)) | box((2, 0, 0), (4, 2, 2), faint) | box((9, 0, 0), (11, 2, 2), faint)
+    )
+    assert [r.voxels for r in query(room, WORDS, ["cup"])[0].regions] == [16]
+    assert [r.voxels for r in query(room, WORDS, ["cup"], Options(grow=1.0))[0].regions] == [8]
+
+
+@pytest.mark.parametrize("word", ["沙发", "диван", "كرسي", "🛋", "???", "\u200b\u0301"])
+def test_words_in_other_scripts_are_not_understood_in_a_sentence(word: str) -> None:
+    (result,) = query(occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1))), WORDS, [word])
+    assert not result.matched
+    assert "not understood" in result.note
 
 
 def test_results_do_not_depend_on_the_size_of_the_work_chunks(monkeypatch: pytest.MonkeyPatch) -> None:

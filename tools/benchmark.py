@@ -32,6 +32,7 @@ import absent_words
 import encoders
 import held_out
 import kernels
+import language
 import rendering
 import variants
 import voxels
@@ -58,7 +59,11 @@ PEERS = {
 
 UNFITTED = "rgbd_no_fitting"
 
-KERNELS = ("splat", "voxels", "query", "rasterizer", "encoders")
+KERNELS = ("splat", "voxels", "query", "rasterizer", "encoders", "lifting")
+CLASSES = "rgbd_true_poses_closed_set"
+LAYER_3 = {
+    "fusion": f"class images with regions flipped at random, fused in the map of {CLASSES}; absent names asked of it",
+}
 LAYER_1 = {
     "stress": "layer 1 on altered captures: what is reached, what is lost, and whether that is told",
     "glued": "layer 1 on two captures as if they were one, which must stay two submaps",
@@ -276,7 +281,7 @@ def occupancy(kind: str, capture: str, frames: int | None, poses: str | None, tr
 
 def kernel(name: str, asked_map: Path | None) -> Figures:
     """Speed of the projection, or of queries in a map. Raises PartFailed."""
-    if name in ("splat", "voxels", "rasterizer", "encoders"):
+    if name in ("splat", "voxels", "rasterizer", "encoders", "lifting"):
         return _inside(name)
     if asked_map is None or not (asked_map / "map.yaml").is_file():
         raise PartFailed(f"there is no map to ask: name the variant {OURS}, too")
@@ -289,6 +294,17 @@ def _stress() -> Any:
     import stress
 
     return stress
+
+
+# Layer 3
+
+
+def fusion(job: Job) -> Figures:
+    """What fusion makes of class images of which some are wrong. Raises PartFailed."""
+    path = job.folder / CLASSES
+    if not (path / "map.yaml").is_file():
+        raise PartFailed(f"there is no map with class images: name the variant {CLASSES}, too")
+    return _inside("fusion", map_path=str(path))
 
 
 # Processes
@@ -309,6 +325,8 @@ INSIDE = {
     "encoders": lambda: encoders.measure_encoders(),
     "words": lambda capture: absent_words.measure_words(capture),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
+    "lifting": lambda: language.measure_lifting(),
+    "fusion": lambda map_path: language.measure_fusion(Path(map_path)),
 }
 """What is measured in a process of its own."""
 
@@ -344,6 +362,7 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
     """All rows, and the kernels' figures."""
     known = variants.all_variants()
     rows: list[Figures] = []
+    layer_3: Figures = {}
     asked_map: Path | None = None
     _tried("nothing yet, everything is compiled first", lambda: _inside("warm_up", capture=str(captures[0].resolve())))
     for number, capture in enumerate(captures):
@@ -375,13 +394,18 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
                     own = sum(stages.get(stage, 0.0) for stage in names_of)
                     if own:
                         row[f"{what}_over_dense_slam"] = own / slam["seconds_without_decoding"]
+        if "fusion" in names:
+            layer_3[job.name] = _tried(f"{job.name}: fusion", lambda job=job: fusion(job))
         if asked_map is None and (job.folder / OURS).is_dir():
             asked_map = job.folder / OURS
     measured = {name: _tried(name, lambda name=name: kernel(name, asked_map)) for name in KERNELS if name in names}
     layer_1 = measure_layer_1([capture.resolve() for capture in captures], names)
     asked = [_absent_words(capture.resolve()) for capture in captures if "absent_words" in names]
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
-    return {"machine": machine, "frames": frames, "rows": rows, "kernels": measured, "layer_1": layer_1, "words": asked}
+    return {
+        "machine": machine, "frames": frames, "rows": rows, "kernels": measured, "layer_1": layer_1, "layer_3": layer_3,
+        "words": asked,
+    }  # fmt: skip
 
 
 def _absent_words(capture: Path) -> Figures:
@@ -477,6 +501,7 @@ def markdown(results: Figures) -> str:
         "query": kernels.query_lines,
         "rasterizer": rendering.rasterizer_lines,
         "encoders": encoders.encoders_lines,
+        "lifting": language.lifting_lines,
     }
     for name, write in writers.items():
         figures = results["kernels"].get(name)
@@ -490,6 +515,7 @@ def markdown(results: Figures) -> str:
             *lines,
             *_layer_1_lines(results.get("layer_1") or {}),
             *_word_lines(results.get("words") or []),
+            *language.fusion_lines(results.get("layer_3") or {}),
             *_pose_lines(results["rows"]),
             *_fit_lines(results["rows"]),
         ]
@@ -624,7 +650,7 @@ def arguments() -> argparse.Namespace:
     given = parser.parse_args()
     captures, names = SUITES[given.suite]
     given.captures = given.captures or [DATA / name for name in captures]
-    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *WORDS]
+    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *LAYER_3, *WORDS]
     given.variants = given.variants or list(names or known)
     if unknown := [name for name in given.variants if name not in known]:
         parser.error(f"unknown variants {', '.join(unknown)}: --list names all")
@@ -648,7 +674,7 @@ def main() -> None:
             print(f"{name:<38} {variant.title}" + (f": not available, {variant.lacking}" if variant.lacking else ""))
         for name, title in PEERS.items():
             print(f"{name:<38} {title}")
-        for name, title in {**LAYER_1, **WORDS}.items():
+        for name, title in (LAYER_1 | LAYER_3 | WORDS).items():
             print(f"{name:<38} {title}")
         print(f"{', '.join(KERNELS):<38} speed of the projection, of voxels, queries, rendering and encoders")
         return

@@ -50,3 +50,21 @@ def cosines(
                     dot += x[r] * text[w, r]
                 out[w, v] = dot * inverse
     return out.T
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def beside(
+    scores: NDArray[np.float32], others: NDArray[np.float32], inverse_temperature: np.float32
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """``matching.beside`` with (C, V) others."""
+    largest, odds = np.empty(len(scores), np.float32), np.empty(len(scores), np.float32)
+    for tile in prange((len(scores) + _TILE - 1) // _TILE):
+        start, end = tile * _TILE, min((tile + 1) * _TILE, len(scores))
+        for v in range(start, end):
+            largest[v], odds[v] = np.float32(-1), np.float32(0)
+        for word in range(len(others)):
+            for v in range(start, end):
+                margin = others[word, v] - scores[v]
+                largest[v] = max(largest[v], margin)
+                odds[v] += math.exp(margin * inverse_temperature)
+    return largest, odds

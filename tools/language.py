@@ -1,0 +1,273 @@
+"""Figures of layer 3: what is left of mistaken class images after fusion, absent names, and the speed of lifting."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from kernels import copy_bytes_per_second
+from voxels import MODELS
+
+Figures = dict[str, Any]
+Line = tuple[str, str, str]
+
+GAUSSIANS, DIMENSION = 100_000, 512
+GRIDS = ((30, 40), (120, 160))
+"""Cells of the features that are lifted: a ViT's patches, and features upsampled to a quarter of the image."""
+FLIPPED, SEEDS, CELL_PX = 0.2, (0, 1, 2), 48
+KINDS = ("superpixels", "components")
+"""Regions whose label is flipped: what a jittered grid of ``CELL_PX`` cuts each class into, or its connected parts."""
+ABSENT = 200
+
+
+def measure_lifting() -> Figures:
+    """Bytes a second of the fusion of 512-dimensional features: of every Gaussian in view its feature is read, and its
+    sum is read and written."""
+    import numpy as np
+
+    from freeocc3d.language.fusion import FeatureFusion
+    from freeocc3d.language.visibility import Seen
+
+    rng = np.random.default_rng(0)
+    rows = np.arange(GAUSSIANS, dtype=np.int32)
+    pixels = rng.permutation(480 * 640)[:GAUSSIANS].astype(np.int32)
+    seen = Seen(rows, pixels, np.ones(GAUSSIANS, np.float32), (480, 640))
+    moved = GAUSSIANS * DIMENSION * (2 + 4 + 4)
+    found: Figures = {"copy_bytes_per_second": copy_bytes_per_second()}
+    for grid in GRIDS:
+        features = rng.normal(size=(*grid, DIMENSION)).astype(np.float16)
+        fusion = FeatureFusion(GAUSSIANS, DIMENSION, 0.6)
+        times = []
+        for _ in range(6):
+            mark = time.perf_counter()
+            fusion.add(seen, features)
+            times.append(time.perf_counter() - mark)
+        found["{} x {}".format(*grid)] = moved / min(times)
+    return found
+
+
+def measure_fusion(map_path: Path) -> Figures:
+    """mIoU of a map of class images, as a share of that of the nearest true labels at the same voxels, and what is left
+    when a share of each keyframe's regions shows a class at random: ours, plain averages, the last keyframe's word."""
+    from freeocc3d.evaluation import evaluate
+    from freeocc3d.language.encoders.labels import LabelsEncoder
+    from freeocc3d.store import load_map
+
+    scan_map = load_map(map_path)
+    capture = evaluate.capture_of(scan_map)
+    scene = _Scene(scan_map, Path(str(scan_map.manifest["capture"]["path"])) / "ground_truth.npz")
+
+    def encoder(kind: str | None, seed: int) -> LabelsEncoder:
+        images = capture.labels if kind is None else Flipped(capture.labels, len(capture.classes), kind, seed)
+        return LabelsEncoder(tuple(capture.classes), images)
+
+    found: Figures = {"nearest_true_label": scene.ceiling, "clean": scene.fused(encoder(None, 0))}
+    for kind in KINDS:
+        found[kind] = [scene.fused(encoder(kind, seed)) for seed in SEEDS]
+    found["absent"] = absent_names(scan_map, [scene.truth.classes[k] for k in scene.present])
+    return found
+
+
+class Flipped:
+    """Class images of which a share of the regions is relabelled to another class at random."""
+
+    def __init__(self, images: Any, classes: int, kind: str, seed: int):
+        self.images, self.classes, self.kind, self.seed = images, classes, kind, seed
+
+    def __call__(self, index: int) -> Any:
+        import numpy as np
+
+        image, rng = self.images(index), np.random.default_rng((self.seed, index))
+        if image is None:
+            return None
+        region = _superpixels(image, rng) if self.kind == "superpixels" else _components(image)
+        own = np.zeros(int(region.max()) + 1, np.int64)
+        own[region.ravel()] = image.ravel()
+        other = rng.integers(1, self.classes - 1, len(own))
+        other += other >= np.maximum(own, 1)  # any class but its own
+        return np.where(rng.random(len(own)) < FLIPPED, other, own)[region].astype(np.uint8)
+
+
+def _superpixels(image: Any, rng: Any) -> Any:
+    """Numbers of the parts that Voronoi cells of a jittered grid cut the classes into."""
+    import numpy as np
+    from scipy.spatial import cKDTree
+
+    height, width = image.shape
+    grid = np.stack(np.mgrid[CELL_PX / 2 : height : CELL_PX, CELL_PX / 2 : width : CELL_PX], axis=-1).reshape(-1, 2)
+    seeds = grid + rng.uniform(-CELL_PX / 2, CELL_PX / 2, grid.shape)
+    cell = cKDTree(seeds).query(np.indices(image.shape).reshape(2, -1).T)[1]
+    return np.unique(cell * 256 + image.ravel(), return_inverse=True)[1].reshape(image.shape)
+
+
+def _components(image: Any) -> Any:
+    """Numbers of the connected parts of the classes."""
+    import cv2
+    import numpy as np
+
+    out, count = np.zeros(image.shape, np.int64), 0
+    for k in np.unique(image):
+        parts, part = cv2.connectedComponents((image == k).astype(np.uint8), connectivity=4)
+        out[part > 0] = part[part > 0] + count - 1
+        count += parts - 1
+    return out
+
+
+class _Scene:
+    """A map's Gaussians on its truth's lattice, scored with other features than its own."""
+
+    def __init__(self, scan_map: Any, truth_path: Path):
+        import numpy as np
+        from scipy.spatial import cKDTree
+
+        from freeocc3d import config, registry
+        from freeocc3d.evaluation import evaluate
+        from freeocc3d.evaluation.ground_truth import load_ground_truth
+        from freeocc3d.language import lift
+        from freeocc3d.occupancy import build, carve, splat
+        from freeocc3d.types import OCCUPIED, UNKNOWN
+
+        settings = config.load(scan_map.path / "config.yaml")
+        self.options = registry.build_options(lift, config.options(settings, "language"))
+        self.truth = load_ground_truth(truth_path)
+        self.classes = evaluate.common_classes([self.truth])
+        self.words = scan_map.text_encoder.encode_words(list(self.truth.classes[1:]))
+        self.gaussians, self.scan_map = scan_map.gaussians, scan_map
+        labels = self.truth.labels
+        self.present = np.unique(labels[(labels > 0) & (labels != UNKNOWN)])
+        made = build.build_occupancy(
+            self.gaussians,
+            np.zeros((len(self.gaussians), 0), np.float16),
+            self.keyframes(),
+            registry.build_options(splat, {**settings["occupancy"], "voxel_size": self.truth.voxel_size}),
+            registry.build_options(carve, settings["carving"]),
+            origin=self.truth.origin,
+        )
+        voxels = made.voxels(OCCUPIED)
+        self.inside = ((voxels >= 0) & (voxels < self.truth.shape)).all(axis=1)
+        self.at = tuple(voxels[self.inside].T)
+        self.bins = splat.bin_gaussians(self.gaussians, self.truth.origin, splat.Options(self.truth.voxel_size))
+        self.slots = _slots(made, self.bins)
+        true = np.argwhere((labels > 0) & (labels != UNKNOWN))
+        nearest = true[cKDTree(true).query(voxels[self.inside])[1]]
+        self.ceiling = self.miou(labels[tuple(nearest.T)])
+
+    def keyframes(self) -> Iterator[Any]:
+        from freeocc3d.types import PosedFrame
+
+        poses = self.scan_map.trajectory.T_world_keyframe
+        for row, (frame, T) in enumerate(zip(self.scan_map.keyframes, poses, strict=True)):
+            yield PosedFrame(frame, T, row)
+
+    def fused(self, encoder: Any) -> Figures:
+        """mIoU by way of fusing."""
+        import numpy as np
+
+        from freeocc3d.language.fusion import FeatureFusion
+        from freeocc3d.language.visibility import seen
+
+        count = len(self.gaussians)
+        ours = FeatureFusion(count, encoder.dimension, self.options.disagreement)
+        mean, last = FeatureFusion(count, encoder.dimension), np.zeros((count, encoder.dimension), np.float16)
+        for frame, T, _ in self.keyframes():
+            shown, features = seen(self.gaussians, frame, T, self.options), encoder.encode(frame)
+            ours.add(shown, features)
+            mean.add(shown, features)
+            own = features.reshape(-1, encoder.dimension)[shown.cells(features.shape[:2])]
+            says = own.any(axis=1)
+            last[shown.rows[says]] = own[says]
+        return {"ours": self.score(ours.features()), "mean": self.score(mean.features()), "last": self.score(last)}
+
+    def score(self, features: Any) -> float:
+        """mIoU over the classes present of the voxels' nearest words."""
+        import numpy as np
+
+        from freeocc3d import query
+        from freeocc3d.occupancy import build, splat
+        from freeocc3d.occupancy.grid import unpack
+
+        means = splat.posterior_mean(self.bins, unpack(self.bins.packed), self.slots, features)
+        nearest = query.nearest_word(build.normalized(means)[self.inside], self.words)
+        return self.miou((nearest + 1).astype(np.uint8))
+
+    def miou(self, labels: Any) -> float:
+        import numpy as np
+
+        from freeocc3d.evaluation.iou import Prediction, Scores, confusion
+
+        predicted, occupied = np.zeros(self.truth.shape, np.uint8), np.zeros(self.truth.shape, bool)
+        predicted[self.at], occupied[self.at] = labels, True
+        names = self.classes.classes
+        scores = Scores(
+            confusion(self.truth.labels, Prediction(occupied, predicted), self.truth.masks()["label"], len(names)),
+            names,
+        )
+        return scores.miou(scores.present)
+
+
+def _slots(occupancy: Any, bins: Any) -> Any:
+    """(B, 512) row of each occupied voxel in the bins' blocks."""
+    import numpy as np
+
+    from freeocc3d.occupancy.grid import pack
+    from freeocc3d.types import OCCUPIED
+
+    occupied = occupancy.state == OCCUPIED
+    slots = np.full(occupied.shape, -1, np.int32)
+    slots[occupied] = np.arange(np.count_nonzero(occupied))
+    return slots[np.searchsorted(pack(occupancy.keys), bins.packed)]
+
+
+def absent_names(scan_map: Any, present: list[str]) -> Figures:
+    """How many names of things that are not there return a region: of LVIS's and Objects365's names, those that are
+    neither a class of the scene nor a synonym of one."""
+    import numpy as np
+
+    from freeocc3d.language import vocabulary
+
+    path = MODELS / "clip_text_names.npz"
+    if not path.is_file():
+        return {}
+    there = {word for name in present for word in (vocabulary.normal(name), *vocabulary.synonyms(name))}
+    names = [name for name in np.load(path)["names"].tolist() if not vocabulary.synonyms(name) & there]
+    asked = [str(name) for name in np.random.default_rng(0).choice(names, ABSENT, replace=False)]
+    matched = [result.word for result in scan_map.query_words(asked) if result.matched]
+    return {"asked": len(asked), "matched": matched}
+
+
+def lifting_lines(figures: Figures) -> list[Line]:
+    """What was measured, and what is asked for."""
+    copy = figures["copy_bytes_per_second"]
+    return [
+        (
+            f"512-d features lifted, {name} cells",
+            f"{1e-9 * rate:.1f} GB/s: {rate / copy:.2f} of a copy's {1e-9 * copy:.1f}",
+            "1/3",
+        )
+        for name, rate in figures.items()
+        if name != "copy_bytes_per_second"
+    ]
+
+
+def fusion_lines(figures: Figures) -> list[str]:
+    """A table of mIoU, a row a capture and kind of flips."""
+    rows = []
+    for capture, found in figures.items():
+        if "error" in found:
+            rows.append([capture, f"not available, {found['error']}", "–", "–", "–", "–"])
+            continue
+        for kind in ("clean", *KINDS):
+            runs = found[kind] if isinstance(found[kind], list) else [found[kind]]
+            cells = [" / ".join(f"{100 * run[way]:.1f}" for run in runs) for way in ("ours", "mean", "last")]
+            rows.append([capture, kind, f"{100 * found['nearest_true_label']:.1f}", *cells])
+    if not rows:
+        return []
+    titles = ["capture", f"{100 * FLIPPED:.0f} % flipped", "nearest true label", "mIoU ours", "mean", "last keyframe"]
+    lines = ["", *(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *rows))]
+    for capture, found in figures.items():
+        if absent := found.get("absent"):
+            said = ", ".join(absent["matched"]) or "none"
+            lines.append(f"\n{capture}: of {absent['asked']} absent names {len(absent['matched'])} match: {said}")
+    return lines
