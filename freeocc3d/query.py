@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 _LONGEST_WORD = 200
 _SCORES = ("cosine", "softmax", "relevancy")
 _EVEN = 0.5  # a probability
-_NOWHERE: NDArray[np.int64] = np.zeros(0, np.int64)
 _ROWS = 16384  # voxels worked on at once, so that float32 copies of all features never exist
 _MANY_ROWS = 1 << 18  # by compiled code, whose threads are worth starting for many only
 _DOUBT_M3 = 0.001
@@ -147,19 +146,27 @@ def query(
     plain = options.scores == "cosine"
     default = text_encoder.threshold if plain else _EVEN
     threshold = default if options.threshold is None else options.threshold
+    every_score = cosine
+    if not plain:
+        every_score = np.stack(
+            [
+                _probability(features, cosine[:, w], _some(others, competes[w]), text_encoder, options.scores)
+                for w in range(len(words))
+            ],
+            axis=1,
+        )
+    understood = np.array([bool(part) for part in text.understood])
+    candidates = says[:, None] & (every_score >= min(options.grow * threshold, threshold)) & understood
+    best = _not_beaten(features, cosine, candidates, others, competes, text_encoder.temperature)
     results = []
-    for w, (word, understood) in enumerate(zip(words, text.understood, strict=True)):
-        rivals = _some(others, competes[w])
-        scores = cosine[:, w]
-        if not plain and understood:
-            scores = _probability(features, scores, rivals, text_encoder, options.scores)
-        rows = np.flatnonzero(says & (scores >= min(options.grow * threshold, threshold))) if understood else _NOWHERE
-        rows, confidence = _against_contrasts(features, rows, cosine[rows, w], rivals, text_encoder.temperature)
+    for w, (word, part) in enumerate(zip(words, text.understood, strict=True)):
+        scores = every_score[:, w]
+        rows, confidence = best[w]
         kept = matching.grown(scores[rows] >= threshold, functools.partial(connected, voxels[rows], edges[rows]))
         rows, confidence = rows[kept], confidence[kept]
         regions = _regions(occupancy, voxels, edges, rows, scores[rows], confidence, options)
-        note = _note(word, understood, text_encoder, scores, threshold, bool(regions))
-        results.append(QueryResult(word, understood, note, regions, np.ascontiguousarray(scores)))
+        note = _note(word, part, text_encoder, scores, threshold, bool(regions))
+        results.append(QueryResult(word, part, note, regions, np.ascontiguousarray(scores)))
     return results
 
 
@@ -190,35 +197,44 @@ def _some(text: TextFeatures, words: NDArray[np.bool_]) -> TextFeatures:
     return type(text)(text.features[words], understood, attainable)
 
 
-def _beside(
+def _not_beaten(
     features: Features,
-    rows: NDArray[np.int64],
-    scores: NDArray[np.float32],
+    cosine: NDArray[np.float32],
+    candidates: NDArray[np.bool_],
     others: TextFeatures,
+    competes: NDArray[np.bool_],
     temperature: float,
+) -> list[tuple[NDArray[np.int64], NDArray[np.float32]]]:
+    """For each of W words, whose cosines (V, W) are given, the rows of its candidates (V, W) at which none of the C
+    other words that compete with it, (W, C), scores higher, and its confidences there."""
+    asked = np.flatnonzero(candidates.any(axis=1))
+    found: list[list[tuple[NDArray[np.int64], NDArray[np.float32]]]] = [[] for _ in competes]
+    step = _ROWS if len(asked) < matching.MANY else _MANY_ROWS
+    for start in range(0, len(asked), step):
+        rows = asked[start : start + step]
+        against = similarity(features[rows], others)
+        confidence = matching.confidences(cosine[rows], against, candidates[rows], competes, temperature)
+        for w, own in enumerate(found):
+            best = np.flatnonzero(confidence[:, w])
+            own.append((rows[best], confidence[best, w]))
+    nothing = (np.zeros(0, np.int64), np.zeros(0, np.float32))
+    return [
+        (np.concatenate([rows for rows, _ in (nothing, *own)]), np.concatenate([part for _, part in (nothing, *own)]))
+        for own in found
+    ]
+
+
+def _beside(
+    features: Features, scores: NDArray[np.float32], others: TextFeatures, temperature: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """``matching.beside`` of other words at some voxels, whose cosines for a word are given."""
-    largest, odds = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
-    step = _ROWS if len(rows) < matching.MANY else _MANY_ROWS
-    for start in range(0, len(rows), step):
+    """``matching.beside`` of other words at all voxels, whose cosines for a word are given."""
+    largest, odds = np.empty(len(scores), np.float32), np.empty(len(scores), np.float32)
+    step = _ROWS if len(scores) < matching.MANY else _MANY_ROWS
+    for start in range(0, len(scores), step):
         chunk = slice(start, start + step)
-        against = similarity(features[rows[chunk]], others)
+        against = similarity(features[chunk], others)
         largest[chunk], odds[chunk] = matching.beside(scores[chunk], against, temperature)
     return largest, odds
-
-
-def _against_contrasts(
-    features: Features,
-    rows: NDArray[np.int64],
-    scores: NDArray[np.float32],
-    contrast: TextFeatures,
-    temperature: float,
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Of the voxels in ``rows``, whose cosines for a word are given, those where no contrast word scores higher;
-    and their confidences."""
-    largest, odds = _beside(features, rows, scores, contrast, temperature)
-    best = largest <= 0
-    return rows[best], matching.softmax(odds[best])
 
 
 def _probability(
@@ -231,7 +247,7 @@ def _probability(
         canonical = text_encoder.encode_words(list(matching.CANONICAL))
         expressed = np.asarray(canonical.features.any(axis=1))
         others = _some(canonical, expressed) if expressed.any() else contrast
-    largest, odds = _beside(features, np.arange(len(scores)), scores, others, text_encoder.temperature)
+    largest, odds = _beside(features, scores, others, text_encoder.temperature)
     made = matching.softmax(odds) if way == "softmax" else matching.relevancy(largest, text_encoder.temperature)
     return np.where(known(features), made, np.float32(0))
 

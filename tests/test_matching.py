@@ -34,6 +34,20 @@ def test_compiled_code_agrees(words: int, monkeypatch: pytest.MonkeyPatch) -> No
         np.testing.assert_allclose(a, b, rtol=1e-3)
 
 
+@pytest.mark.parametrize("words", [0, 1, 7])
+def test_confidences_are_softmax_where_nothing_scores_higher(words: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(2)
+    scores, others = rng.random((1000, 3)).astype(np.float32), (0.9 * rng.random((1000, words))).astype(np.float32)
+    candidates, competes = rng.random((1000, 3)) < 0.8, rng.random((3, words)) < 0.7
+    found = scoring.confidences(scores, np.asfortranarray(others), candidates, competes, np.float32(10))
+    monkeypatch.setattr(matching, "compiled", lambda count: False)
+    np.testing.assert_allclose(found, matching.confidences(scores, others, candidates, competes, 0.1), rtol=1e-3)
+    for w in range(3):
+        largest, odds = matching.beside(scores[:, w], others[:, competes[w]], 0.1)
+        expected = np.where(candidates[:, w] & (largest <= 0), matching.softmax(odds), 0)
+        np.testing.assert_allclose(found[:, w], expected, rtol=1e-3)
+
+
 def test_only_what_hangs_together_with_a_seed_grows() -> None:
     voxels = np.array([(0, 0, 0), (1, 1, 1), (2, 2, 2), (9, 0, 0), (9, 0, 1)], np.int32)
     seeds = np.array([False, False, True, False, False])

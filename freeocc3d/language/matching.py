@@ -41,6 +41,31 @@ def beside(
     return margin.max(axis=1, initial=-1.0), np.exp(margin / np.float32(temperature)).sum(axis=1)
 
 
+def confidences(
+    scores: NDArray[np.float32],
+    others: NDArray[np.float32],
+    candidates: NDArray[np.bool_],
+    competes: NDArray[np.bool_],
+    temperature: float,
+) -> NDArray[np.float32]:
+    """(V, W) softmax of W words against those of C others that compete with each, (W, C), where a word is a candidate
+    and none of these scores higher; 0 elsewhere.
+
+    scores: (V, W) of the words, others: (V, C) of the others.
+    """
+    if compiled(len(scores)):
+        from . import scoring
+
+        return np.asarray(scoring.confidences(scores, others, candidates, competes, np.float32(1 / temperature)))
+    out = np.zeros(scores.shape, np.float32)
+    for w, rivals in enumerate(competes):
+        rows = np.flatnonzero(candidates[:, w])
+        margin = others[rows][:, rivals] - scores[rows, w, None]
+        best = margin.max(axis=1, initial=-1.0) <= 0
+        out[rows[best], w] = softmax(np.exp(margin[best] / np.float32(temperature)).sum(axis=1))
+    return out
+
+
 def softmax(odds: NDArray[np.float32]) -> NDArray[np.float32]:
     """(V,) probability of the word against all others together."""
     return np.asarray(1 / (1 + odds), np.float32)

@@ -44,11 +44,25 @@ def cosines(
                 squared += x[r] * x[r]
             known = codes[v, 0] > 0 and squared > 0
             inverse = np.float32(1 / math.sqrt(squared)) if known else np.float32(0)
-            for w in range(len(text)):
-                dot = np.float32(0)
+            fours_of_words = len(text) - len(text) % 4
+            for w in range(0, fours_of_words, 4):  # x is read once for four words
+                a, b, c, d = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
                 for r in range(len(x)):
-                    dot += x[r] * text[w, r]
-                out[w, v] = dot * inverse
+                    a += x[r] * text[w, r]
+                    b += x[r] * text[w + 1, r]
+                    c += x[r] * text[w + 2, r]
+                    d += x[r] * text[w + 3, r]
+                out[w, v], out[w + 1, v], out[w + 2, v], out[w + 3, v] = (
+                    a * inverse,
+                    b * inverse,
+                    c * inverse,
+                    d * inverse,
+                )
+            for w in range(fours_of_words, len(text)):
+                a = np.float32(0)
+                for r in range(len(x)):
+                    a += x[r] * text[w, r]
+                out[w, v] = a * inverse
     return out.T
 
 
@@ -68,3 +82,36 @@ def beside(
                 largest[v] = max(largest[v], margin)
                 odds[v] += math.exp(margin * inverse_temperature)
     return largest, odds
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def confidences(
+    scores: NDArray[np.float32],
+    others: NDArray[np.float32],
+    candidates: NDArray[np.bool_],
+    competes: NDArray[np.bool_],
+    inverse_temperature: np.float32,
+) -> NDArray[np.float32]:
+    """``matching.confidences``. The other word that fits a voxel best is asked first: it beats most words."""
+    words, rivals = competes.shape
+    out = np.zeros((len(scores), words), np.float32)
+    for tile in prange((len(scores) + _TILE - 1) // _TILE):
+        own = np.empty(rivals, np.float32)
+        for v in range(tile * _TILE, min((tile + 1) * _TILE, len(scores))):
+            top = 0
+            for c in range(rivals):
+                own[c] = others[v, c]
+                if own[c] > own[top]:
+                    top = c
+            for w in range(words):
+                score = scores[v, w]
+                if not candidates[v, w] or (rivals > 0 and competes[w, top] and own[top] > score):
+                    continue
+                odds, beaten = np.float32(0), False
+                for c in range(rivals):
+                    if competes[w, c]:
+                        beaten |= own[c] > score
+                        odds += math.exp((own[c] - score) * inverse_temperature)
+                if not beaten:
+                    out[v, w] = 1 / (1 + odds)
+    return out
