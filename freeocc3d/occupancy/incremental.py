@@ -96,7 +96,7 @@ def _merged(old: Occupancy | None, new: Occupancy) -> Occupancy:
     order = np.argsort(packed)
     arrays = {
         name: np.concatenate([getattr(part, name) for part in parts])[order]
-        for name in ("probability", "free", "hits", "state")
+        for name in ("probability", "free", "hits", "state", "levels")
     }
     count = np.concatenate([np.count_nonzero(part.state == OCCUPIED, axis=1) for part in parts])
     first = np.cumsum(count) - count
