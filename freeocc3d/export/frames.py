@@ -98,6 +98,11 @@ def placed(scan_map: Map, frame: str, origin: ArrayLike | None = None, one_size:
     return Placed(new, _nearest(plain, one)[rows] if occupancy.deepest else rows, frame, T)
 
 
+def floor_z(scan_map: Map, T_frame_map: NDArray[np.float64]) -> float:
+    """Height of the floor in a frame whose z points up, metres."""
+    return float((T_frame_map @ invert(scan_map.T_gravity_map))[2, 3])
+
+
 def write_description(path: Path, described: dict[str, Any]) -> None:
     """Write ``PATH.json`` beside an export whose format has no room for its frame. Raises OSError."""
     text = json.dumps({"file": path.name, "unit": "metre", **described}, indent=1)
