@@ -30,10 +30,10 @@ def room(seed=0, table=1500, floor=3000, noise=0.004):
 
 
 def cameras(n=30):
-    """A walk at 1.5 m that looks around and down by 20 degrees; OpenCV axes."""
+    """A walk at 1.5 m that looks around and down by 37 degrees; OpenCV axes."""
     out = []
     for turn in np.linspace(0.3, 2 * np.pi, n):
-        forward = np.array((np.cos(turn) * 0.94, np.sin(turn) * 0.94, -0.34))
+        forward = np.array((0.8 * np.cos(turn), 0.8 * np.sin(turn), -0.6))
         right = np.array((np.sin(turn), -np.cos(turn), 0.0))
         T = np.eye(4)
         T[:3, :3] = np.stack((right, np.cross(forward, right), forward), axis=1)
@@ -77,7 +77,7 @@ def test_the_first_camera_is_the_origin_and_looks_along_x() -> None:
     assert is_rigid(T)
     np.testing.assert_allclose(transform(T, poses[0][:3, 3]), 0, atol=1e-9)
     looks = T[:3, :3] @ poses[0][:3, 2]
-    assert looks[0] > 0.9
+    assert looks[0] > 0.79
     assert abs(looks[1]) < 1e-9
     np.testing.assert_allclose((T @ invert(T_gravity_map))[2, :3], (0, 0, 1), atol=1e-9)  # z stays up
 

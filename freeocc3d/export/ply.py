@@ -83,20 +83,21 @@ def _write(
 ) -> None:
     if form == "points":
         points = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges()).astype(np.float32)
-        _write_ply(path, points, colors, None, described)
+        write_ply(path, points, colors, None, described)
     else:
         vertices, quads, rows = exposed_faces(occupancy)
-        _write_ply(path, vertices, np.repeat(colors[rows], 4, axis=0), quads, described)
+        write_ply(path, vertices, np.repeat(colors[rows], 4, axis=0), quads, described)
 
 
-def _write_ply(
+def write_ply(
     path: Path,
     points: NDArray[np.float32],
     colors: NDArray[np.uint8],
-    quads: NDArray[np.int32] | None,
-    described: dict[str, Any] | None,
+    quads: NDArray[np.int32] | None = None,
+    described: dict[str, Any] | None = None,
 ) -> None:
-    """Binary little-endian PLY with coloured vertices and, if given, quads; what describes it in comments."""
+    """Binary little-endian PLY with coloured vertices and, if given, quads; what describes it in comments. Raises
+    OSError."""
     vertex = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     vertex["xyz"], vertex["rgb"] = points, colors
     comments = ["freeocc3d, metres", *(f"{name} {json.dumps(value)}" for name, value in (described or {}).items())]
