@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scenes import occupancy_of
 from test_export_frames import map_of
+from test_vdb import read
 
 from freeocc3d.errors import ConfigError, ExportError
 from freeocc3d.export import esdf, export_map
@@ -58,6 +59,22 @@ def test_in_another_frame_the_arrays_say_where_they_are(tmp_path) -> None:
     np.testing.assert_allclose(sorted(found.tolist()), sorted(expected.tolist()), atol=1e-6)
 
 
+def test_openvdb_holds_the_distances_of_known_voxels(tmp_path) -> None:
+    scan_map = map_of(scene())
+    export_map(scan_map, "esdf", tmp_path / "esdf.npz")
+    export_map(scan_map, "esdf", tmp_path / "esdf.vdb")
+    with np.load(tmp_path / "esdf.npz") as file:
+        distance, state, origin, size = (file[name] for name in ("distance", "state", "origin", "voxel_size"))
+    at = np.argwhere(np.ones(state.shape, bool))
+    shift = np.rint((origin - (0, 0, -0.05)) / size).astype(int)
+    told = read(tmp_path / "esdf.vdb", at + shift, tmp_path)
+    found, active = map(np.array, zip(*told["values"], strict=True))
+    np.testing.assert_array_equal(active, (state != 255).ravel())
+    np.testing.assert_array_equal(found, np.where(state != 255, distance, 0).ravel())
+    np.testing.assert_allclose(told["world"][0], (0.05, 0.05, 0.0), atol=1e-12)
+    assert told["metadata"]["frame"] == '"gravity"'
+
+
 def test_what_has_no_distances_is_told(tmp_path) -> None:
     with pytest.raises(ExportError, match="no obstacle"):
         export_map(map_of(occupancy_of([], free=[(0, 0, 0)])), "esdf", tmp_path / "a.npz", {"frame": "map"})
@@ -65,6 +82,8 @@ def test_what_has_no_distances_is_told(tmp_path) -> None:
         esdf.states(occupancy_of([(0, 0, 0), (100_000, 100_000, 9)]))
     with pytest.raises(ConfigError, match="free, obstacle or nan"):
         export_map(map_of(scene()), "esdf", tmp_path / "a.npz", {"unknown": "lava"})
+    with pytest.raises(ConfigError, match=r"\.npz or \.vdb"):
+        export_map(map_of(scene()), "esdf", tmp_path / "a.esdf")
     assert not list(tmp_path.iterdir())
     nothing_else = occupancy_of([(0, 0, 0), (1, 0, 0)])
     assert (esdf.signed_distances(nothing_else, "free")[0] < 0).all()

@@ -1,13 +1,16 @@
-"""Euclidean signed distances to the nearest obstacle, as trajectory optimisers take them: NumPy arrays.
+"""Euclidean signed distances to the nearest obstacle, for trajectory optimisers: NumPy arrays, or OpenVDB (`.vdb`).
 
-Keys: distance (X, Y, Z) float32, metres, from a voxel's centre to the face of the nearest obstacle: to its centre, less
-half a voxel; negative within obstacles, to the nearest voxel that is none; NaN for unknown with `unknown=nan`.
+Keys of the arrays: distance (X, Y, Z) float32, metres, from a voxel's centre to the face of the nearest obstacle: to its
+centre, less half a voxel; negative within obstacles, to the nearest voxel that is none; NaN for unknown with
+`unknown=nan`;
 state (X, Y, Z) uint8: 0 free, 1 occupied, 255 unknown; origin (3,) lower corner of voxel (0, 0, 0); voxel_size metres;
 frame; T_frame_map and T_world_map (4, 4).
+A .vdb has one grid `distance`, whose active voxels are the known ones, others reading 0; index 0 is a voxel's centre.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +19,9 @@ from numpy.typing import NDArray
 
 from ..errors import ConfigError, ExportError
 from ..store import Map
-from ..types import FREE, OCCUPIED, UNKNOWN, Occupancy
-from .frames import check_frame, placed, world_of
+from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
+from .frames import Placed, check_frame, placed, world_of
+from .vdb import write_vdb
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -28,7 +32,7 @@ UNKNOWN_IS = "free", "obstacle", "nan"
 
 @dataclass(frozen=True)
 class Options:
-    """Frame, and what unknown space is."""
+    """Frame, and what unknown space is; a name that ends in .npz gives arrays, in .vdb an OpenVDB grid."""
 
     frame: str = "gravity"
     """"gravity" (z up, floor at 0), "first-camera" (z up, from there) or "map"; voxels keep their places in the last
@@ -43,9 +47,15 @@ class Options:
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the distances. Raises ExportError if the map has no obstacle, or would not fit into 2 GiB."""
+    """Write the distances. Raises ConfigError for another ending, ExportError if the map has no obstacle, or would not
+    fit into 2 GiB."""
+    if path.suffix not in (".npz", ".vdb"):
+        raise ConfigError(f"Distances are written to .npz or .vdb, got '{path.name}'.")
     there = placed(scan_map, options.frame, one_size=True)
     distance, state, origin = signed_distances(there.occupancy, options.unknown)
+    if path.suffix == ".vdb":
+        _write_grid(path, there, distance)
+        return
     with path.open("wb") as stream:
         np.savez_compressed(
             stream,
@@ -57,6 +67,20 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
             T_frame_map=there.T_frame_map,
             T_world_map=world_of(scan_map, there.T_frame_map),
         )
+
+
+def _write_grid(path: Path, there: Placed, distance: NDArray[np.float32]) -> None:
+    """The distances of the known voxels, block by block."""
+    occupancy = there.occupancy
+    known = occupancy.state != UNKNOWN
+    low = np.minimum(*(occupancy.voxels(state).min(axis=0, initial=1 << 20) for state in (FREE, OCCUPIED)))
+    block, local = np.nonzero(known)
+    at = occupancy.keys[block] * BLOCK + np.stack(np.unravel_index(local, (BLOCK,) * 3), axis=1) - low
+    values = np.zeros(known.shape, np.float32)
+    values[known] = distance[tuple(at.T)]
+    described = {name: json.dumps(value) for name, value in there.described().items()}
+    center = occupancy.origin + 0.5 * occupancy.voxel_size
+    write_vdb(path, "distance", occupancy.keys, values, known, occupancy.voxel_size, center, described)
 
 
 def signed_distances(
