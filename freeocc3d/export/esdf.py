@@ -1,10 +1,10 @@
 """Euclidean signed distances to the nearest obstacle, for trajectory optimisers: NumPy arrays, or OpenVDB (`.vdb`).
 
-Keys of the arrays: distance (X, Y, Z) float32, metres, from a voxel's centre to the face of the nearest obstacle: to its
-centre, less half a voxel; negative within obstacles, to the nearest voxel that is none; NaN for unknown with
-`unknown=nan`;
-state (X, Y, Z) uint8: 0 free, 1 occupied, 255 unknown; origin (3,) lower corner of voxel (0, 0, 0); voxel_size metres;
-frame; T_frame_map and T_world_map (4, 4).
+Keys of the arrays:
+    distance (X, Y, Z) float32, metres, from a voxel's centre to the face of the nearest obstacle: to its centre, less
+    half a voxel; negative within obstacles, to the nearest voxel that is none; NaN for unknown with `unknown=nan`
+    state (X, Y, Z) uint8: 0 free, 1 occupied, 255 unknown; origin (3,) lower corner of voxel (0, 0, 0); voxel_size
+    metres; frame; T_frame_map and T_world_map (4, 4)
 A .vdb has one grid `distance`, whose active voxels are the known ones, others reading 0; index 0 is a voxel's centre.
 """
 

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import invert
+from ..geometry import invert, transform
 from ..lattice import contains
 from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
 from .grid import pack, unpack
@@ -37,10 +37,11 @@ def resampled(
     states = np.full((len(keys), BLOCK**3), UNKNOWN, np.uint8)
     probability = np.zeros((len(keys), BLOCK**3), np.float32)
     rows = np.full((len(keys), BLOCK**3), -1, np.int32)
+    corners = transform(T_old_new, origin + keys * BLOCK * size) - occupancy.origin  # of new blocks, on the old lattice
+    offsets = (_LOCAL + 0.5) @ T_old_new[:3, :3].T
     for start in range(0, len(keys), _BLOCKS_AT_ONCE):
         part = slice(start, start + _BLOCKS_AT_ONCE)
-        centers = origin + ((keys[part, None] * BLOCK + _LOCAL).reshape(-1, 3) + 0.5) * size
-        voxel = np.floor((centers @ T_old_new[:3, :3].T + T_old_new[:3, 3] - occupancy.origin) / size).astype(np.int64)
+        voxel = np.floor(corners[part, None] / size + offsets).astype(np.int64).reshape(-1, 3)
         block = pack(voxel >> 3)
         found = contains(ascending, block)
         at = order[np.searchsorted(ascending, block[found])]
@@ -50,8 +51,8 @@ def resampled(
             values[found] = old[at, local]
             new[part] = values.reshape(-1, BLOCK**3)
 
-    centers = occupancy.centers(occupancy.occupied_voxels())
-    voxel = np.floor((centers @ T_new_old[:3, :3].T + T_new_old[:3, 3] - origin) / size).astype(np.int64)
+    centers = transform(T_new_old, occupancy.centers(occupancy.occupied_voxels()))
+    voxel = np.floor((centers - origin) / size).astype(np.int64)
     row = np.searchsorted(pack(keys), pack(voxel >> 3))
     local = (voxel & 7) @ np.array((64, 8, 1))
     missed = states[row, local] != OCCUPIED
