@@ -1,6 +1,7 @@
 """Plans for ROS, read by map_server's own rules on a room without symmetry."""
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -102,6 +103,35 @@ def test_free_share_and_inflation(tmp_path) -> None:
     np.testing.assert_array_equal(wide, grown)
 
 
+def test_a_layer_a_word_keeps_robots_out_of_it(tmp_path) -> None:
+    occupancy, expected = room()
+    scan_map = map_of(occupancy, Z_UP)
+    at = occupancy.occupied_voxels()
+    regions = {"table": (at[:, 0] >= 7) & (at[:, 2] == 7), "old door": (at == (4, 2, 1)).all(axis=1)}
+    scan_map.query_words = lambda words: [
+        SimpleNamespace(regions=[SimpleNamespace(rows=np.flatnonzero(regions[word]))] if word in regions else [])
+        for word in words
+    ]
+    asked = {"max_height": 1.7, "avoid": ["table", "old door:0.1", "glass:0.5"]}
+    export_map(scan_map, "nav2", tmp_path / "map.yaml", asked)
+    plain, size, origin = map_server(tmp_path / "map.yaml")
+    np.testing.assert_array_equal(plain == 100, expected == 100)
+    layers = json.loads((tmp_path / "map.yaml.json").read_text())["avoid"]
+    assert [(layer["word"], layer["distance_m"], layer["matched"]) for layer in layers] == [
+        ("table", 0.0, True), ("old door", 0.1, True), ("glass", 0.5, False),
+    ]  # fmt: skip
+    masks = {}
+    for layer in layers:
+        masks[layer["word"]], layer_size, layer_origin = map_server(tmp_path / layer["file"])
+        assert layer_size == size
+        np.testing.assert_array_equal(layer_origin, origin)
+    table = np.zeros_like(expected)
+    table[4:6, 7:10] = 100
+    np.testing.assert_array_equal(masks["table"], table)
+    assert np.argwhere(masks["old door"] == 100).tolist() == [[1, 4], [2, 3], [2, 4], [2, 5], [3, 4]]
+    assert (masks["glass"] == 0).all()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -110,6 +140,8 @@ def test_free_share_and_inflation(tmp_path) -> None:
         ({"min_free": 1.5}, "0 to 1"),
         ({"inflation": -1.0}, "negative"),
         ({"inflation": float("nan")}, "inflation"),
+        ({"avoid": ["glass:near"]}, "glass:0.5, got 'glass:near'"),
+        ({"avoid": ["a b", "a_b"]}, "same file name"),
     ],
 )
 def test_bad_options_are_told(tmp_path, options, message) -> None:

@@ -3,13 +3,17 @@
 A pixel is occupied (0) where any voxel of its column between the heights is; else free (254) where enough of them are
 free; else unknown (205). The floor lies below the lower height and is no obstacle. The top row is the largest y,
 `origin` the lower left corner of the lower left pixel, as map_server reads them. NAME.yaml.json holds the frame.
-Source: nav2_map_server's map_io.
+`avoid` adds a layer a word, NAME.WORD.yaml and .pgm of the same size: occupied where a robot is to keep out, free
+elsewhere, a mask for Nav2's keepout filter. Source: nav2_map_server's map_io.
 """
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +22,7 @@ from ..errors import ConfigError, ExportError
 from ..registry import require_positive
 from ..store import Map
 from ..types import FREE, OCCUPIED, UNKNOWN, Occupancy
-from .frames import check_upright, floor_z, placed, write_description
+from .frames import Placed, check_upright, floor_z, placed, write_description
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -41,6 +45,9 @@ class Options:
     """Share of a column's voxels between the heights that have to be free for its cell to be free, 0…1; 0 = any."""
     inflation: float = 0.0
     """Metres around obstacles that are occupied as well; planners mostly inflate by themselves."""
+    avoid: tuple[str, ...] = ()
+    """Words whose places a robot is to keep out of, each with the metres to keep from them, 0 if not given, as in
+    [carpet, glass:0.5]."""
 
     def __post_init__(self) -> None:
         check_upright(self.frame)
@@ -51,6 +58,7 @@ class Options:
             raise ConfigError(f"'min_free' must be 0 to 1, got {self.min_free}.")
         if self.inflation < 0:
             raise ConfigError(f"'inflation' must not be negative, got {self.inflation}.")
+        _avoided(self.avoid)
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
@@ -63,22 +71,75 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     cells, origin = plan(there.occupancy, floor + options.min_height, floor + options.max_height, options.min_free)
     if options.inflation > 0:
         cells = inflated(cells, options.inflation / there.occupancy.voxel_size)
+    heights = f"obstacles {options.min_height:g} to {options.max_height:g} m above the floor"
+    _write_map(path, cells, origin, there.occupancy.voxel_size, f"{there.frame} frame; {heights}")
+    described = {"floor_z_m": floor, "min_height_m": options.min_height, "max_height_m": options.max_height}
+    layers = _write_layers(scan_map, path, there, _avoided(options.avoid), cells.shape, origin)
+    write_description(path, {**there.described(), **described, **({"avoid": layers} if layers else {})})
+
+
+def _write_map(path: Path, cells: NDArray[np.uint8], origin: NDArray[np.float64], size: float, about: str) -> None:
     image = path.with_suffix(".pgm")
     write_pgm(image, cells)
     occupied, free = _THRESHOLDS
     lines = [
-        f"# freeocc3d, {there.frame} frame; obstacles {options.min_height:g} to {options.max_height:g} m above floor",
+        f"# freeocc3d, {about}",
         f"image: {image.name}",
         "mode: trinary",
-        f"resolution: {there.occupancy.voxel_size:.12g}",
+        f"resolution: {size:.12g}",
         f"origin: [{origin[0]:.9g}, {origin[1]:.9g}, 0.0]",
         "negate: 0",
         f"occupied_thresh: {occupied}",
         f"free_thresh: {free}",
     ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    heights = {"floor_z_m": floor, "min_height_m": options.min_height, "max_height_m": options.max_height}
-    write_description(path, {**there.described(), **heights})
+
+
+def _avoided(entries: tuple[str, ...]) -> dict[str, float]:
+    """Word -> metres to keep from it. Raises ConfigError."""
+    found = {}
+    for entry in entries:
+        word, separator, distance = entry.partition(":")
+        try:
+            metres = float(distance) if separator else 0.0
+        except ValueError:
+            metres = -1.0
+        if not 0 <= metres < np.inf:
+            raise ConfigError(f"'avoid' takes words with metres to keep from them, as in glass:0.5, got '{entry}'.")
+        found[word.strip()] = metres
+    if len({_file_part(word) for word in found}) < len(found):
+        raise ConfigError("'avoid' names two words whose layers would have the same file name: leave one out.")
+    return found
+
+
+def _write_layers(
+    scan_map: Map,
+    path: Path,
+    there: Placed,
+    avoided: dict[str, float],
+    shape: tuple[int, ...],
+    origin: NDArray[np.float64],
+) -> list[dict[str, Any]]:
+    """Write a mask for each word, over the plan's cells, and say what was written."""
+    if not avoided:
+        return []
+    occupancy, layers = there.occupancy, []
+    offset = np.rint((origin - occupancy.origin[:2]) / occupancy.voxel_size).astype(np.int64)
+    cell = occupancy.occupied_voxels()[:, :2] - offset
+    for result, (word, metres) in zip(scan_map.query_words(list(avoided)), avoided.items(), strict=True):
+        rows = np.concatenate([region.rows for region in result.regions] or [np.zeros(0, np.int64)])
+        inside = np.isin(there.rows, rows) & ((cell >= 0) & (cell < shape)).all(axis=1)
+        mask = np.full(shape, FREE, np.uint8)
+        mask[tuple(cell[inside].T)] = OCCUPIED
+        layer = path.with_name(f"{path.stem}.{_file_part(word)}.yaml")
+        about = f"{there.frame} frame; {metres:g} m around {json.dumps(word)}"
+        _write_map(layer, inflated(mask, metres / occupancy.voxel_size), origin, occupancy.voxel_size, about)
+        layers.append({"word": word, "distance_m": metres, "matched": bool(inside.any()), "file": layer.name})
+    return layers
+
+
+def _file_part(word: str) -> str:
+    return re.sub(r"\W+", "_", word.strip()) or "_"
 
 
 def plan(
