@@ -19,7 +19,6 @@ from ..errors import ExportError
 from ..geometry import transform
 from ..query import Region
 from ..store import Map
-from ..types import Occupancy
 from .frames import check_upright, to_frame
 
 REQUIRES: tuple[str, ...] = ()
@@ -46,8 +45,16 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     if not words:
         raise ExportError("The map has no vocabulary of its own: name words with --set 'words=[sofa, chair]'.")
     T_frame_map = to_frame(scan_map, options.frame)
+    occupancy = scan_map.occupancy
+    voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
+
+    def corners(rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(8 N, 3) corners of N voxels, in the frame."""
+        lattice = voxels[rows, None] + _CORNERS * edges[rows, None, None]
+        return transform(T_frame_map, occupancy.origin + lattice.reshape(-1, 3) * occupancy.finest)
+
     features = [
-        _feature(result.word, region, scan_map.occupancy, T_frame_map)
+        _feature(result.word, region, corners(region.rows), transform(T_frame_map, region.centroid))
         for result in scan_map.query_words(words)
         for region in result.regions
     ]
@@ -61,10 +68,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     path.write_text(json.dumps(collection, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def _feature(word: str, region: Region, occupancy: Occupancy, T_frame_map: NDArray[np.float64]) -> dict[str, Any]:
-    voxels, edges = occupancy.occupied_voxels()[region.rows], occupancy.occupied_edges()[region.rows]
-    lattice = (voxels[:, None] + _CORNERS * edges[:, None, None]).reshape(-1, 3)
-    corners = transform(T_frame_map, occupancy.origin + lattice * occupancy.finest)
+def _feature(word: str, region: Region, corners: NDArray[np.float64], centroid: NDArray[np.float64]) -> dict[str, Any]:
     ring, area = outline(corners[:, :2])
     return {
         "type": "Feature",
@@ -73,7 +77,7 @@ def _feature(word: str, region: Region, occupancy: Occupancy, T_frame_map: NDArr
             "word": word,
             "score": round(region.score, 4),
             "confidence": round(region.confidence, 4),
-            "centroid": np.round(transform(T_frame_map, region.centroid), 4).tolist(),
+            "centroid": np.round(centroid, 4).tolist(),
             "height_min_m": round(float(corners[:, 2].min()), 4),
             "height_max_m": round(float(corners[:, 2].max()), 4),
             "area_m2": round(area, 4),
@@ -87,6 +91,6 @@ def outline(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     corners to the millimetre, and its area."""
     from scipy.spatial import ConvexHull
 
-    points = np.unique(np.round(points, 3), axis=0)  # a lattice's corners along an edge are not quite on one line
-    hull = ConvexHull(points)
+    points = np.round(points[ConvexHull(points).vertices], 3)
+    hull = ConvexHull(points)  # again, for a turned lattice's corners along an edge are not quite on one line
     return points[np.append(hull.vertices, hull.vertices[0])], float(hull.volume)
