@@ -246,7 +246,8 @@ def export(
         options[name.strip()] = yaml.safe_load(text)
     refuse_existing(output, overwrite)
     export_map(load_map(map_path), format_name, output, options, overwrite=overwrite)
-    print(f"{output}: {output.stat().st_size:,} bytes")
+    files = [path for path in output.rglob("*") if path.is_file()] if output.is_dir() else [output]
+    print(f"{output}: {sum(path.stat().st_size for path in files):,} bytes")
 
 
 @app.command()
