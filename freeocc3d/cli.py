@@ -229,6 +229,9 @@ def export(
     map_path: MapPath,
     format_name: Annotated[str, typer.Option("--format", help="See 'freeocc3d list'.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")],
+    frame: Annotated[
+        str | None, typer.Option("--frame", help="map, gravity (z up, floor at 0) or first-camera (z up, from there).")
+    ] = None,
     overrides: Set = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -238,14 +241,16 @@ def export(
     from .export import export_map
     from .store import load_map
 
-    options = {}
+    options = {} if frame is None else {"frame": frame}
     for override in overrides or []:
         name, separator, text = override.partition("=")
         if not separator:
             raise ConfigError(f"An option reads name=value, got '{override}'.")
         options[name.strip()] = yaml.safe_load(text)
+    refuse_existing(output, overwrite)
     export_map(load_map(map_path), format_name, output, options, overwrite=overwrite)
-    print(f"{output}: {output.stat().st_size:,} bytes")
+    files = [path for path in output.rglob("*") if path.is_file()] if output.is_dir() else [output]
+    print(f"{output}: {sum(path.stat().st_size for path in files):,} bytes")
 
 
 @app.command()

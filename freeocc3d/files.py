@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,17 +17,25 @@ def refuse_existing(path: Path, overwrite: bool = False) -> None:
         raise ExportError(f"Cannot write {path}: there is no folder {path.parent}.")
     if path.exists() and not overwrite:
         raise ExportError(f"{path} exists: choose another name, or replace it with --overwrite.")
+    if path.is_dir():
+        raise ExportError(f"{path} is a folder, which is never replaced: choose another name.")
 
 
 def write_whole(path: Path, write: Callable[[Path], None], overwrite: bool = False) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then give it the name. Raises ExportError."""
+    """Let ``write`` fill a file or folder of that name, with what else belongs to it, in a temporary folder beside
+    ``path``; then move everything, ``path`` last. Raises ExportError."""
     refuse_existing(path, overwrite)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        write(temporary)
-        temporary.replace(path)
+        temporary.mkdir()
+        write(temporary / path.name)
+        beside = [made for made in sorted(temporary.iterdir()) if made.name != path.name]
+        for made in beside:
+            refuse_existing(path.with_name(made.name), overwrite)
+        for made in [*beside, temporary / path.name]:
+            made.replace(path.with_name(made.name))
     except OSError as error:
         reason = "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error)).lower()
         raise ExportError(f"Cannot write {path}: {reason}.") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        shutil.rmtree(temporary, ignore_errors=True)

@@ -94,11 +94,13 @@ class Keyframes(Sequence[Frame]):
     def __iter__(self) -> Iterator[Frame]:
         return map(self._read, list(self._entries))
 
+    def views(self) -> list[tuple[Path, Intrinsics]]:
+        """The colour image's file and the camera of each, without decoding anything."""
+        return [(self._paths(int(entry["frame"]))[0], _camera(entry)) for entry in self._entries]
+
     def _read(self, entry: dict[str, float]) -> Frame:
         index = int(entry["frame"])
-        camera = Intrinsics(
-            int(entry["width"]), int(entry["height"]), entry["fx"], entry["fy"], entry["cx"], entry["cy"]
-        )
+        camera = _camera(entry)
         color_path, depth_path = self._paths(index)
         color = _decode(color_path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         units = _decode(depth_path, cv2.IMREAD_UNCHANGED)
@@ -110,6 +112,10 @@ class Keyframes(Sequence[Frame]):
     def _paths(self, index: int) -> tuple[Path, Path]:
         """Colour and depth image of a frame."""
         return self.folder / f"{index:06d}.color.jpg", self.folder / f"{index:06d}.depth.png"
+
+
+def _camera(entry: dict[str, float]) -> Intrinsics:
+    return Intrinsics(int(entry["width"]), int(entry["height"]), entry["fx"], entry["fy"], entry["cx"], entry["cy"])
 
 
 def _decode(path: Path, flags: int) -> np.ndarray:

@@ -26,6 +26,7 @@ from .capture.reregistered import Reregistered
 from .config import Config
 from .errors import CaptureError, FrameError, Interrupted, MapError, TrackingError
 from .gaussians import anchors, fit, images
+from .gaussians.gravity import gravity_frame
 from .gaussians.rasterizers.base import Rasterizer
 from .gaussians.upright import estimate_up
 from .keyframes import Keyframes
@@ -505,6 +506,7 @@ def _manifest(
         "origin": occupancy.origin.tolist(),
         "up": estimate_up(trajectory.T_world_keyframe, gaussians.means).tolist(),
         "T_world_map": np.eye(4).tolist(),
+        "T_gravity_map": gravity_frame(trajectory.T_world_keyframe, gaussians).tolist(),
         "encoder": {"name": encoder.name, "dimension": encoder.dimension, "state": encoder.text_state()},
         "codec": "transform coding, 8, 4 and 2 bits a direction",
         "counts": {

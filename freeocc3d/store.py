@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from . import registry
 from .arrays import read_arrays
 from .errors import MapError
-from .geometry import quats_to_rotations, rotations_to_quats
+from .geometry import is_rigid, quats_to_rotations, rotations_to_quats
 from .language.codec import Codec, CodedFeatures
 from .types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, Trajectory
 
@@ -60,6 +60,18 @@ class Map:
     def up(self) -> NDArray[np.float64]:
         """(3,) unit vector that points up in the map's frame, as well as the camera's attitude tells."""
         return np.array(self.manifest["up"], np.float64)
+
+    @functools.cached_property
+    def T_gravity_map(self) -> NDArray[np.float64]:
+        """(4, 4) to the frame with z up and the floor at z = 0; found now where an earlier version made the map."""
+        if "T_gravity_map" not in self.manifest:
+            from .gaussians.gravity import gravity_frame
+
+            return gravity_frame(self.trajectory.T_world_keyframe, self.gaussians)
+        T = np.array(self.manifest["T_gravity_map"], np.float64)
+        if not is_rigid(T):
+            raise MapError(f"{self.path / MANIFEST} is damaged: 'T_gravity_map' is no rigid transform.")
+        return T
 
     @functools.cached_property
     def occupancy(self) -> Occupancy:

@@ -80,6 +80,13 @@ def test_export_and_view(room, tmp_path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == {"m.npz", "m.ply", "m.png"}
     assert "--overwrite" in refused("export", room, "--format", "npz", "-o", tmp_path / "m.npz")
     assert "did you mean 'npz'" in refused("export", room, "--format", "npzz", "-o", tmp_path / "x")
+    for name in ("m.bt", "m.ot", "m.yaml", "m.vdb", "m.glb", "m.geojson", "poses"):
+        kind = {"m.bt": "octomap", "m.ot": "octomap", "m.yaml": "nav2", "m.vdb": "esdf"}.get(name, name.split(".")[-1])
+        told = run("export", room, "--format", kind, "--frame", "first-camera", "-o", tmp_path / name)
+        assert int(told.stdout.split(": ")[1].split()[0].replace(",", "")) > 100
+    assert "gravity or first-camera" in refused(
+        "export", room, "--format", "npz", "--frame", "up", "-o", tmp_path / "x"
+    )
 
 
 def test_list_names_every_backend_without_importing_them() -> None:

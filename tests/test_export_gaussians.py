@@ -1,6 +1,7 @@
 """The export of Gaussians: upright, and read by a program that others wrote."""
 
 import contextlib
+import json
 import shutil
 import subprocess
 from pathlib import Path
@@ -10,11 +11,12 @@ import numpy as np
 import pytest
 from scenes import random_gaussians
 from scipy.spatial import cKDTree
+from test_export_frames import CAMERA_TO_UP
 
 from freeocc3d.errors import ExportError
 from freeocc3d.export import export_map
 from freeocc3d.gaussians.standard_ply import read_standard_ply
-from freeocc3d.geometry import quats_to_rotations
+from freeocc3d.geometry import quats_to_rotations, transform
 
 
 def map_of(gaussians, up=(0.0, -1.0, 0.0)):
@@ -39,6 +41,20 @@ def test_the_maps_own_frame_can_be_kept(tmp_path: Path) -> None:
     g = random_gaussians(60, seed=1)
     export_map(map_of(g, (0, 0, 1)), "gaussians", tmp_path / "g.ply", {"upright": False})
     np.testing.assert_array_equal(read_standard_ply(tmp_path / "g.ply")[0].means, g.means)
+
+
+def test_the_floor_is_at_0_in_the_gravity_frame(tmp_path: Path) -> None:
+    g = random_gaussians(60, seed=1)
+    scan_map = map_of(g)
+    scan_map.T_gravity_map = CAMERA_TO_UP
+    height = 1.52 - g.means[:, 1]
+    export_map(scan_map, "gaussians", tmp_path / "g.ply", {"frame": "gravity"})
+    read = read_standard_ply(tmp_path / "g.ply")[0]
+    np.testing.assert_allclose(-read.means[:, 1], height, atol=1e-5)
+    T = np.array(json.loads((tmp_path / "g.ply.json").read_text())["T_file_map"])
+    np.testing.assert_allclose(transform(T, g.means.astype(float)), read.means, atol=1e-5)
+    export_map(scan_map, "gaussians", tmp_path / "z.ply", {"frame": "gravity", "upright": False})
+    np.testing.assert_allclose(read_standard_ply(tmp_path / "z.ply")[0].means[:, 2], height, atol=1e-5)
 
 
 def test_a_map_without_gaussians_is_refused(tmp_path: Path) -> None:

@@ -156,3 +156,15 @@ def test_a_damaged_vocabulary_is_told(copy, named) -> None:
     edit(copy, vocabulary=named)
     with pytest.raises(MapError, match="'vocabulary'"):
         freeocc3d.load_map(copy)
+
+
+def test_the_gravity_frame_is_saved_or_found_again(copy) -> None:
+    saved_frame = store.load_map(copy).T_gravity_map
+    manifest = yaml.safe_load((copy / "map.yaml").read_text())
+    assert manifest.pop("T_gravity_map") == saved_frame.tolist()
+    (copy / "map.yaml").write_text(yaml.safe_dump(manifest))
+    found = store.load_map(copy).T_gravity_map
+    np.testing.assert_allclose(found, saved_frame, atol=1e-3)
+    edit(copy, T_gravity_map=(2 * np.eye(4)).tolist())
+    with pytest.raises(MapError, match="T_gravity_map"):
+        _ = store.load_map(copy).T_gravity_map

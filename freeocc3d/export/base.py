@@ -1,7 +1,9 @@
 """The contract of an exporter, and the one way in which all of them write: whole or not at all.
 
 An exporter is one file of this folder with ``Options`` and ``write(scan_map, path, options)``, which writes to ``path``
-and may raise OSError or ExportError.
+and may raise OSError or ExportError. ``path`` has its final name in a folder of its own: what a format needs beside it
+(an image, a description) is written into that folder, and moves with it. An exporter that has the option ``frame``
+takes its voxels from ``frames.placed``.
 """
 
 from __future__ import annotations

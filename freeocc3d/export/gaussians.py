@@ -10,17 +10,23 @@ from numpy.typing import NDArray
 
 from ..errors import ExportError
 from ..store import Map
+from .frames import check_frame, to_frame, write_description
 
 REQUIRES: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Options:
-    """Orientation."""
+    """Frame and orientation; NAME.json beside the file holds the transform from the map."""
 
     upright: bool = True
-    """Turn the map so that up is -y, as viewers of such files expect; false = the map's own frame, whose first camera
-    looks along +z with y down."""
+    """Turn the frame so that up is -y, as viewers of such files expect; false = the frame's own axes, in the map's the
+    first camera's, which looks along +z with y down."""
+    frame: str = "map"
+    """"map", "gravity" (floor at 0) or "first-camera" (origin there)."""
+
+    def __post_init__(self) -> None:
+        check_frame(self.frame)
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
@@ -31,9 +37,17 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     gaussians = scan_map.gaussians
     if len(gaussians) == 0:
         raise ExportError("The map has no Gaussians to write.")
+    T_file_map = to_frame(scan_map, options.frame)
     if options.upright:
-        gaussians = aligned(gaussians, 1.0, _to_minus_y(scan_map.up), np.zeros(3))
+        up = scan_map.up if options.frame == "map" else np.array((0.0, 0.0, 1.0))
+        turn = np.eye(4)
+        turn[:3, :3] = _to_minus_y(up)
+        T_file_map = turn @ T_file_map
+    if not np.array_equal(T_file_map, np.eye(4)):
+        gaussians = aligned(gaussians, 1.0, T_file_map[:3, :3], T_file_map[:3, 3])
     write_standard_ply(gaussians, path)
+    told = {"frame": options.frame, "up": "-y" if options.upright else "the frame's"}
+    write_description(path, {**told, "T_file_map": T_file_map.tolist()})
 
 
 def _to_minus_y(up: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,11 +5,12 @@ Keys of the dense form (`form=dense`), over the box of all known voxels:
     probability (X, Y, Z) float16: alpha of the voxel's centre
     labels (X, Y, Z) uint8: 0 free, k = classes[k - 1], len(classes) + 1 = occupied by nothing known, 255 unknown
     classes (C,) names, C = 0 without a vocabulary; at most 253, so that every label fits into a byte
-    origin (3,) lower corner of voxel (0, 0, 0), metres; voxel_size metres; T_world_map (4, 4)
+    origin (3,) lower corner of voxel (0, 0, 0), metres; voxel_size metres; frame, the name of the arrays' frame;
+    T_world_map (4, 4) from the arrays' frame to the map's world
 Of the sparse form: voxels (V, 3) int32 indices, state (V,) uint8 as above, probability (V,), labels (V,), classes,
-origin, voxel_size, T_world_map; voxel (i, j, k) covers origin + [i, i + 1) * voxel_size in both. Of a map of several
-voxel sizes, voxel_size is the smallest; larger voxels fill as many as they cover in the dense form, and the sparse one
-has edges (V,) int32 besides: voxel (i, j, k) covers origin + [i, i + edge) * voxel_size.
+origin, voxel_size, frame, T_world_map; voxel (i, j, k) covers origin + [i, i + 1) * voxel_size in both. Of a map of
+several voxel sizes, voxel_size is the smallest; larger voxels fill as many as they cover in the dense form, and the
+sparse one has edges (V,) int32 besides: voxel (i, j, k) covers origin + [i, i + edge) * voxel_size.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from ..errors import ConfigError, ExportError
 from ..store import Map
 from ..types import FREE, OCCUPIED, UNKNOWN, Occupancy
+from .frames import check_frame, placed, world_of
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -37,8 +39,12 @@ class Options:
 
     form: str = "dense"
     """"dense" for a grid over the map's box, "sparse" for lists of its known voxels."""
+    frame: str = "map"
+    """"map", "gravity" (z up, floor at 0) or "first-camera" (z up, from there); but for the first, voxels are sampled
+    anew."""
 
     def __post_init__(self) -> None:
+        check_frame(self.frame)
         if self.form not in ("dense", "sparse"):
             raise ConfigError(f"'form' must be dense or sparse, got '{self.form}'.")
 
@@ -47,10 +53,12 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the arrays. Raises ExportError if the dense grid would not fit into memory."""
     form = dense if options.form == "dense" else sparse
     classes = scan_map.vocabulary[:_MOST_CLASSES]
-    arrays = form(scan_map.occupancy, scan_map.labels(), len(classes))
+    there = placed(scan_map, options.frame)
+    arrays = form(there.occupancy, scan_map.labels()[there.rows], len(classes))
     arrays |= {
-        "voxel_size": np.float64(scan_map.occupancy.finest),
-        "T_world_map": np.array(scan_map.manifest["T_world_map"], np.float64),
+        "voxel_size": np.float64(there.occupancy.finest),
+        "frame": np.array(options.frame),
+        "T_world_map": world_of(scan_map, there.T_frame_map),
         "classes": np.array(classes, np.str_),
     }
     with path.open("wb") as stream:

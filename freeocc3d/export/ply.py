@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +17,12 @@ from ..palette import class_colors, height_colors, highlighted, ramp
 from ..query import QueryResult
 from ..store import Map
 from ..types import OCCUPIED, Occupancy
+from .frames import Placed, check_frame, placed
 
 REQUIRES: tuple[str, ...] = ()
 
-_COLORS = "rgb", "class", "height", "probability"
+COLORS = "rgb", "class", "height", "probability"
+"""What occupied voxels may be coloured by."""
 
 
 @dataclass(frozen=True)
@@ -30,18 +34,23 @@ class Options:
     color: str = "rgb"
     """"rgb" for the surface's own colour, "class" for the class that fits best, "height" above the lowest voxel, or
     "probability" of being occupied, 0 to 1; the last two from dark blue to yellow."""
+    frame: str = "map"
+    """"map", "gravity" (z up, floor at 0) or "first-camera" (z up, from there); but for the first, voxels are sampled
+    anew."""
 
     def __post_init__(self) -> None:
+        check_frame(self.frame)
         if self.form not in ("cubes", "points"):
             raise ConfigError(f"'form' must be cubes or points, got '{self.form}'.")
-        if self.color not in _COLORS:
-            raise ConfigError(f"'color' must be {', '.join(_COLORS[:-1])} or {_COLORS[-1]}, got '{self.color}'.")
+        if self.color not in COLORS:
+            raise ConfigError(f"'color' must be {', '.join(COLORS[:-1])} or {COLORS[-1]}, got '{self.color}'.")
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the occupied voxels. Raises ExportError for a map without any."""
     _refuse_empty(scan_map.occupancy)
-    _write(scan_map.occupancy, _colors(scan_map, options.color), path, options.form)
+    there = placed(scan_map, options.frame)
+    _write(there.occupancy, colors_of(scan_map, there, options.color), path, options.form, there.described())
 
 
 def write_query_ply(occupancy: Occupancy, results: list[QueryResult], path: Path, overwrite: bool = False) -> None:
@@ -57,35 +66,44 @@ def _refuse_empty(occupancy: Occupancy) -> None:
         raise ExportError("The map has no occupied voxel to write.")
 
 
-def _colors(scan_map: Map, by: str) -> NDArray[np.uint8]:
-    """(V, 3) colour of each occupied voxel."""
-    occupancy = scan_map.occupancy
+def colors_of(scan_map: Map, there: Placed, by: str) -> NDArray[np.uint8]:
+    """(V, 3) colour of each occupied voxel of a placed map, by one of COLORS."""
+    occupancy = there.occupancy
     if by == "class":
-        return class_colors(scan_map.vocabulary)[scan_map.labels()]
+        return class_colors(scan_map.vocabulary)[scan_map.labels()[there.rows]]
     if by == "height":
-        return height_colors(occupancy, scan_map.up)
+        return height_colors(occupancy, there.T_frame_map[:3, :3] @ scan_map.up)
     if by == "probability":
         return ramp(occupancy.probability[occupancy.state == OCCUPIED])
     return occupancy.colors
 
 
-def _write(occupancy: Occupancy, colors: NDArray[np.uint8], path: Path, form: str) -> None:
+def _write(
+    occupancy: Occupancy, colors: NDArray[np.uint8], path: Path, form: str, described: dict[str, Any] | None = None
+) -> None:
     if form == "points":
         points = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges()).astype(np.float32)
-        _write_ply(path, points, colors, None)
+        write_ply(path, points, colors, None, described)
     else:
         vertices, quads, rows = exposed_faces(occupancy)
-        _write_ply(path, vertices, np.repeat(colors[rows], 4, axis=0), quads)
+        write_ply(path, vertices, np.repeat(colors[rows], 4, axis=0), quads, described)
 
 
-def _write_ply(
-    path: Path, points: NDArray[np.float32], colors: NDArray[np.uint8], quads: NDArray[np.int32] | None
+def write_ply(
+    path: Path,
+    points: NDArray[np.float32],
+    colors: NDArray[np.uint8],
+    quads: NDArray[np.int32] | None = None,
+    described: dict[str, Any] | None = None,
 ) -> None:
-    """Binary little-endian PLY with coloured vertices and, if given, quads."""
+    """Binary little-endian PLY with coloured vertices and, if given, quads; what describes it in comments. Raises
+    OSError."""
     vertex = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     vertex["xyz"], vertex["rgb"] = points, colors
+    comments = ["freeocc3d, metres", *(f"{name} {json.dumps(value)}" for name, value in (described or {}).items())]
     header = [
-        "ply", "format binary_little_endian 1.0", "comment freeocc3d, metres", f"element vertex {len(points)}",
+        "ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments),
+        f"element vertex {len(points)}",
         *(f"property float {name}" for name in "xyz"), *(f"property uchar {name}" for name in ("red", "green", "blue")),
     ]  # fmt: skip
     if quads is not None:

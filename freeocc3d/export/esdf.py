@@ -1,0 +1,124 @@
+"""Euclidean signed distances to the nearest obstacle, for trajectory optimisers: NumPy arrays, or OpenVDB (`.vdb`).
+
+Keys of the arrays:
+    distance (X, Y, Z) float32, metres, from a voxel's centre to the face of the nearest obstacle: to its centre, less
+    half a voxel; negative within obstacles, to the nearest voxel that is none; NaN for unknown with `unknown=nan`
+    state (X, Y, Z) uint8: 0 free, 1 occupied, 255 unknown; origin (3,) lower corner of voxel (0, 0, 0); voxel_size
+    metres; frame; T_frame_map and T_world_map (4, 4)
+A .vdb has one grid `distance`, whose active voxels are the known ones, others reading 0; index 0 is a voxel's centre.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError, ExportError
+from ..store import Map
+from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
+from .frames import Placed, check_frame, placed, world_of
+from .vdb import write_vdb
+
+REQUIRES: tuple[str, ...] = ()
+
+_BYTES_A_VOXEL = 40  # of the transform, its indices and its results
+_LARGEST = 2 << 30
+UNKNOWN_IS = "free", "obstacle", "nan"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Frame, and what unknown space is; a name that ends in .npz gives arrays, in .vdb an OpenVDB grid."""
+
+    frame: str = "gravity"
+    """"gravity" (z up, floor at 0), "first-camera" (z up, from there) or "map"; voxels keep their places in the last
+    only, in the others they are sampled anew."""
+    unknown: str = "free"
+    """Unknown space: "free" is no obstacle, "obstacle" is one, "nan" is none and has no distance itself."""
+
+    def __post_init__(self) -> None:
+        check_frame(self.frame)
+        if self.unknown not in UNKNOWN_IS:
+            raise ConfigError(f"'unknown' must be free, obstacle or nan, got '{self.unknown}'.")
+
+
+def write(scan_map: Map, path: Path, options: Options) -> None:
+    """Write the distances. Raises ConfigError for another ending, ExportError if the map has no obstacle, or would not
+    fit into 2 GiB."""
+    if path.suffix not in (".npz", ".vdb"):
+        raise ConfigError(f"Distances are written to .npz or .vdb, got '{path.name}'.")
+    there = placed(scan_map, options.frame, one_size=True)
+    distance, state, origin = signed_distances(there.occupancy, options.unknown)
+    if path.suffix == ".vdb":
+        _write_grid(path, there, distance)
+        return
+    with path.open("wb") as stream:
+        np.savez_compressed(
+            stream,
+            distance=distance,
+            state=state,
+            origin=origin,
+            voxel_size=np.float64(there.occupancy.voxel_size),
+            frame=np.array(options.frame),
+            T_frame_map=there.T_frame_map,
+            T_world_map=world_of(scan_map, there.T_frame_map),
+        )
+
+
+def _write_grid(path: Path, there: Placed, distance: NDArray[np.float32]) -> None:
+    """The distances of the known voxels, block by block."""
+    occupancy = there.occupancy
+    known = occupancy.state != UNKNOWN
+    low = np.minimum(*(occupancy.voxels(state).min(axis=0, initial=1 << 20) for state in (FREE, OCCUPIED)))
+    block, local = np.nonzero(known)
+    at = occupancy.keys[block] * BLOCK + np.stack(np.unravel_index(local, (BLOCK,) * 3), axis=1) - low
+    values = np.zeros(known.shape, np.float32)
+    values[known] = distance[tuple(at.T)]
+    described = {name: json.dumps(value) for name, value in there.described().items()}
+    center = occupancy.origin + 0.5 * occupancy.voxel_size
+    write_vdb(path, "distance", occupancy.keys, values, known, occupancy.voxel_size, center, described)
+
+
+def signed_distances(
+    occupancy: Occupancy, unknown: str
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float64]]:
+    """(X, Y, Z) distances and states over the box of all known voxels, which are of one size, and the (3,) lower corner
+    of the box. Exact; raises ExportError as ``write`` does."""
+    from scipy import ndimage
+
+    state, origin = states(occupancy)
+    obstacle = state != FREE if unknown == "obstacle" else state == OCCUPIED
+    if not obstacle.any():
+        raise ExportError("The map has no obstacle, so that there is no distance to one.")
+    distance = np.asarray(ndimage.distance_transform_edt(~obstacle), np.float32)
+    distance -= np.asarray(ndimage.distance_transform_edt(obstacle), np.float32) if not obstacle.all() else np.inf
+    distance -= np.where(obstacle, -0.5, 0.5).astype(np.float32)
+    distance *= np.float32(occupancy.voxel_size)
+    if unknown == "nan":
+        distance[state == UNKNOWN] = np.nan
+    return distance, state, origin
+
+
+def states(occupancy: Occupancy) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """(X, Y, Z) states over the box of all known voxels, which are of one size, and its lower corner. Raises
+    ExportError where distances over it would not fit into 2 GiB, or nothing is known."""
+    known = {state: occupancy.voxels(state) for state in (FREE, OCCUPIED)}
+    every = np.concatenate(list(known.values()))
+    if not len(every):
+        raise ExportError("Nothing of the map is known: there are no distances to write.")
+    low = every.min(axis=0)
+    shape = every.max(axis=0).astype(np.int64) - low + 1
+    size = _BYTES_A_VOXEL * float(np.prod(shape.astype(np.float64)))
+    if size > _LARGEST:
+        raise ExportError(
+            f"Distances in {' x '.join(map(str, shape))} voxels take {size / 2**30:.1f} GiB of memory: export a part "
+            "of the map, or map with larger voxels."
+        )
+    grid = np.full(shape, UNKNOWN, np.uint8)
+    for state, voxels in known.items():
+        grid[tuple((voxels - low).T)] = state
+    return grid, occupancy.origin + low * occupancy.voxel_size

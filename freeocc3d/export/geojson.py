@@ -1,0 +1,96 @@
+"""GeoJSON: what words find, as outlines on the floor for maps and fleet managers.
+
+A FeatureCollection with one Polygon for each region: the convex outline of its voxels seen from above, x and y in
+metres of the frame (no longitudes), with word, score, confidence, centroid, height_min_m and height_max_m,
+area and volume. Members `frame` and `T_frame_map` of the collection say what frame that is. Source: RFC 7946.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ExportError
+from ..geometry import transform
+from ..query import Region
+from ..store import Map
+from .frames import check_upright, to_frame
+
+REQUIRES: tuple[str, ...] = ()
+
+_CORNERS = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Words and frame."""
+
+    words: tuple[str, ...] = ()
+    """Words to ask, as in [sofa, chair]; none = all words that the map's encoder or a scene vocabulary names."""
+    frame: str = "gravity"
+    """"gravity" (walls along x and y) or "first-camera" (origin there, x where it looked)."""
+
+    def __post_init__(self) -> None:
+        check_upright(self.frame)
+
+
+def write(scan_map: Map, path: Path, options: Options) -> None:
+    """Write the regions. Raises ExportError without any word to ask; a word that nothing matches has no feature."""
+    words = list(options.words) or scan_map.vocabulary
+    if not words:
+        raise ExportError("The map has no vocabulary of its own: name words with --set 'words=[sofa, chair]'.")
+    T_frame_map = to_frame(scan_map, options.frame)
+    occupancy = scan_map.occupancy
+    voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
+
+    def corners(rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(8 N, 3) corners of N voxels, in the frame."""
+        lattice = voxels[rows, None] + _CORNERS * edges[rows, None, None]
+        return transform(T_frame_map, occupancy.origin + lattice.reshape(-1, 3) * occupancy.finest)
+
+    features = [
+        _feature(result.word, region, corners(region.rows), transform(T_frame_map, region.centroid))
+        for result in scan_map.query_words(words)
+        for region in result.regions
+    ]
+    collection = {
+        "type": "FeatureCollection",
+        "frame": options.frame,
+        "T_frame_map": T_frame_map.tolist(),
+        "unit": "metre",
+        "features": features,
+    }
+    path.write_text(json.dumps(collection, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _feature(word: str, region: Region, corners: NDArray[np.float64], centroid: NDArray[np.float64]) -> dict[str, Any]:
+    ring, area = outline(corners[:, :2])
+    return {
+        "type": "Feature",
+        "geometry": {"type": "Polygon", "coordinates": [ring.tolist()]},
+        "properties": {
+            "word": word,
+            "score": round(region.score, 4),
+            "confidence": round(region.confidence, 4),
+            "centroid": np.round(centroid, 4).tolist(),
+            "height_min_m": round(float(corners[:, 2].min()), 4),
+            "height_max_m": round(float(corners[:, 2].max()), 4),
+            "area_m2": round(area, 4),
+            "volume_m3": round(region.volume_m3, 6),
+        },
+    }
+
+
+def outline(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The convex hull of (N, 2) points that do not lie on a line, as a closed counter-clockwise ring of
+    corners to the millimetre, and its area."""
+    from scipy.spatial import ConvexHull
+
+    points = np.round(points[ConvexHull(points).vertices], 3)
+    hull = ConvexHull(points)  # again, for a turned lattice's corners along an edge are not quite on one line
+    return points[np.append(hull.vertices, hull.vertices[0])], float(hull.volume)

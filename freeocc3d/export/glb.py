@@ -1,0 +1,106 @@
+"""glTF binary: the occupied voxels as a coloured mesh for Blender, Unity, Unreal and web viewers.
+
+One mesh of the faces between occupied and other voxels, in the frame's coordinates; its node turns it so that up is +y,
+as glTF has it. The node's `extras` say which frame that is. Source: glTF 2.0 specification, Khronos Group.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import __version__
+from ..errors import ConfigError, ExportError
+from ..geometry import invert
+from ..occupancy.faces import exposed_faces
+from ..store import Map
+from .frames import Placed, check_frame, placed
+from .ply import COLORS, colors_of
+
+REQUIRES: tuple[str, ...] = ()
+
+_FLOAT, _UINT32, _UINT8 = 5126, 5125, 5121
+_VERTICES, _INDICES = 34962, 34963
+_Z_UP_TO_Y_UP = np.array([(1.0, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1)])
+
+
+@dataclass(frozen=True)
+class Options:
+    """Frame and colour."""
+
+    frame: str = "gravity"
+    """"gravity" (floor at 0), "first-camera" (origin there) or "map"; voxels keep their places in the last only, in the
+    others they are sampled anew."""
+    color: str = "rgb"
+    """"rgb" for the surface's own colour, "class", "height" or "probability", as of `ply`."""
+
+    def __post_init__(self) -> None:
+        check_frame(self.frame)
+        if self.color not in COLORS:
+            raise ConfigError(f"'color' must be {', '.join(COLORS[:-1])} or {COLORS[-1]}, got '{self.color}'.")
+
+
+def write(scan_map: Map, path: Path, options: Options) -> None:
+    """Write the mesh. Raises ExportError for a map without an occupied voxel."""
+    there = placed(scan_map, options.frame)
+    if not len(there.occupancy.colors):
+        raise ExportError("The map has no occupied voxel to write.")
+    positions, quads, rows = exposed_faces(there.occupancy)
+    triangles = quads[:, (0, 1, 2, 0, 2, 3)].astype(np.uint32)
+    colors = np.full((len(positions), 4), 255, np.uint8)  # with alpha, for attributes begin at multiples of 4 bytes
+    colors[:, :3] = np.repeat(_linear(colors_of(scan_map, there, options.color))[rows], 4, axis=0)
+    turned = np.eye(4)
+    turned[:3, :3] = (_Z_UP_TO_Y_UP @ scan_map.T_gravity_map @ invert(there.T_frame_map))[:3, :3]
+    to_y_up = turned if options.frame == "map" else _Z_UP_TO_Y_UP
+    body = b"".join(part.tobytes() for part in (positions.astype("<f4"), colors, triangles.astype("<u4")))
+    described = json.dumps(_described(there, positions, colors, triangles, to_y_up, len(body))).encode("utf-8")
+    described += b" " * (-len(described) % 4)
+    chunks = ((b"JSON", described), (b"BIN\0", body))
+    with path.open("wb") as stream:
+        stream.write(struct.pack("<4sII", b"glTF", 2, 12 + sum(8 + len(data) for _, data in chunks)))
+        for kind, data in chunks:
+            stream.write(struct.pack("<I4s", len(data), kind) + data)
+
+
+def _described(
+    there: Placed,
+    positions: NDArray[np.float32],
+    colors: NDArray[np.uint8],
+    triangles: NDArray[np.uint32],
+    to_y_up: NDArray[np.float64],
+    size: int,
+) -> dict[str, Any]:
+    views, start = [], 0
+    for array, target in ((positions, _VERTICES), (colors, _VERTICES), (triangles, _INDICES)):
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
+        start += array.nbytes
+    low, high = (bound.tolist() for bound in (positions.min(axis=0), positions.max(axis=0)))
+    return {
+        "asset": {"version": "2.0", "generator": f"freeocc3d {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "occupied", "mesh": 0, "matrix": to_y_up.T.ravel().tolist(), "extras": there.described()}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
+        "buffers": [{"byteLength": size}],
+        "bufferViews": views,
+        "accessors": [
+            {"bufferView": 0, "componentType": _FLOAT, "count": len(positions), "type": "VEC3", "min": low,
+             "max": high},
+            {"bufferView": 1, "componentType": _UINT8, "normalized": True, "count": len(colors), "type": "VEC4"},
+            {"bufferView": 2, "componentType": _UINT32, "count": triangles.size, "type": "SCALAR"},
+        ],
+    }  # fmt: skip
+
+
+def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Colours of the screen, sRGB, as the light that a renderer computes with and glTF's vertex colours are."""
+    c = np.arange(256) / 255.0
+    table = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return np.rint(255 * table).astype(np.uint8)[colors]

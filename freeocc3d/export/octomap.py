@@ -1,0 +1,108 @@
+"""OctoMap: an octree of free and occupied space, `.bt` (free or occupied), `.ot` (with log-odds, and colours).
+
+Read by MoveIt, OMPL's examples, octovis and whatever links OctoMap. The tree's resolution is the map's smallest voxel;
+a map of several voxel sizes becomes leaves of other depths. NAME.json beside it holds the frame.
+Source: the file formats of A. Hornung et al., OctoMap, Autonomous Robots 2013, as its library 1.9 writes them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError, ExportError
+from ..store import Map
+from ..types import FREE, OCCUPIED, Occupancy
+from .frames import check_frame, placed, write_description
+from .octree import KEY_ORIGIN, Leaves, Octree, octree
+
+REQUIRES: tuple[str, ...] = ()
+
+_CLAMP = np.log(0.1192 / 0.8808), np.log(0.971 / 0.029)
+"""OctoMap's own range of log-odds."""
+_LEAST = 0.05  # log-odds: an occupied voxel has more, a free one less than the negative
+_UNSET = 255  # of all three channels: OctoMap's colour of a node that has none
+
+
+@dataclass(frozen=True)
+class Options:
+    """Frame, and whether there are colours; a name that ends in .bt gives the binary form, in .ot the full one."""
+
+    frame: str = "gravity"
+    """"gravity" (z up, floor at 0), "first-camera" (z up, from there) or "map"; voxels keep their places in the last
+    only, in the others they are sampled anew."""
+    color: bool = False
+    """Write a ColorOcTree, for .ot: occupied leaves have the surface's colour."""
+
+    def __post_init__(self) -> None:
+        check_frame(self.frame)
+
+
+def write(scan_map: Map, path: Path, options: Options) -> None:
+    """Write the tree. Raises ConfigError for another ending than .bt and .ot or colours in a .bt; ExportError if
+    nothing is known, or the map is larger than a tree of its resolution can be."""
+    binary = path.suffix == ".bt"
+    if not binary and path.suffix != ".ot":
+        raise ConfigError(f"An OctoMap file is named .bt (free or occupied) or .ot (log-odds), got '{path.name}'.")
+    if binary and options.color:
+        raise ConfigError("A .bt holds no colours: name the file .ot.")
+    there = placed(scan_map, options.frame, origin=(0.0, 0.0, 0.0))
+    tree = octree(leaves(there.occupancy, log_odds=not binary, color=options.color))
+    with path.open("wb") as stream:
+        kind = "OcTree binary" if binary else "OcTree"
+        name = "ColorOcTree" if options.color else "OcTree"
+        header = f"# Octomap {kind} file\n# freeocc3d, {there.frame} frame, metres\nid {name}\nsize {len(tree)}\n"
+        stream.write(f"{header}res {there.occupancy.finest:.12g}\ndata\n".encode("ascii"))
+        stream.write(_binary_nodes(tree) if binary else _full_nodes(tree, options.color))
+    write_description(path, there.described())
+
+
+def leaves(occupancy: Occupancy, log_odds: bool, color: bool) -> list[Leaves]:
+    """The known voxels by size, the smallest first. log_odds: values from the voxels' probabilities, which keep each
+    voxel on its side; else all occupied and all free ones have one. Raises ExportError as ``write`` does."""
+    shift = np.rint(occupancy.origin / occupancy.finest).astype(np.int64)
+    corners = np.concatenate([occupancy.voxels(state) for state in (OCCUPIED, FREE)]) + shift
+    edges = np.concatenate([occupancy.edges(state) for state in (OCCUPIED, FREE)])
+    if not len(corners):
+        raise ExportError("Nothing of the map is known, neither free nor occupied: there is no tree to write.")
+    if corners.min() < -KEY_ORIGIN or (corners + edges[:, None]).max() > KEY_ORIGIN:
+        reach = KEY_ORIGIN * occupancy.finest
+        raise ExportError(
+            f"The map reaches farther than {reach:.0f} m from its origin, which is as far as an octree of "
+            f"{occupancy.finest:g} m voxels goes: export a part of it, or map with larger voxels."
+        )
+    states = np.repeat((OCCUPIED, FREE), [np.count_nonzero(occupancy.state == state) for state in (OCCUPIED, FREE)])
+    values = np.where(states == OCCUPIED, 1.0, -1.0).astype(np.float32)
+    if log_odds:
+        p = np.concatenate([occupancy.probability[occupancy.state == state] for state in (OCCUPIED, FREE)])
+        values = _log_odds(p, states == OCCUPIED)
+    colors = np.full((len(corners), 3), _UNSET, np.uint8)
+    if color:
+        colors[: len(occupancy.colors)] = np.minimum(occupancy.colors, _UNSET - 1)
+    sizes = [edges == 1 << height for height in range(occupancy.deepest + 1)]
+    return [Leaves(corners[own].astype(np.int32), values[own], colors[own]) for own in sizes]
+
+
+def _log_odds(probability: NDArray[np.float32], occupied: NDArray[np.bool_]) -> NDArray[np.float32]:
+    p = np.clip(probability, 1e-6, 1 - 1e-6)
+    odds = np.clip(np.log(p / (1 - p)), *_CLAMP)
+    return np.where(occupied, np.maximum(odds, _LEAST), np.minimum(odds, -_LEAST)).astype(np.float32)
+
+
+def _binary_nodes(tree: Octree) -> bytes:
+    """Two bytes for each node with children, two bits a child; leaves are told by their parents alone."""
+    return tree.kinds[tree.children > 0].astype("<u2").tobytes()
+
+
+def _full_nodes(tree: Octree, color: bool) -> bytes:
+    """Log-odds, colour if any, and which children there are, for each node."""
+    fields: list[tuple[Any, ...]] = [("value", "<f4"), *([("color", "u1", 3)] if color else []), ("children", "u1")]
+    nodes = np.empty(len(tree), fields)
+    nodes["value"], nodes["children"] = tree.values, tree.children
+    if color:
+        nodes["color"] = tree.colors
+    return nodes.tobytes()

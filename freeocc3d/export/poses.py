@@ -1,0 +1,111 @@
+"""Keyframes with poses, for COLMAP and nerfstudio: a folder that Gaussian splatting and NeRF trainers take.
+
+    colmap       FOLDER/sparse/0/{cameras,images,points3D}.txt and FOLDER/images/
+    nerfstudio   FOLDER/transforms.json, sparse_pc.ply and FOLDER/images/
+
+Points are the Gaussians' means. Source: COLMAP's "Output format", nerfstudio's "Data conventions".
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConfigError, ExportError
+from ..geometry import invert, rotations_to_quats, transform
+from ..store import Map
+from ..types import Gaussians, Intrinsics
+from .frames import check_frame, to_frame, write_description
+from .ply import write_ply
+
+REQUIRES: tuple[str, ...] = ()
+
+Views = list[tuple[Path, Intrinsics]]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Layout, frame, points."""
+
+    form: str = "colmap"
+    """"colmap" or "nerfstudio"."""
+    frame: str = "gravity"
+    """"gravity" (z up, floor at 0), "first-camera" (z up, from there) or "map"."""
+    points: int = 100_000
+    """At most so many of the Gaussians' means, evenly spread, as the points that training starts from."""
+
+    def __post_init__(self) -> None:
+        check_frame(self.frame)
+        if self.form not in ("colmap", "nerfstudio"):
+            raise ConfigError(f"'form' must be colmap or nerfstudio, got '{self.form}'.")
+        if self.points < 0:
+            raise ConfigError(f"'points' must not be negative, got {self.points}.")
+
+
+def write(scan_map: Map, path: Path, options: Options) -> None:
+    """Write the folder. Raises ExportError for a map without keyframes, MapError for a missing image."""
+    views = scan_map.keyframes.views()
+    T_frame_map = to_frame(scan_map, options.frame)
+    T_frame_cam = T_frame_map @ scan_map.trajectory.T_world_keyframe
+    if not views:
+        raise ExportError("The map has no keyframe to write.")
+    gaussians = scan_map.gaussians
+    chosen = gaussians[:: max(1, -(-len(gaussians) // options.points))] if options.points else gaussians[:0]
+    points = transform(T_frame_map, chosen.means.astype(np.float64))
+    (path / "images").mkdir(parents=True)
+    for image, _ in views:
+        shutil.copyfile(image, path / "images" / image.name)
+    form = _write_colmap if options.form == "colmap" else _write_nerfstudio
+    form(path, views, T_frame_cam, points, chosen)
+    write_description(path / "frame", {"frame": options.frame, "T_frame_map": T_frame_map.tolist()})
+
+
+def _write_colmap(
+    path: Path, views: Views, T_frame_cam: NDArray[np.float64], points: NDArray[np.float64], gaussians: Gaussians
+) -> None:
+    """World-to-camera poses, and pixel coordinates whose origin is the corner of the first pixel."""
+    folder = path / "sparse" / "0"
+    folder.mkdir(parents=True)
+    numbers: dict[Intrinsics, int] = {}
+    cameras, images = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"], ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"]
+    T_cam_frame = invert(T_frame_cam)
+    quats_wxyz = rotations_to_quats(T_cam_frame[:, :3, :3])
+    for row, (image, camera) in enumerate(views):
+        if camera not in numbers:
+            numbers[camera] = len(numbers) + 1
+            values = camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5
+            cameras.append(f"{numbers[camera]} PINHOLE {camera.width} {camera.height} {_numbers(values)}")
+        pose = _numbers((*quats_wxyz[row], *T_cam_frame[row, :3, 3]))
+        images += [f"{row + 1} {pose} {numbers[camera]} {image.name}", ""]
+    (folder / "cameras.txt").write_text("\n".join(cameras) + "\n", encoding="utf-8")
+    (folder / "images.txt").write_text("\n".join(images) + "\n", encoding="utf-8")
+    table = np.column_stack((np.arange(1, len(points) + 1), points, gaussians.colors, np.zeros(len(points))))
+    header = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
+    np.savetxt(folder / "points3D.txt", table, "%d %.6f %.6f %.6f %d %d %d %d", header=header)
+
+
+def _write_nerfstudio(
+    path: Path, views: Views, T_frame_cam: NDArray[np.float64], points: NDArray[np.float64], gaussians: Gaussians
+) -> None:
+    """Camera-to-world poses of OpenGL cameras, which look along -z with y up."""
+    frames: list[dict[str, Any]] = []
+    for (image, camera), T in zip(views, T_frame_cam * (1, -1, -1, 1), strict=True):
+        frames.append(
+            {
+                "file_path": f"images/{image.name}", "w": camera.width, "h": camera.height, "fl_x": camera.fx,
+                "fl_y": camera.fy, "cx": camera.cx + 0.5, "cy": camera.cy + 0.5, "transform_matrix": T.tolist(),
+            }
+        )  # fmt: skip
+    write_ply(path / "sparse_pc.ply", points.astype(np.float32), gaussians.colors)
+    told = {"camera_model": "OPENCV", "ply_file_path": "sparse_pc.ply", "frames": frames}
+    (path / "transforms.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(f"{float(value):.12g}" for value in values)
