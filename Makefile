@@ -10,6 +10,7 @@ demo: setup  ## build the built-in room, map it, ask it three words, write pictu
 	$(BIN)/freeocc3d demo -o demo --overwrite
 
 test: setup lint
+	@sh tools/test_clients.sh
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: setup
