@@ -12,7 +12,7 @@ from freeocc3d.capture.room import CUP_HEIGHT, CUPS
 from freeocc3d.errors import ConfigError, MapError
 from freeocc3d.export import export_map
 from freeocc3d.occupancy import levels
-from freeocc3d.query import connected
+from freeocc3d.occupancy.connected import connected
 from freeocc3d.store import Map
 from freeocc3d.types import FREE, OCCUPIED, Gaussians
 from freeocc3d.viewer.pictures import map_picture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from freeocc3d.language import matching, scoring
-from freeocc3d.query import connected
+from freeocc3d.occupancy.connected import connected
 
 
 def test_softmax_and_relevancy_are_those_of_their_definitions() -> None:

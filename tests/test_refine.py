@@ -11,8 +11,8 @@ from freeocc3d import pipeline, refine
 from freeocc3d.capture.room import CUP_HEIGHT, CUPS
 from freeocc3d.errors import MapError
 from freeocc3d.language.encoders import colour
+from freeocc3d.occupancy.connected import connected
 from freeocc3d.progress import Progress
-from freeocc3d.query import connected
 from freeocc3d.store import Map
 from freeocc3d.types import FREE
 
