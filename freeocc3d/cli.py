@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from . import __version__
-from .errors import ConfigError, FreeOccError
+from .errors import ConfigError, FreeOccError, ModelError
 from .files import refuse_existing
 from .progress import Progress
 
@@ -506,10 +506,17 @@ def models_verify(
     from .language import models
 
     folders = [path if (path := Path(name)).is_dir() else models.models_folder() / name for name in names or []]
+    damaged = []
     for folder in folders or [models.models_folder() / name for name in models.installed()]:
-        package = models.read(folder)
-        models.verify(package)
-        print(f"{folder}: {len(package.files)} files are as they should be")
+        try:
+            package = models.read(folder)
+            models.verify(package)
+        except ModelError as error:
+            damaged.append(str(error))
+        else:
+            print(f"{folder}: {len(package.files)} files are as they should be")
+    if damaged:
+        raise ModelError(" ".join(damaged))
 
 
 def _info(loaded: Any) -> dict[str, Any]:

@@ -260,9 +260,9 @@ def reconstruct(
     except (KeyboardInterrupt, SystemError) as error:
         if not _is_interrupt(error):
             raise
+        kept = f"The work up to the last checkpoint is in {work.folder}: run the same command with --resume to go on."
         raise Interrupted(
-            f"Stopped. The work up to the last checkpoint is in {work.folder}: run the same command with --resume to "
-            "go on."
+            f"Stopped. {kept if work.kept else 'There was no checkpoint yet, so nothing is kept.'}"
         ) from error
     except OSError as error:
         reason = "the disk is full" if error.errno == errno.ENOSPC else str(error.strerror or error).lower()

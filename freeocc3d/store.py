@@ -38,6 +38,8 @@ MANIFEST, CONFIG, REPORT, TRAJECTORY = "map.yaml", "config.yaml", "report.json",
 PATH_PICTURE, RENDER_PICTURE = "trajectory.png", "gaussians.png"
 GAUSSIANS, OCCUPANCY, FEATURES, KEYFRAMES = "gaussians.ply", "occupancy.npz", "features.npz", "keyframes"
 
+_DEEPEST = 12
+"""Level of the smallest voxels of any map: from 4 m down to a millimetre."""
 _OCCUPANCY_ARRAYS = {
     "keys": ("i", 2), "probability": ("f", 2), "free": ("u", 2), "hits": ("u", 2), "state": ("u", 2),
     "colors": ("u", 2), "feature_codes": ("u", 2),
@@ -79,14 +81,17 @@ class Map:
         arrays = read_arrays(self.path / OCCUPANCY, _OCCUPANCY_ARRAYS)
         blocks = len(arrays["keys"])
         occupied = int(np.count_nonzero(arrays["state"] == OCCUPIED))
-        shapes_fit = (
+        levels = arrays.get("levels", np.zeros(blocks, np.uint8))
+        arrays_fit = (
             arrays["keys"].shape == (blocks, 3)
             and all(arrays[name].shape == (blocks, BLOCK**3) for name in ("probability", "free", "hits", "state"))
             and arrays["colors"].shape == (occupied, 3)
             and arrays["feature_codes"].shape == (occupied, self._codec.code_bytes)
-            and ("levels" not in arrays or arrays["levels"].shape == (blocks,))
+            and levels.shape == (blocks,)
+            and levels.dtype == np.uint8
+            and levels.max(initial=0) <= _DEEPEST
         )
-        if not shapes_fit:
+        if not arrays_fit:
             raise MapError(f"{self.path / OCCUPANCY} is damaged: its arrays do not belong together.")
         return Occupancy(
             voxel_size=float(self.manifest["voxel_size_m"]),
@@ -98,7 +103,7 @@ class Map:
             state=arrays["state"].astype(np.uint8),
             features=cast(Any, CodedFeatures(self._codec, arrays["feature_codes"])),
             colors=arrays["colors"].astype(np.uint8),
-            levels=arrays["levels"].astype(np.uint8) if "levels" in arrays else np.zeros(blocks, np.uint8),
+            levels=levels,
         )
 
     @functools.cached_property

@@ -146,6 +146,11 @@ class WorkFolder:
         return features
 
     @property
+    def kept(self) -> bool:
+        """Whether there is a stage's result or a checkpoint to go on from."""
+        return (self.folder / _MARKS).is_file()
+
+    @property
     def answers(self) -> Path:
         """Where the answers about keyframes are kept, which say themselves to which questions."""
         return self.folder / _ANSWERS

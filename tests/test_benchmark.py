@@ -13,6 +13,7 @@ TOOLS = Path(__file__).parents[1] / "tools"
 sys.path.insert(0, str(TOOLS))
 
 import benchmark  # noqa: E402
+import language  # noqa: E402
 import variants  # noqa: E402
 
 
@@ -49,6 +50,14 @@ def test_every_part_of_a_few_frames(tmp_path: Path) -> None:
     assert "**not available**, needs the networks of CLIP, DINO and SAM" in lacking
     assert "0" not in lacking.split("|")[3]
     assert benchmark.moved(results, results) == "nothing moved"
+
+
+def test_lifting_has_a_row_for_each_grid() -> None:
+    figures = {"copy_bytes_per_second": 8e9, "30 x 40": 4e9, "120 x 160": 2e9, "peak_memory_bytes": 6e8}
+    assert [line[1] for line in language.lifting_lines(figures)] == [
+        "4.0 GB/s: 0.50 of a copy's 8.0",
+        "2.0 GB/s: 0.25 of a copy's 8.0",
+    ]
 
 
 def test_what_moved_is_told_by_figure() -> None:

@@ -15,8 +15,8 @@ from onnx import TensorProto, helper, numpy_helper
 from onnx_models import COLOURS, logits, write_classifier, write_identity, write_model
 
 import freeocc3d
-from freeocc3d import refine
-from freeocc3d.errors import CaptureError, ConfigError, FrameError, FreeOccError
+from freeocc3d import config, pipeline, refine
+from freeocc3d.errors import ConfigError, FrameError, FreeOccError
 from freeocc3d.language.encoders import segmenter
 from freeocc3d.language.encoders.segmenter import Options, SegmenterEncoder, SegmenterWords, load, load_text
 from freeocc3d.types import Frame, Intrinsics
@@ -171,8 +171,8 @@ def refused(tmp_path: Path, path: Path, told: str, **options: Any) -> None:
 
 
 def test_files_that_are_no_networks_are_told(tmp_path: Path) -> None:
-    refused(tmp_path, tmp_path / "absent.onnx", "There is no network")
-    refused(tmp_path, tmp_path, "There is no network")
+    refused(tmp_path, tmp_path / "absent.onnx", "There is no file .*language.segmenter.model")
+    refused(tmp_path, tmp_path, "There is no file .*language.segmenter.model")
     (tmp_path / "text.onnx").write_text("not a network")
     refused(tmp_path, tmp_path / "text.onnx", "ONNX")
     (tmp_path / "empty.onnx").write_bytes(b"")
@@ -207,8 +207,13 @@ def test_networks_that_fit_neither_classes_nor_sizes_are_told(tmp_path: Path) ->
     refused(tmp_path, tmp_path / "", "needs language.segmenter.model", model="")
     refused(tmp_path, net, "needs language.segmenter.classes", classes="")
     refused(tmp_path, net, "cpu", device="tpu")
-    with pytest.raises(CaptureError, match="Cannot read the class names"):
-        load(Options(model=str(net), classes=str(tmp_path / "absent.txt")))
+    refused(tmp_path, net, "There is no file .*language.segmenter.classes", classes=str(tmp_path / "absent.txt"))
+
+
+def test_files_that_are_not_there_are_told_before_any_work(tmp_path: Path) -> None:
+    settings = {"language": {"encoder": "segmenter", "segmenter": {"model": str(tmp_path / "absent.onnx")}}}
+    with pytest.raises(ConfigError, match=r"absent\.onnx, which language\.segmenter\.model names"):
+        pipeline.check(config.resolve(settings))
 
 
 def test_what_shapes_leave_open_is_told_before_there_is_work_to_lose(tmp_path: Path) -> None:

@@ -96,21 +96,40 @@ def test_asking_in_between_changes_nothing() -> None:
     np.testing.assert_allclose(asked.features(), silent.features(), atol=2e-3)
 
 
-def test_a_region_that_others_contradict_is_left_out_with_what_it_alone_shows() -> None:
-    """Three views of most of a wall; one more, of all of it, takes it for a vase where it is not something else."""
-    whole, most = everywhere(), everywhere(150)
+@pytest.mark.parametrize("seen_again", [150, 60])
+def test_a_region_that_others_contradict_is_left_out_with_what_it_alone_shows(seen_again: int) -> None:
+    """Three views of a part of a wall; one more, of all of it, takes it for a vase where it is not something else."""
+    whole, most = everywhere(), everywhere(seen_again)
     fused, plain = FeatureFusion(len(whole.rows), 8, 0.6), FeatureFusion(len(whole.rows), 8)
     for into in (fused, plain):
         for _ in range(3):
             into.add(most, half(8, WALL, np.eye(8)[2]))
         into.add(whole, half(8, VASE, np.eye(8)[2]))
     left = np.arange(len(whole.rows)) % SHAPE[1] < 8
-    once = np.arange(len(whole.rows)) >= 150
+    once = np.arange(len(whole.rows)) >= seen_again
     assert plain.features()[left & once, 1].all()  # the vase, for all that a mean knows
     found = fused.features()
     np.testing.assert_allclose(found[left & ~once], np.broadcast_to(WALL, (np.sum(left & ~once), 8)), atol=1e-2)
     assert not found[left & once].any()
     assert (found[~left, 2] > 0.99).all()  # the rest of that view stays, also where it is alone
+
+
+def test_where_all_views_contradict_each_other_what_is_said_most_stays() -> None:
+    """A thing that two views see as it is, and three others each take for something else."""
+    floor, *mistakes = np.eye(8)[2:6]
+    for order in np.random.default_rng(0).permuted(np.tile(np.arange(5), (6, 1)), axis=1):
+        fused = FeatureFusion(192, 8, 0.6)
+        for n in order:
+            fused.add(everywhere(), half(4, [VASE, VASE, *mistakes][n], floor))
+        left = np.arange(192) % SHAPE[1] < 4
+        np.testing.assert_allclose(fused.features()[left], np.broadcast_to(VASE, (48, 8)), atol=1e-2)
+
+
+def test_two_views_that_contradict_each_other_count_alike() -> None:
+    fused = FeatureFusion(192, 8, 0.6)
+    for thing in (WALL, VASE):
+        fused.add(everywhere(), half(16, thing, thing))
+    np.testing.assert_allclose(fused.features()[:, :2], np.sqrt(0.5), atol=1e-2)
 
 
 def test_differences_count_relative_to_the_scenes_own() -> None:

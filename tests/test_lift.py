@@ -20,7 +20,7 @@ WALL = gaussians([(x, y, 2.0) for x in np.linspace(-1, 1, 20) for y in np.linspa
 
 
 class Halves(Encoder):
-    """The left half of every image is one thing, the right half another; frame 7 cannot be encoded."""
+    """The left half of every image is one thing, the right half another; frame 7 cannot be encoded, and 9 overflows."""
 
     name, dimension = "halves", 2
 
@@ -33,7 +33,7 @@ class Halves(Encoder):
             raise FrameError("Frame 7 is broken.")
         if frame.index == 8:
             raise CaptureError("The class images are not there.")
-        return np.eye(2, dtype=np.float16)[None]
+        return np.eye(2, dtype=np.float16)[None] * np.float16(np.inf if frame.index == 9 else 1)
 
     def text_state(self) -> dict[str, Any]:
         return {}
@@ -76,6 +76,8 @@ def test_a_broken_frame_is_left_out_with_a_warning_and_others_faults_are_told() 
     told = Warnings()
     assert lift(WALL, frames(7, 2), poses(2), Halves(), None, told).any()
     assert told.said == ["Frame 7 is broken."]
+    assert np.isfinite(lift(WALL, frames(9, 2), poses(2), Halves(), None, told)).all()
+    assert "not finite for frame 9" in told.said[1]
     with pytest.raises(CaptureError):
         lift(WALL, frames(8), poses(1), Halves())
 

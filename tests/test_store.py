@@ -106,6 +106,18 @@ def test_damage_that_keeps_the_size_is_told_when_it_is_read(copy, name) -> None:
         _ = (loaded.occupancy, loaded.gaussian_features)
 
 
+@pytest.mark.parametrize("levels", [31, -1, 0.5, [0]])
+def test_levels_that_no_map_has_are_told(copy, levels) -> None:
+    with np.load(copy / "occupancy.npz") as file:
+        arrays = dict(file)
+    levels = np.array(levels) if isinstance(levels, list) else np.full(len(arrays["keys"]), levels)
+    np.savez(copy / "occupancy.npz", **arrays, levels=levels.astype(np.uint8) if levels.max() == 31 else levels)
+    manifest = yaml.safe_load((copy / "map.yaml").read_text())
+    edit(copy, files={**manifest["files"], "occupancy.npz": (copy / "occupancy.npz").stat().st_size})
+    with pytest.raises(MapError, match=r"occupancy\.npz is damaged"):
+        _ = store.load_map(copy).occupancy
+
+
 def test_a_damaged_manifest(copy) -> None:
     edit(copy, voxel_size_m="big")
     with pytest.raises(MapError, match="voxel_size_m"):

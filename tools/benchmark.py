@@ -62,7 +62,7 @@ UNFITTED = "rgbd_no_fitting"
 KERNELS = ("splat", "voxels", "query", "rasterizer", "encoders", "lifting")
 CLASSES = "rgbd_true_poses_closed_set"
 LAYER_3 = {
-    "fusion": f"class images with regions flipped at random, fused in the map of {CLASSES}; absent names asked of it",
+    "fusion": f"class images with regions flipped at random, fused in the map of {CLASSES}",
 }
 LAYER_1 = {
     "stress": "layer 1 on altered captures: what is reached, what is lost, and whether that is told",

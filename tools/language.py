@@ -1,4 +1,4 @@
-"""Figures of layer 3: what is left of mistaken class images after fusion, absent names, and the speed of lifting."""
+"""Figures of layer 3: what is left of mistaken class images after fusion, and the speed of lifting."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from kernels import copy_bytes_per_second
-from voxels import MODELS
 
 Figures = dict[str, Any]
 Line = tuple[str, str, str]
@@ -19,7 +18,6 @@ GRIDS = ((30, 40), (120, 160))
 FLIPPED, SEEDS, CELL_PX = 0.2, (0, 1, 2), 48
 KINDS = ("superpixels", "components")
 """Regions whose label is flipped: what a jittered grid of ``CELL_PX`` cuts each class into, or its connected parts."""
-ABSENT = 200
 
 
 def measure_lifting() -> Figures:
@@ -66,7 +64,6 @@ def measure_fusion(map_path: Path) -> Figures:
     found: Figures = {"nearest_true_label": scene.ceiling, "clean": scene.fused(encoder(None, 0))}
     for kind in KINDS:
         found[kind] = [scene.fused(encoder(kind, seed)) for seed in SEEDS]
-    found["absent"] = absent_names(scan_map, [scene.truth.classes[k] for k in scene.present])
     return found
 
 
@@ -220,34 +217,16 @@ def _slots(occupancy: Any, bins: Any) -> Any:
     return slots[np.searchsorted(pack(occupancy.keys), bins.packed)]
 
 
-def absent_names(scan_map: Any, present: list[str]) -> Figures:
-    """How many names of things that are not there return a region: of LVIS's and Objects365's names, those that are
-    neither a class of the scene nor a synonym of one."""
-    import numpy as np
-
-    from freeocc3d.language import vocabulary
-
-    path = MODELS / "clip_text_names.npz"
-    if not path.is_file():
-        return {}
-    there = {word for name in present for word in (vocabulary.normal(name), *vocabulary.synonyms(name))}
-    names = [name for name in np.load(path)["names"].tolist() if not vocabulary.synonyms(name) & there]
-    asked = [str(name) for name in np.random.default_rng(0).choice(names, ABSENT, replace=False)]
-    matched = [result.word for result in scan_map.query_words(asked) if result.matched]
-    return {"asked": len(asked), "matched": matched}
-
-
 def lifting_lines(figures: Figures) -> list[Line]:
     """What was measured, and what is asked for."""
     copy = figures["copy_bytes_per_second"]
     return [
         (
-            f"512-d features lifted, {name} cells",
-            f"{1e-9 * rate:.1f} GB/s: {rate / copy:.2f} of a copy's {1e-9 * copy:.1f}",
+            f"512-d features lifted, {grid} cells",
+            f"{1e-9 * figures[grid]:.1f} GB/s: {figures[grid] / copy:.2f} of a copy's {1e-9 * copy:.1f}",
             "1/3",
         )
-        for name, rate in figures.items()
-        if name != "copy_bytes_per_second"
+        for grid in ("{} x {}".format(*grid) for grid in GRIDS)
     ]
 
 
@@ -265,9 +244,4 @@ def fusion_lines(figures: Figures) -> list[str]:
     if not rows:
         return []
     titles = ["capture", f"{100 * FLIPPED:.0f} % flipped", "nearest true label", "mIoU ours", "mean", "last keyframe"]
-    lines = ["", *(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *rows))]
-    for capture, found in figures.items():
-        if absent := found.get("absent"):
-            said = ", ".join(absent["matched"]) or "none"
-            lines.append(f"\n{capture}: of {absent['asked']} absent names {len(absent['matched'])} match: {said}")
-    return lines
+    return ["", *(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *rows))]

@@ -7,7 +7,8 @@ takes so over the whole of it. So agreement is judged by regions of a view, conn
 disagreement is the mean of 1 - cos(z_t(u_t), f_k without view t) over the Gaussians in it that other views show,
 in units of what two random places of the scene differ by, 1 - |mean f|^2: 0 is agreement, 1 no more of it than by
 chance, for any encoder. Regions beyond ``disagreement`` are taken out, with what no other view shows in them: of a wall
-that is mistaken, also the part that is seen once.
+that is mistaken, also the part that is seen once. But of views that all contradict each other, the one that does so
+least stays: what is mistaken differently each time does not take with it what is right most often.
 
 The regions are judged by all views and taken out together, the worst first, so that the order of views matters only to
 rounding.
@@ -34,6 +35,8 @@ contradicted, too, until the worst are out."""
 _ROUNDS = 2  # after that
 _NOTHING_LEFT = 1e-3
 """Share of a Gaussian's weight, below which all of its views are taken out: what remains is rounding."""
+_TIED = 1e-3
+"""Regions whose disagreement differs by less are contradicted equally."""
 _LEAST_CONTRAST = 0.05
 """Of a scene that looks the same everywhere: differences below this share of it are noise."""
 
@@ -99,7 +102,9 @@ class FeatureFusion:
         little = _NOTHING_LEFT * self.weights
         for limit in self._limits():
             most = limit * self._contrast()
-            judged = [self._agreeing(view, most, little) for view in self._views]
+            off = [self._disagreement(view, little) for view in self._views]
+            least = self._least(off)
+            judged = [self._agreeing(view, own, least, most) for view, own in zip(self._views, off, strict=True)]
             for view, kept in zip(self._views, judged, strict=True):
                 self._keep(view, kept)
         norms = np.linalg.norm(self.sum, axis=1)
@@ -118,15 +123,35 @@ class FeatureFusion:
         mean = (known / np.where(known, norms, 1)).astype(np.float32) @ self.sum / max(np.count_nonzero(known), 1)
         return max(1.0 - float(mean @ mean), _LEAST_CONTRAST)
 
-    def _agreeing(self, view: _View, most: float, little: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(R,) the view's regions that the other views do not contradict; those that no other view shows are kept.
-        most: mean of 1 - cosine.  little: (N,) weights that are rounding."""
+    def _disagreement(self, view: _View, little: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(R,) mean of 1 - cosine of each of the view's regions with the other views, NaN where no other view shows any
+        of it. little: (N,) weights that are rounding."""
         own = np.where(view.kept[view.region[view.slots]], view.weights, np.float32(0))
         cosine = _agreement(view.rows, view.slots, own, view.codes, view.scales, self.sum, self.weights - little)
         other = np.isfinite(cosine)
         region, count = view.region[view.slots[other]], len(view.kept)
+        shown = np.bincount(region, minlength=count)
         off = np.bincount(region, 1.0 - cosine[other], count)
-        return np.asarray(off <= most * np.maximum(np.bincount(region, minlength=count), 1))
+        return np.where(shown > 0, off / np.maximum(shown, 1), np.nan).astype(np.float32)
+
+    def _least(self, off: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+        """(N,) least disagreement of the regions that show each Gaussian; infinite where only one does."""
+        least, views = np.full(len(self.weights), np.inf, np.float32), np.zeros(len(self.weights), np.int32)
+        for view, own in zip(self._views, off, strict=True):
+            least[view.rows] = np.fmin(least[view.rows], own[view.region[view.slots]])
+            views[view.rows] += 1
+        least[views < 2] = np.inf
+        return least
+
+    def _agreeing(
+        self, view: _View, off: NDArray[np.float32], least: NDArray[np.float32], most: float
+    ) -> NDArray[np.bool_]:
+        """(R,) the view's regions that the other views do not contradict, or not more than any other region at half of
+        the Gaussians that others show; those that no other view shows are kept. most: mean of 1 - cosine."""
+        region, least = view.region[view.slots], least[view.rows]
+        rivalled = np.bincount(region, np.isfinite(least), len(off))
+        best = np.bincount(region, np.isfinite(least) & (off[region] <= least + _TIED), len(off))
+        return np.asarray(~(off > most) | (2 * best >= rivalled))
 
     def _keep(self, view: _View, kept: NDArray[np.bool_]) -> None:
         """Take regions out of the sum, or back in."""

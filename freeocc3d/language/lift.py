@@ -74,13 +74,21 @@ def lift(
     for done, row in enumerate(chosen, start=1):
         frame = frames[row]
         try:
-            features = encoder.encode(frame)
+            features = _encoded(encoder, frame)
         except FrameError as error:
             progress.warn(str(error))
         else:
             fusion.add(seen(gaussians, frame, T_world_cam[row], options), features)
         progress.advance(done)
     return fusion.features()
+
+
+def _encoded(encoder: Encoder, frame: Frame) -> NDArray[np.float16]:
+    """The frame's features. Raises FrameError if they are not finite: a network in half precision may overflow."""
+    features = encoder.encode(frame)
+    if not np.isfinite(features).all():
+        raise FrameError(f"The encoder gives numbers that are not finite for frame {frame.index}: it is left out.")
+    return features
 
 
 def chosen_keyframes(

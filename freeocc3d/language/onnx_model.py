@@ -33,5 +33,5 @@ def load_session(path: Path, device: str = "cpu") -> Any:
     try:
         return ort.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # onnxruntime's exceptions have no common base of their own
-        said = " ".join(str(error).split())[:200]
+        said = " ".join(str(error).split())[:200].rstrip(".")
         raise ModelError(f"{path} is not an ONNX network that onnxruntime can run: {said}.") from error

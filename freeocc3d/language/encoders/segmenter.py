@@ -242,13 +242,21 @@ class SegmenterWords(LabelWords):
         return found, used
 
 
-def load(options: Options, capture: Capture | None = None) -> SegmenterEncoder:
-    """The encoder; it needs nothing of the capture. Raises ConfigError for files that cannot be used."""
-    for name in ("model", "classes"):
-        if not getattr(options, name):
+def check(options: Options) -> None:
+    """Raises ConfigError for a file that is not given, or not there."""
+    for name in ("model", "classes", "mapping", "embeddings"):
+        given = getattr(options, name)
+        if given == "":
             raise ConfigError(
                 f"The encoder 'segmenter' needs language.segmenter.{name}: a file. It has none of its own."
             )
+        if given is not None and not Path(given).is_file():
+            raise ConfigError(f"There is no file {given}, which language.segmenter.{name} names.")
+
+
+def load(options: Options, capture: Capture | None = None) -> SegmenterEncoder:
+    """The encoder; it needs nothing of the capture. Raises ConfigError for files that cannot be used."""
+    check(options)
     names = read_names(Path(options.classes))
     network = Network(Path(options.model), len(names), options)
     classes, grouping = read_mapping(Path(options.mapping), names) if options.mapping else (names, np.eye(len(names)))
