@@ -86,6 +86,19 @@ def test_order_of_views_matters_to_rounding_only(disagreement: float | None) -> 
         np.testing.assert_allclose(results[0], other, atol=2e-3)
 
 
+def test_views_in_a_file_say_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for room in (1 << 30, 0, 20):
+        monkeypatch.setattr(fusion, "_IN_MEMORY", room)
+        fused = FeatureFusion(SHAPE[0] * SHAPE[1], 8, 0.5)
+        for columns, other in ((0, WALL), (8, VASE), (16, WALL), (12, VASE)):
+            fused.add(everywhere(), half(columns, other, VASE))
+        found.append(fused.features())
+        assert (fused._file is None) == (room == 1 << 30)
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])
+
+
 def test_asking_in_between_changes_nothing() -> None:
     views = [(view(np.arange(100), n), half(4 + n, WALL, unit((8,), n))) for n in range(6)]
     asked, silent = FeatureFusion(100, 8, 0.6), FeatureFusion(100, 8, 0.6)

@@ -17,7 +17,9 @@ rounding.
 from __future__ import annotations
 
 import math
+import tempfile
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -37,6 +39,8 @@ _NOTHING_LEFT = 1e-3
 """Share of a Gaussian's weight, below which all of its views are taken out: what remains is rounding."""
 _TIED = 1e-3
 """Regions whose disagreement differs by less are contradicted equally."""
+_IN_MEMORY = 512 << 20
+"""Bytes of views' codes that are kept in memory; more are kept in a temporary file."""
 _LEAST_CONTRAST = 0.05
 """Of a scene that looks the same everywhere: differences below this share of it are noise."""
 
@@ -64,6 +68,7 @@ class FeatureFusion:
 
     Memory: 4 D + 4 bytes a Gaussian (float32 ``sum`` (N, D) and ``weights`` (N,)); and of each view, unless all are
     kept, 12 bytes a Gaussian that it shows and D + 8 a feature, which all Gaussians on like cells of a region share.
+    Features of many views, beyond 512 MB, lie in a temporary file.
     disagreement: see above; None keeps all.
     """
 
@@ -72,6 +77,8 @@ class FeatureFusion:
         self.sum = np.zeros((n_gaussians, dimension), np.float32)
         self.weights = np.zeros(n_gaussians, np.float32)
         self._views: list[_View] = []
+        self._in_memory = 0
+        self._file: Any = None
 
     def add(self, seen: Seen, features: NDArray[np.float16]) -> None:
         """Fuse the (h, w, D) features of a frame that shows ``seen``; their lengths are weights, zeros say nothing."""
@@ -93,7 +100,21 @@ class FeatureFusion:
         region = np.unique(first[used], return_inverse=True)[1].astype(np.int32)
         kept = np.ones(int(region.max()) + 1, bool)
         codes, scales = _coded(cells, used)
+        codes = self._stowed(codes)
         self._views.append(_View(rows, slot_of[own], weights, codes, scales, region, kept))
+
+    def _stowed(self, codes: NDArray[np.int8]) -> NDArray[np.int8]:
+        """The same codes, in a file that has no name if there are many already. Raises OSError: the disk is full."""
+        self._in_memory += codes.nbytes
+        if self._in_memory <= _IN_MEMORY:
+            return codes
+        self._in_memory -= codes.nbytes
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(prefix="freeocc3d-")  # noqa: SIM115 - it is open as long as it is mapped
+        start = self._file.seek(0, 2)
+        self._file.write(codes.tobytes())
+        self._file.flush()
+        return np.asarray(np.memmap(self._file, np.int8, "r", start, codes.shape))
 
     def features(self) -> NDArray[np.float16]:
         """(N, D) unit features; zero for a Gaussian that no view had anything to say of that others bear out."""
