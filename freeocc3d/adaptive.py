@@ -163,7 +163,8 @@ def refine_where_needed(
         (work.folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
         kept = {key: value for key, value in scan_map.manifest.items() if key not in ("format_version", "files")}
         counts = {**kept["counts"], "voxels": store.counts(occupancy)}
-        store.write_manifest(work.folder, {**kept, **store.sizes(occupancy), "counts": counts})
+        refined = {"map": str(scan_map.path.absolute())}
+        store.write_manifest(work.folder, {**kept, **store.sizes(occupancy), "refined": refined, "counts": counts})
         work.finish(Path(output))
     except BaseException as error:
         work.discard()

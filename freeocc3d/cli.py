@@ -567,7 +567,10 @@ def _info_text(facts: dict[str, Any]) -> str:
         f"frames     {facts['frames']} in the capture, {used} used, {facts['frames_with_pose']} with a pose, "
         f"{facts['keyframes']} keyframe{plural['keyframes']}, {facts['submaps']} submap{plural['submaps']}",
         *(
-            [f"refined    a box of {facts['refined']['map']}, whose frames and times these are"]
+            [
+                f"refined    {'a box of ' if 'box' in facts['refined'] else 'from '}{facts['refined']['map']}, whose "
+                "frames and times these are"
+            ]
             if facts["refined"]
             else []
         ),

@@ -161,7 +161,9 @@ def test_saved_loaded_exported_and_drawn(room: Map, fine: Map, tmp_path: Path) -
     facts = json.loads(run("info", fine.path, "--json").stdout)
     assert facts["voxel_size_m"] == 0.08
     assert facts["finest_voxel_m"] == 0.01
-    assert "edges 0.08 to 0.01 m" in run("info", fine.path).stdout
+    told = run("info", fine.path).stdout
+    assert "edges 0.08 to 0.01 m" in told
+    assert f"from {room.path}" in told
 
 
 def test_as_an_option_of_reconstruct_it_is_the_same_map(room: Map, tmp_path: Path) -> None:
