@@ -133,6 +133,9 @@ def query(
     scores: Annotated[str | None, typer.Option("--scores", help="cosine, softmax or relevancy.")] = None,
     ply: Annotated[Path | None, typer.Option("--ply", help="Write the map as PLY, matches coloured.")] = None,
     picture: Annotated[Path | None, typer.Option("--picture", help="Write a picture, matches coloured (PNG).")] = None,
+    views: Annotated[
+        bool, typer.Option("--views", help="With --json: also the keyframes that show each region best.")
+    ] = False,
     refine_to: Annotated[
         float | None,
         typer.Option("--refine", metavar="METRES", help="Look again with finer voxels, around the best match."),
@@ -148,6 +151,8 @@ def query(
 
     if output is not None and refine_to is None:
         raise typer.BadParameter("-o keeps the map that --refine makes: give --refine METRES.")
+    if views and not as_json:
+        raise typer.BadParameter("--views adds to the document of --json: give both.")
     if refine_to is not None and len(words) > 1:
         raise typer.BadParameter("--refine looks around the best match of one word.")
     options: dict[str, Any] = {}
@@ -171,10 +176,12 @@ def query(
             from .viewer import pictures
 
             pictures.query_picture(loaded, results, picture, overwrite)
-    if as_json:
-        print(json.dumps(asking.to_json(map_path, results)))
-    else:
-        print(asking.to_text(results))
+        if as_json:
+            from .details import details
+
+            print(json.dumps(asking.to_json(map_path, results, details(loaded, results, views))))
+        else:
+            print(asking.to_text(results))
 
 
 def _refined(loaded: Any, region: Any, voxel_size: float, output: Path, overwrite: bool) -> Any:

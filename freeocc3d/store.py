@@ -29,7 +29,9 @@ from .types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, Traject
 if TYPE_CHECKING:
     from .keyframes import Keyframes
     from .language.encoders.base import TextEncoder
-    from .query import QueryResult
+    from .places import OrientedBox
+    from .query import QueryResult, Region
+    from .region_views import View
 
 FORMAT_VERSION = 3
 _UNIFORM_VERSION = 2
@@ -190,6 +192,26 @@ class Map:
         checked = registry.build_options(query, options)
         named = self.scene_words if self.text_encoder.open_vocabulary else []
         return query.query(self.occupancy, self.text_encoder, words, checked, [*named, *contrast])
+
+    def box_of(self, region: Region) -> OrientedBox:
+        """The upright box of least level area around a region, turned as the region is."""
+        return self.boxes_of_each([region])[0]
+
+    def boxes_of_each(self, regions: Sequence[Region]) -> list[OrientedBox]:
+        """``box_of`` for several."""
+        from .places import oriented_boxes
+
+        return oriented_boxes(self.occupancy, regions, self.T_gravity_map)
+
+    def views_of(self, region: Region) -> list[View]:
+        """The up to three keyframes that show a region best, with the pixel box in each; see ``region_views``."""
+        return self.views_of_each([region])[0]
+
+    def views_of_each(self, regions: Sequence[Region]) -> list[list[View]]:
+        """``views_of`` for several, decoding each keyframe once."""
+        from .region_views import best_views
+
+        return best_views(self.occupancy, self.trajectory, self.keyframes, regions)
 
     @functools.cached_property
     def _feature_arrays(self) -> dict[str, NDArray[Any]]:

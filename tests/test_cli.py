@@ -52,6 +52,19 @@ def test_query_json(room) -> None:
     }  # fmt: skip
 
 
+def test_query_json_says_how_regions_stand_and_on_request_which_keyframes_show_them(room) -> None:
+    plain = json.loads(run("query", room, "red", "--json").stdout)["results"][0]["regions"]
+    seen = json.loads(run("query", room, "red", "--json", "--views").stdout)["results"][0]["regions"]
+    assert plain[0]["label"] == "red"
+    assert set(plain[0]["oriented_box"]) == {"extent", "yaw", "T_map_box"}
+    assert set(seen[0]) - set(plain[0]) == {"keyframes"}
+    assert 0 < len(seen[0]["keyframes"]) <= 3
+    x0, y0, x1, y1 = seen[0]["keyframes"][0]["box"]
+    assert 0 <= x0 < x1 < 160
+    assert 0 <= y0 < y1 < 120
+    assert "--json" in run("query", room, "red", "--views", code=2).stderr
+
+
 def test_query_text_ply_and_picture(room, tmp_path) -> None:
     done = run("query", room, "yellow", "--top", 1, "--ply", tmp_path / "q.ply", "--picture", tmp_path / "q.png")
     assert "yellow: 1 region" in done.stdout

@@ -1,0 +1,39 @@
+"""What ``query --json`` says of a region beyond what the query found: its upright box, and the keyframes it is in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from .query import QueryResult, Region
+from .store import Map
+
+
+def details(scan_map: Map, results: Sequence[QueryResult], views: bool = False) -> Callable[[Region], dict[str, Any]]:
+    """What gives further keys of a region, for ``query.to_json``.
+
+    oriented_box: extent (metres along its own axes), yaw (radians, gravity frame), T_map_box (4 x 4).
+    views: also keyframes, the frame, pixel box x0 y0 x1 y1 and visible share of those that show it best.
+    """
+    regions = [region for result in results for region in result.regions]
+    number = {id(region): n for n, region in enumerate(regions)}
+    boxes = scan_map.boxes_of_each(regions) if regions else []
+    seen = scan_map.views_of_each(regions) if views and regions else []
+
+    def more(region: Region) -> dict[str, Any]:
+        box = boxes[number[id(region)]]
+        said: dict[str, Any] = {
+            "oriented_box": {
+                "extent": box.extent.round(4).tolist(),
+                "yaw": round(box.yaw, 6),
+                "T_map_box": box.T_map_box.round(6).tolist(),
+            }
+        }
+        if views:
+            said["keyframes"] = [
+                {"frame": view.frame, "box": list(view.box), "visible": round(view.visible, 4)}
+                for view in seen[number[id(region)]]
+            ]
+        return said
+
+    return more
