@@ -133,6 +133,19 @@ def query(
     scores: Annotated[str | None, typer.Option("--scores", help="cosine, softmax or relevancy.")] = None,
     ply: Annotated[Path | None, typer.Option("--ply", help="Write the map as PLY, matches coloured.")] = None,
     picture: Annotated[Path | None, typer.Option("--picture", help="Write a picture, matches coloured (PNG).")] = None,
+    negative: Annotated[
+        list[str] | None, typer.Option("--not", metavar="WORD", help="What is not meant; repeatable.")
+    ] = None,
+    within: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option("--within", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Regions whose centroid is in a box, map frame."),
+    ] = None,
+    near: Annotated[
+        str | None,
+        typer.Option("--near", metavar="WORD[:METRES]", help="Regions with a gap to WORD of at most METRES [0.5]."),
+    ] = None,
+    on: Annotated[str | None, typer.Option("--on", metavar="WORD", help="Regions that stand on WORD.")] = None,
+    pick: Annotated[str | None, typer.Option("--pick", help="Only the largest, highest, lowest or best.")] = None,
     views: Annotated[
         bool, typer.Option("--views", help="With --json: also the keyframes that show each region best.")
     ] = False,
@@ -147,6 +160,7 @@ def query(
     import tempfile
 
     from . import query as asking
+    from .relations import Where, near_word
     from .store import load_map
 
     if output is not None and refine_to is None:
@@ -162,6 +176,10 @@ def query(
         options["threshold"] = threshold
     if scores is not None:
         options["scores"] = scores
+    options["negative"] = negative or []
+    if within or near or on or pick:
+        word, metres = near_word(near) if near else (None, Where.near_m)
+        options["where"] = Where(within, word, metres, on, pick)
     loaded = load_map(map_path)
     results = loaded.query_words(words, **options)
     with tempfile.TemporaryDirectory() as folder:  # for a map that nobody keeps

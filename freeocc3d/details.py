@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from .places import oriented_boxes
 from .query import QueryResult, Region
 from .store import Map
+
+if TYPE_CHECKING:
+    from .region_views import View
 
 
 def details(scan_map: Map, results: Sequence[QueryResult], views: bool = False) -> Callable[[Region], dict[str, Any]]:
@@ -17,8 +21,12 @@ def details(scan_map: Map, results: Sequence[QueryResult], views: bool = False) 
     """
     regions = [region for result in results for region in result.regions]
     number = {id(region): n for n, region in enumerate(regions)}
-    boxes = scan_map.boxes_of_each(regions) if regions else []
-    seen = scan_map.views_of_each(regions) if views and regions else []
+    boxes = oriented_boxes(scan_map.occupancy, regions, scan_map.T_gravity_map) if regions else []
+    seen: list[list[View]] = []
+    if views and regions:
+        from .region_views import best_views
+
+        seen = best_views(scan_map.occupancy, scan_map.trajectory, scan_map.keyframes, regions)
 
     def more(region: Region) -> dict[str, Any]:
         box = boxes[number[id(region)]]

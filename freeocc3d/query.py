@@ -119,20 +119,30 @@ def query(
     words: list[str],
     options: Options | None = None,
     contrast: Sequence[str] = (),
+    negative: Sequence[str] = (),
 ) -> list[QueryResult]:
     """Ask for several words; one that nothing matches gives no regions.
 
-    contrast: words for what else is there, besides those that the encoder names itself.
-    Raises FreeOccError for an empty or endless word, MapError if the map's features are not the encoder's.
+    contrast: words for what else is there, besides those that the encoder names itself.  negative: words for what is
+    not meant: a voxel whose plain cosine with one of them is higher than with the word does not match, though the word
+    should include it, as "table" includes a coffee table.
+    Raises FreeOccError for an empty, endless or excluded word or a negative one without a meaning, MapError if the
+    map's features are not the encoder's.
     """
     options = options or Options()
-    for word in words:
+    for word in (*words, *negative):
         if not word.strip():
             raise FreeOccError("An empty word cannot be looked for: give at least one word.")
         if len(word) > _LONGEST_WORD:
             raise FreeOccError(f"'{word[:30]}…' has {len(word)} characters; a query may have up to {_LONGEST_WORD}.")
     text = text_encoder.encode_words(words)
-    others = text_encoder.encode_words(list(dict.fromkeys((*text_encoder.contrast_words(), *contrast))))
+    excluded = text_encoder.encode_words(list(negative))
+    for word, part in zip(negative, excluded.understood, strict=True):
+        if not part:
+            raise FreeOccError(f"'{word}' cannot be excluded: this map knows only {text_encoder.knows}.")
+        if part in text.understood:
+            raise FreeOccError(f"'{word}' is asked for and excluded: leave one out.")
+    others = text_encoder.encode_words(list(dict.fromkeys((*text_encoder.contrast_words(), *contrast, *negative))))
     features = occupancy.features
     if len(features) and features.shape[1] != text.features.shape[1]:
         raise MapError(
@@ -163,6 +173,10 @@ def query(
     for w, (word, part) in enumerate(zip(words, text.understood, strict=True)):
         scores = every_score[:, w]
         rows, confidence = best[w]
+        if negative and len(rows):
+            meant = cosines(features[rows], text.features[w : w + 1])[:, 0]
+            allowed = meant >= cosines(features[rows], excluded.features).max(axis=1)
+            rows, confidence = rows[allowed], confidence[allowed]
         kept = matching.grown(scores[rows] >= threshold, functools.partial(connected, voxels[rows], edges[rows]))
         rows, confidence = rows[kept], confidence[kept]
         regions = _regions(occupancy, voxels, edges, rows, scores[rows], confidence, options, word)

@@ -34,7 +34,7 @@ def best_views(
     occupancy: Occupancy, trajectory: Trajectory, keyframes: Keyframes, regions: Sequence[Region], most: int = MOST
 ) -> list[list[View]]:
     """For each region, at most so many of the keyframes that show a part of it: those that show most voxels, to a tenth
-    of them, and of these the ones in whose images it is largest.
+    of what the best one shows, and of these the ones in whose images it is largest.
 
     A keyframe shows a voxel whose centre falls on a pixel with a depth that differs from the centre's by no more than
     the voxel's edge. Raises MapError for a broken keyframe.
@@ -61,8 +61,8 @@ def best_views(
             if shown.any():
                 half = 0.5 * np.stack((camera.fx, camera.fy)) * (size / z)[inside][shown, None]
                 box = _box(pixels[inside][shown], half, camera.width, camera.height)
-                found[region].append(View(int(frame), box, np.count_nonzero(shown) / len(points)))
-    return [sorted(views, key=_worth, reverse=True)[:most] for views in found]
+                found[region].append(View(int(frame), box, float(shown.sum() / len(points))))
+    return [_best(views)[:most] for views in found]
 
 
 def _box(pixels: NDArray[np.float64], half: NDArray[np.float64], width: int, height: int) -> tuple[int, int, int, int]:
@@ -72,6 +72,12 @@ def _box(pixels: NDArray[np.float64], half: NDArray[np.float64], width: int, hei
     return x0, y0, x1, y1
 
 
-def _worth(view: View) -> tuple[float, int]:
-    x0, y0, x1, y1 = view.box
-    return round(view.visible, 1), (x1 + 1 - x0) * (y1 + 1 - y0)
+def _best(views: list[View]) -> list[View]:
+    """The views, best first."""
+    most = max((view.visible for view in views), default=1.0)
+
+    def worth(view: View) -> tuple[float, int]:
+        x0, y0, x1, y1 = view.box
+        return round(view.visible / most, 1), (x1 + 1 - x0) * (y1 + 1 - y0)
+
+    return sorted(views, key=worth, reverse=True)

@@ -65,6 +65,21 @@ def test_query_json_says_how_regions_stand_and_on_request_which_keyframes_show_t
     assert "--json" in run("query", room, "red", "--views", code=2).stderr
 
 
+def test_query_with_conditions_on_places(room) -> None:
+    def corners(*arguments: object) -> list[list[float]]:
+        document = json.loads(run("query", room, *arguments, "--json").stdout)
+        return [region["box_min"] for region in document["results"][0]["regions"]]
+
+    every = corners("red")
+    assert len(every) > 1
+    assert len(corners("red", "--pick", "largest")) == 1
+    assert corners("red", "--within", -99, -99, -99, 99, 99, 99, "--near", "white:99") == every
+    assert "none is on 'unicorn'" in run("query", room, "red", "--on", "unicorn").stdout
+    assert "excluded" in refused("query", room, "red", "--not", "red")
+    assert "lies outside" in refused("query", room, "red", "--within", 98, 98, 98, 99, 99, 99)
+    assert "largest, highest" in refused("query", room, "red", "--pick", "nicest")
+
+
 def test_query_text_ply_and_picture(room, tmp_path) -> None:
     done = run("query", room, "yellow", "--top", 1, "--ply", tmp_path / "q.ply", "--picture", tmp_path / "q.png")
     assert "yellow: 1 region" in done.stdout

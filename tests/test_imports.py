@@ -19,7 +19,7 @@ FLOORS = (
     ("language",),
     ("occupancy",),
     ("query",),
-    ("places", "region_views"),
+    ("places", "region_views", "relations"),
     ("store", "palette"),
     ("export", "viewer", "work", "details"),
     ("evaluation",),
@@ -36,7 +36,7 @@ LAYERS = ("capture", "tracking", "gaussians", "language", "occupancy")
 HEAVY = {"open3d", "torch", "pyvista", "vtk", "numba", "pycolmap", "scipy", "cv2", "onnxruntime"}
 """Packages whose import takes a good part of a second."""
 
-FAST = ("store", "query", "places", "cli", "registry", "config", "__init__")
+FAST = ("store", "query", "places", "relations", "cli", "registry", "config", "__init__")
 """Modules that have to be imported in no time, for a query starts with them."""
 
 
