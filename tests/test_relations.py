@@ -100,13 +100,13 @@ def test_a_note_says_which_condition_nothing_met(room) -> None:
     assert "'unicorn' is not understood" in answer(room, "unicorn", Where(on="table")).note
 
 
-def mixed(seed: int, apart: float) -> tuple[Occupancy, Region, Region]:
+def mixed(seed: int, apart: float, density: float = 0.05) -> tuple[Occupancy, Region, Region]:
     """Two random regions of voxels of two sizes; the second lies the farther away the larger ``apart`` is."""
     rng = np.random.default_rng(seed)
     keys = np.array([(0, 0, 0), (2, 0, 0), (1, 1, 0)], np.int32)
     levels = np.array((0, 1, 0), np.uint8)
     keys[1, 0] += 2 * int(apart)
-    state = np.where(rng.random((3, BLOCK**3)) < 0.05, OCCUPIED, 0).astype(np.uint8)
+    state = np.where(rng.random((3, BLOCK**3)) < density, OCCUPIED, 0).astype(np.uint8)
     counts = np.zeros(state.shape, np.uint16)
     made = Occupancy(
         SIZE, np.array((0.3, 0.1, -2.0)), keys, np.ones(state.shape, np.float32), counts, counts, state, levels=levels
@@ -142,7 +142,7 @@ def test_gaps_are_those_of_all_pairs_in_a_map_of_two_sizes(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_standing_on_is_that_of_all_pairs_in_a_map_of_two_sizes(seed: int) -> None:
-    made, a, b = mixed(seed, apart=0)
+    made, a, b = mixed(seed, apart=0, density=0.2)
     voxels, edges = made.occupied_voxels(), made.occupied_edges()
     raised = a.rows[voxels[a.rows, 2] >= 6]
     a = Region(1.0, 1.0, a.centroid, a.box_min, a.box_max, 1.0, raised)
