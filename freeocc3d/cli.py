@@ -147,7 +147,7 @@ def query(
     on: Annotated[str | None, typer.Option("--on", metavar="WORD", help="Regions that stand on WORD.")] = None,
     pick: Annotated[str | None, typer.Option("--pick", help="Only the largest, highest, lowest or best.")] = None,
     views: Annotated[
-        bool, typer.Option("--views", help="With --json: also the keyframes that show each region best.")
+        bool, typer.Option("--views", help="With --json: also the keyframes that show each region, and where to stand.")
     ] = False,
     refine_to: Annotated[
         float | None,

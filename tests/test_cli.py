@@ -57,7 +57,7 @@ def test_query_json_says_how_regions_stand_and_on_request_which_keyframes_show_t
     seen = json.loads(run("query", room, "red", "--json", "--views").stdout)["results"][0]["regions"]
     assert plain[0]["label"] == "red"
     assert set(plain[0]["oriented_box"]) == {"extent", "yaw", "T_map_box"}
-    assert set(seen[0]) - set(plain[0]) == {"keyframes"}
+    assert set(seen[0]) - set(plain[0]) == {"keyframes", "stand"}
     assert 0 < len(seen[0]["keyframes"]) <= 3
     x0, y0, x1, y1 = seen[0]["keyframes"][0]["box"]
     assert 0 <= x0 < x1 < 160

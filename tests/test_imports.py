@@ -19,7 +19,7 @@ FLOORS = (
     ("language",),
     ("occupancy",),
     ("query",),
-    ("places", "region_views", "relations"),
+    ("places", "region_views", "relations", "standing"),
     ("store", "palette"),
     ("export", "viewer", "work", "details"),
     ("evaluation",),
