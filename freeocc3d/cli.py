@@ -209,17 +209,17 @@ def query(
             from .viewer import pictures
 
             pictures.query_picture(loaded, results, picture, overwrite)
-        print(_answer(loaded, results, as_json, views))
+        print(_answer(map_path, loaded, results, as_json, views))
 
 
-def _answer(loaded: Any, results: list[Any], as_json: bool, views: bool) -> str:
+def _answer(map_path: Path, loaded: Any, results: list[Any], as_json: bool, views: bool) -> str:
     from . import query as asking
 
     if not as_json:
         return asking.to_text(results)
     from .details import details
 
-    return json.dumps(asking.to_json(loaded.path, results, details(loaded, results, views)))
+    return json.dumps(asking.to_json(map_path, results, details(loaded, results, views)))
 
 
 def _answer_lines(loaded: Any, options: dict[str, Any], as_json: bool, views: bool) -> None:
@@ -235,7 +235,8 @@ def _answer_lines(loaded: Any, options: dict[str, Any], as_json: bool, views: bo
         if not words:
             continue
         try:
-            print(_answer(loaded, loaded.query_words(words, **options), as_json, views), flush=True)
+            results = loaded.query_words(words, **options)
+            print(_answer(loaded.path, loaded, results, as_json, views), flush=True)
         except FreeOccError as error:
             said = " ".join(str(error).split())
             if as_json:

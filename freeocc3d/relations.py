@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,6 +147,7 @@ class _Space:
         first = first - (first @ up) * up
         first /= np.linalg.norm(first)
         self.R_level_map = np.stack((first, np.cross(up, first), up))
+        self._trees: dict[tuple[int, ...], Any] = {}  # of references, mostly the same for all regions
 
     def refuse_outside(self, within: Sequence[float]) -> None:
         """Raises MapError unless the box has a part in common with the one around all occupied voxels."""
@@ -162,13 +164,15 @@ class _Space:
         """Whether the gap between any two voxels is at most so many metres."""
         from scipy.spatial import KDTree
 
-        rows = _others(region, references)
-        if not len(rows):
+        others = _others(region, references)
+        if not others:
             return False
         # The nearest points of two cubes of a lattice are found among the lattice's points in both.
-        mine, theirs = self._lattice_points(region.rows), self._lattice_points(rows)
+        key = tuple(map(id, others))
+        if key not in self._trees:
+            self._trees[key] = KDTree(self._lattice_points(_rows(others)))
         reach = distance / self.occupancy.finest * (1 + 1e-9) + 1e-9
-        gaps = KDTree(theirs).query(mine, distance_upper_bound=reach)[0]
+        gaps = self._trees[key].query(self._lattice_points(region.rows), distance_upper_bound=reach)[0]
         return bool(np.isfinite(gaps).any())
 
     def on(self, region: Region, references: Sequence[Region]) -> bool:
@@ -179,17 +183,16 @@ class _Space:
         mine, edges = self._level(region.rows)
         bottom = mine[:, 2] - edges / 2
         under = bottom <= bottom.min() + _LOWEST * size
-        rows = _others(region, references)
-        theirs, their_edges = self._level(rows)
+        theirs, their_edges = self._level(_rows(_others(region, references)))
         middle, half = sum(_ON_GAP) / 2 * size, (_ON_GAP[1] - _ON_GAP[0]) / 2 * size
         for edge in np.unique(edges[under]):
             for their_edge in np.unique(their_edges):
                 reach = (edge + their_edge) / 2
                 scale = 1.0, 1.0, reach / half  # so that all three conditions are one distance
-                above = mine[under & (edges == edge)] - (0.0, 0.0, reach + middle)
-                gaps = KDTree(theirs[their_edges == their_edge] * scale).query(
-                    above * scale, p=np.inf, distance_upper_bound=reach * _OVERLAP
-                )[0]
+                above = (mine[under & (edges == edge)] - (0.0, 0.0, reach + middle)) * scale
+                below = theirs[their_edges == their_edge] * scale
+                below = below[((below > above.min(axis=0) - reach) & (below < above.max(axis=0) + reach)).all(axis=1)]
+                gaps = KDTree(below).query(above, p=np.inf, distance_upper_bound=reach * _OVERLAP)[0]
                 if np.isfinite(gaps).any():
                     return True
         return False
@@ -211,7 +214,11 @@ class _Space:
         return every[np.unique(packed_voxels(every), return_index=True)[1]]
 
 
-def _others(region: Region, references: Sequence[Region]) -> NDArray[np.int64]:
-    """Rows of the references that share none with the region."""
-    apart = [other.rows for other in references if not np.isin(other.rows, region.rows).any()]
-    return np.concatenate(apart) if apart else np.zeros(0, np.int64)
+def _others(region: Region, references: Sequence[Region]) -> list[Region]:
+    """The references that share no voxel with the region."""
+    return [other for other in references if not np.isin(other.rows, region.rows).any()]
+
+
+def _rows(regions: Sequence[Region]) -> NDArray[np.int64]:
+    """Rows of all their voxels."""
+    return np.concatenate([np.zeros(0, np.int64), *(region.rows for region in regions)])

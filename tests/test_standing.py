@@ -107,6 +107,17 @@ def test_a_turned_gravity_frame_gives_the_same_place() -> None:
     assert np.linalg.norm(at[:2] - 2.1) < 0.2
 
 
+def test_a_map_of_small_voxels_in_larger_ones_has_the_same_place() -> None:
+    made, region = room(((20, 20, 20), (22, 22, 22)))
+    smaller = made.replace(voxel_size=2 * SIZE, levels=np.ones(len(made.keys), np.uint8))
+    assert smaller.finest == SIZE
+    T = T_GRAVITY_MAP.copy()
+    T[2, 3] = -SIZE
+    (at,) = standing_places(smaller, T, [region])
+    assert at is not None
+    assert np.linalg.norm(at[:2] - 2.1) < 0.3
+
+
 def test_a_map_without_a_voxel_has_no_place() -> None:
     made, region = room(CUP)
     empty = made.replace(state=np.zeros_like(made.state), colors=np.zeros((0, 3), np.uint8))
