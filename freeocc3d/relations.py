@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -87,11 +88,11 @@ def only_where(
     there = _Space(occupancy, up)
     if where.within is not None:
         there.refuse_outside(where.within)
-    by_word = dict(zip(where.words, references, strict=True))
+    conditions = _conditions(there, where, dict(zip(where.words, references, strict=True)))
     narrowed = []
     for result in results:
         regions, note = result.regions, result.note
-        for kept, condition in _conditions(there, where, by_word):
+        for kept, condition in conditions:
             left = [region for region in regions if kept(region)]
             if regions and not left:
                 count = f"{len(regions)} region{'s' if len(regions) > 1 else ''}"
@@ -112,11 +113,13 @@ def _conditions(
         conditions.append((lambda r: bool(((r.centroid >= low) & (r.centroid <= high)).all()), inside))
     if where.near is not None:
         near = by_word[where.near]
+        those_near = _References(there, near.regions)
         told = f"within {where.near_m:g} m of '{where.near}'" + _absent(near)
-        conditions.append((lambda r: there.near(r, near.regions, where.near_m), told))
+        conditions.append((lambda r: there.near(r, those_near, where.near_m), told))
     if where.on is not None:
         on = by_word[where.on]
-        conditions.append((lambda r: there.on(r, on.regions), f"on '{where.on}'" + _absent(on)))
+        those_below = _References(there, on.regions)
+        conditions.append((lambda r: there.on(r, those_below), f"on '{where.on}'" + _absent(on)))
     return conditions
 
 
@@ -147,7 +150,6 @@ class _Space:
         first = first - (first @ up) * up
         first /= np.linalg.norm(first)
         self.R_level_map = np.stack((first, np.cross(up, first), up))
-        self._trees: dict[tuple[int, ...], Any] = {}  # of references, mostly the same for all regions
 
     def refuse_outside(self, within: Sequence[float]) -> None:
         """Raises MapError unless the box has a part in common with the one around all occupied voxels."""
@@ -160,30 +162,21 @@ class _Space:
             spans = f"{' '.join(f'{v:.2f}' for v in low)} to {' '.join(f'{v:.2f}' for v in high)}"
             raise MapError(f"The box lies outside of the map, which reaches from {spans} m.")
 
-    def near(self, region: Region, references: Sequence[Region], distance: float) -> bool:
+    def near(self, region: Region, references: _References, distance: float) -> bool:
         """Whether the gap between any two voxels is at most so many metres."""
-        from scipy.spatial import KDTree
-
-        others = _others(region, references)
-        if not others:
-            return False
         # The nearest points of two cubes of a lattice are found among the lattice's points in both.
-        key = tuple(map(id, others))
-        if key not in self._trees:
-            self._trees[key] = KDTree(self._lattice_points(_rows(others)))
         reach = distance / self.occupancy.finest * (1 + 1e-9) + 1e-9
-        gaps = self._trees[key].query(self._lattice_points(region.rows), distance_upper_bound=reach)[0]
+        tree = references.tree(references.shared(region))
+        gaps = tree.query(self.lattice_points(region.rows), distance_upper_bound=reach)[0]
         return bool(np.isfinite(gaps).any())
 
-    def on(self, region: Region, references: Sequence[Region]) -> bool:
+    def on(self, region: Region, references: _References) -> bool:
         """Whether any voxel of the underside stands over a voxel of the others; see ``Where``."""
-        from scipy.spatial import KDTree
-
         size = self.occupancy.voxel_size
         mine, edges = self._level(region.rows)
         bottom = mine[:, 2] - edges / 2
         under = bottom <= bottom.min() + _LOWEST * size
-        theirs, their_edges = self._level(_rows(_others(region, references)))
+        theirs, their_edges = self._level(references.apart(references.shared(region)))
         middle, half = sum(_ON_GAP) / 2 * size, (_ON_GAP[1] - _ON_GAP[0]) / 2 * size
         for edge in np.unique(edges[under]):
             for their_edge in np.unique(their_edges):
@@ -192,18 +185,22 @@ class _Space:
                 above = (mine[under & (edges == edge)] - (0.0, 0.0, reach + middle)) * scale
                 below = theirs[their_edges == their_edge] * scale
                 below = below[((below > above.min(axis=0) - reach) & (below < above.max(axis=0) + reach)).all(axis=1)]
-                gaps = KDTree(below).query(above, p=np.inf, distance_upper_bound=reach * _OVERLAP)[0]
+                gaps = _tree(below).query(above, p=np.inf, distance_upper_bound=reach * _OVERLAP)[0]
                 if np.isfinite(gaps).any():
                     return True
         return False
 
-    def _level(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(n, 3) centres in a frame with z up, and (n,) edges, metres."""
-        edges = self.edges[rows]
-        centers = self.occupancy.centers(self.voxels[rows], edges)
-        return centers @ self.R_level_map.T, np.asarray(edges * self.occupancy.finest, np.float64)
+    @functools.cached_property
+    def _every_level(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(V, 3) centres in a frame with z up, and (V,) edges, metres."""
+        centers = self.occupancy.centers(self.voxels, self.edges)
+        return centers @ self.R_level_map.T, np.asarray(self.edges * self.occupancy.finest, np.float64)
 
-    def _lattice_points(self, rows: NDArray[np.int64]) -> NDArray[np.int32]:
+    def _level(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        centers, edges = self._every_level
+        return centers[rows], edges[rows]
+
+    def lattice_points(self, rows: NDArray[np.int64]) -> NDArray[np.int32]:
         """(P, 3) distinct points of the finest lattice in and on voxels."""
         points = [np.zeros((0, 3), np.int32)]
         for edge in np.unique(self.edges[rows]).tolist():
@@ -214,11 +211,29 @@ class _Space:
         return every[np.unique(packed_voxels(every), return_index=True)[1]]
 
 
-def _others(region: Region, references: Sequence[Region]) -> list[Region]:
-    """The references that share no voxel with the region."""
-    return [other for other in references if not np.isin(other.rows, region.rows).any()]
+class _References:
+    """The regions of a word that others are compared with."""
+
+    def __init__(self, there: _Space, regions: Sequence[Region]):
+        self._regions = regions
+        self._owner = np.full(len(there.voxels), -1, np.int64)
+        for number, region in enumerate(regions):
+            self._owner[region.rows] = number
+        self.apart = functools.lru_cache(maxsize=2)(self._rows_apart)
+        self.tree = functools.lru_cache(maxsize=2)(lambda shared: _tree(there.lattice_points(self.apart(shared))))
+
+    def shared(self, region: Region) -> tuple[int, ...]:
+        """Numbers of those that share a voxel with the region, mostly none."""
+        own = np.unique(self._owner[region.rows])
+        return tuple(own[own >= 0].tolist())
+
+    def _rows_apart(self, shared: tuple[int, ...]) -> NDArray[np.int64]:
+        """Rows of the voxels of all others."""
+        others = (region.rows for number, region in enumerate(self._regions) if number not in shared)
+        return np.concatenate([np.zeros(0, np.int64), *others])
 
 
-def _rows(regions: Sequence[Region]) -> NDArray[np.int64]:
-    """Rows of all their voxels."""
-    return np.concatenate([np.zeros(0, np.int64), *(region.rows for region in regions)])
+def _tree(points: NDArray[np.generic]) -> Any:
+    from scipy.spatial import KDTree
+
+    return KDTree(points)

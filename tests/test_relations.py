@@ -8,7 +8,7 @@ from test_query import SIZE, WORDS, box, feature, occupancy
 
 from freeocc3d.errors import ConfigError, FreeOccError, MapError
 from freeocc3d.query import Options, Region, query
-from freeocc3d.relations import Where, _Space, near_word, only_where
+from freeocc3d.relations import Where, _References, _Space, near_word, only_where
 from freeocc3d.types import BLOCK, OCCUPIED, Occupancy
 
 UP = np.array((0.0, 0.0, 1.0))
@@ -135,9 +135,9 @@ def test_gaps_are_those_of_all_pairs_in_a_map_of_two_sizes(seed: int) -> None:
     made, a, b = mixed(seed, apart=seed)
     a, b = (Region(1.0, 1.0, r.centroid, r.box_min, r.box_max, 1.0, r.rows[::3]) for r in (a, b))
     true, space = gap(made, a, b), _Space(made, UP)
-    assert space.near(a, [b], true)
+    assert space.near(a, _References(space, [b]), true)
     if true > 0:
-        assert not space.near(a, [b], true - 0.01 * SIZE)
+        assert not space.near(a, _References(space, [b]), true - 0.01 * SIZE)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -153,7 +153,8 @@ def test_standing_on_is_that_of_all_pairs_in_a_map_of_two_sizes(seed: int) -> No
         for j in b.rows:
             over = (voxels[i] < voxels[j] + edges[j])[:2].all() and (voxels[j] < voxels[i] + edges[i])[:2].all()
             stands |= bool(over and -1 < voxels[i, 2] - voxels[j, 2] - edges[j] < 3)
-    assert _Space(made, UP).on(a, [b]) == stands
+    space = _Space(made, UP)
+    assert space.on(a, _References(space, [b])) == stands
 
 
 @pytest.mark.parametrize(
