@@ -126,13 +126,37 @@ def reconstruct(
 @app.command()
 def query(
     map_path: MapPath,
-    words: Annotated[list[str], typer.Argument(metavar="WORD...", help="Words or quoted phrases.")],
+    words: Annotated[
+        list[str] | None, typer.Argument(metavar="WORD...", help="Words or quoted phrases.", show_default=False)
+    ] = None,
     as_json: Json = False,
+    interactive: Annotated[
+        bool,
+        typer.Option(
+            "--interactive", help="Keep the map loaded and answer each line of the input, phrases separated by commas."
+        ),
+    ] = False,
     top: Annotated[int | None, typer.Option("--top", metavar="K", help="At most K regions a word.")] = None,
     threshold: Annotated[float | None, typer.Option("--threshold", help="Least score, 0…1.")] = None,
     scores: Annotated[str | None, typer.Option("--scores", help="cosine, softmax or relevancy.")] = None,
     ply: Annotated[Path | None, typer.Option("--ply", help="Write the map as PLY, matches coloured.")] = None,
     picture: Annotated[Path | None, typer.Option("--picture", help="Write a picture, matches coloured (PNG).")] = None,
+    negative: Annotated[
+        list[str] | None, typer.Option("--not", metavar="WORD", help="What is not meant; repeatable.")
+    ] = None,
+    within: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option("--within", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Regions whose centroid is in a box, map frame."),
+    ] = None,
+    near: Annotated[
+        str | None,
+        typer.Option("--near", metavar="WORD[:METRES]", help="Regions with a gap to WORD of at most METRES [0.5]."),
+    ] = None,
+    on: Annotated[str | None, typer.Option("--on", metavar="WORD", help="Regions that stand on WORD.")] = None,
+    pick: Annotated[str | None, typer.Option("--pick", help="Only the largest, highest, lowest or best.")] = None,
+    views: Annotated[
+        bool, typer.Option("--views", help="With --json: also the keyframes that show each region, and where to stand.")
+    ] = False,
     refine_to: Annotated[
         float | None,
         typer.Option("--refine", metavar="METRES", help="Look again with finer voxels, around the best match."),
@@ -143,11 +167,18 @@ def query(
     """Ask a map where something is."""
     import tempfile
 
-    from . import query as asking
+    from .relations import Where, near_word
     from .store import load_map
 
+    words = words or []
+    if interactive == bool(words):
+        raise typer.BadParameter("give words to look for, or --interactive without any.")
+    if interactive and (ply or picture or refine_to is not None):
+        raise typer.BadParameter("--interactive answers in text or JSON: leave out --ply, --picture and --refine.")
     if output is not None and refine_to is None:
         raise typer.BadParameter("-o keeps the map that --refine makes: give --refine METRES.")
+    if views and not as_json:
+        raise typer.BadParameter("--views adds to the document of --json: give both.")
     if refine_to is not None and len(words) > 1:
         raise typer.BadParameter("--refine looks around the best match of one word.")
     options: dict[str, Any] = {}
@@ -157,7 +188,14 @@ def query(
         options["threshold"] = threshold
     if scores is not None:
         options["scores"] = scores
+    options["negative"] = negative or []
+    if any(condition is not None for condition in (within, near, on, pick)):
+        word, metres = (None, Where.near_m) if near is None else near_word(near)
+        options["where"] = Where(within, word, metres, on, pick)
     loaded = load_map(map_path)
+    if interactive:
+        _answer_lines(loaded, options, as_json, views)
+        return
     results = loaded.query_words(words, **options)
     with tempfile.TemporaryDirectory() as folder:  # for a map that nobody keeps
         if refine_to is not None and results[0].matched:
@@ -171,10 +209,40 @@ def query(
             from .viewer import pictures
 
             pictures.query_picture(loaded, results, picture, overwrite)
-    if as_json:
-        print(json.dumps(asking.to_json(map_path, results)))
-    else:
-        print(asking.to_text(results))
+        print(_answer(map_path, loaded, results, as_json, views))
+
+
+def _answer(map_path: Path, loaded: Any, results: list[Any], as_json: bool, views: bool) -> str:
+    from . import query as asking
+
+    if not as_json:
+        return asking.to_text(results)
+    from .details import details
+
+    return json.dumps(asking.to_json(map_path, results, details(loaded, results, views)))
+
+
+def _answer_lines(loaded: Any, options: dict[str, Any], as_json: bool, views: bool) -> None:
+    """Answer each line of the standard input until it ends. A line that cannot be answered is told why, in JSON by a
+    document with "error" in place of "results", so that every line that is not empty has its document."""
+    while True:
+        if sys.stdin.isatty():
+            print("> ", end="", file=sys.stderr, flush=True)
+        line = sys.stdin.readline()
+        if not line:
+            return
+        words = [word.strip() for word in line.split(",") if word.strip()]
+        if not words:
+            continue
+        try:
+            results = loaded.query_words(words, **options)
+            print(_answer(loaded.path, loaded, results, as_json, views), flush=True)
+        except FreeOccError as error:
+            said = " ".join(str(error).split())
+            if as_json:
+                print(json.dumps({"version": __version__, "map": str(loaded.path), "error": said}), flush=True)
+            else:
+                print(f"freeocc3d: {said}", file=sys.stderr, flush=True)
 
 
 def _refined(loaded: Any, region: Any, voxel_size: float, output: Path, overwrite: bool) -> Any:

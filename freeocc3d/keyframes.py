@@ -98,16 +98,26 @@ class Keyframes(Sequence[Frame]):
         """The colour image's file and the camera of each, without decoding anything."""
         return [(self._paths(int(entry["frame"]))[0], _camera(entry)) for entry in self._entries]
 
+    def depth_m(self, row: int) -> NDArray[np.float32]:
+        """(H, W) depth of one, whose colour is not decoded; 0 = no measurement."""
+        return self._read_depth(self._entries[row])
+
     def _read(self, entry: dict[str, float]) -> Frame:
         index = int(entry["frame"])
         camera = _camera(entry)
-        color_path, depth_path = self._paths(index)
+        color_path = self._paths(index)[0]
         color = _decode(color_path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        units = _decode(depth_path, cv2.IMREAD_UNCHANGED)
-        if color.shape != (camera.height, camera.width, 3) or units.shape != color.shape[:2]:
-            raise MapError(f"{color_path} or its depth does not have the size that {INDEX} states.")
-        depth_m = units.astype(np.float32) / np.float32(_UNITS_PER_METRE)
+        depth_m = self._read_depth(entry)
+        if color.shape != (*depth_m.shape, 3):
+            raise MapError(f"{color_path} does not have the size that {INDEX} states.")
         return Frame(index, entry["timestamp"], cv2.cvtColor(color, cv2.COLOR_BGR2RGB), depth_m, camera)
+
+    def _read_depth(self, entry: dict[str, float]) -> NDArray[np.float32]:
+        camera, path = _camera(entry), self._paths(int(entry["frame"]))[1]
+        units = _decode(path, cv2.IMREAD_UNCHANGED)
+        if units.shape != (camera.height, camera.width):
+            raise MapError(f"{path} does not have the size that {INDEX} states.")
+        return np.asarray(units.astype(np.float32) / np.float32(_UNITS_PER_METRE))
 
     def _paths(self, index: int) -> tuple[Path, Path]:
         """Colour and depth image of a frame."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -74,7 +74,7 @@ class Region:
     as if a litre that does not match belonged to it.  confidence: 0…1, mean softmax probability of the word against
     the contrast words, at the encoder's temperature.  centroid: (3,) mean of the voxels' centres, map frame, metres.
     box_min, box_max: (3,) corners of the axis-aligned box around the voxels, faces included, metres.  rows: (n,) rows
-    of ``Occupancy.occupied_voxels()``.
+    of ``Occupancy.occupied_voxels()``.  label: the word that it was found by.
     """
 
     score: float
@@ -84,6 +84,7 @@ class Region:
     box_max: NDArray[np.float64]
     volume_m3: float
     rows: NDArray[np.int64]
+    label: str = ""
 
     @property
     def voxels(self) -> int:
@@ -118,20 +119,30 @@ def query(
     words: list[str],
     options: Options | None = None,
     contrast: Sequence[str] = (),
+    negative: Sequence[str] = (),
 ) -> list[QueryResult]:
     """Ask for several words; one that nothing matches gives no regions.
 
-    contrast: words for what else is there, besides those that the encoder names itself.
-    Raises FreeOccError for an empty or endless word, MapError if the map's features are not the encoder's.
+    contrast: words for what else is there, besides those that the encoder names itself.  negative: words for what is
+    not meant: a voxel whose plain cosine with one of them is higher than with the word does not match, though the word
+    should include it, as "table" includes a coffee table.
+    Raises FreeOccError for an empty, endless or excluded word or a negative one without a meaning, MapError if the
+    map's features are not the encoder's.
     """
     options = options or Options()
-    for word in words:
+    for word in (*words, *negative):
         if not word.strip():
             raise FreeOccError("An empty word cannot be looked for: give at least one word.")
         if len(word) > _LONGEST_WORD:
             raise FreeOccError(f"'{word[:30]}…' has {len(word)} characters; a query may have up to {_LONGEST_WORD}.")
     text = text_encoder.encode_words(words)
-    others = text_encoder.encode_words(list(dict.fromkeys((*text_encoder.contrast_words(), *contrast))))
+    excluded = text_encoder.encode_words(list(negative))
+    for word, part in zip(negative, excluded.understood, strict=True):
+        if not part:
+            raise FreeOccError(f"'{word}' cannot be excluded: this map knows only {text_encoder.knows}.")
+        if part in text.understood:
+            raise FreeOccError(f"'{word}' is asked for and excluded: leave one out.")
+    others = text_encoder.encode_words(list(dict.fromkeys((*text_encoder.contrast_words(), *contrast, *negative))))
     features = occupancy.features
     if len(features) and features.shape[1] != text.features.shape[1]:
         raise MapError(
@@ -162,9 +173,13 @@ def query(
     for w, (word, part) in enumerate(zip(words, text.understood, strict=True)):
         scores = every_score[:, w]
         rows, confidence = best[w]
+        if negative and len(rows):
+            meant = cosines(features[rows], text.features[w : w + 1])[:, 0]
+            allowed = meant >= cosines(features[rows], excluded.features).max(axis=1)
+            rows, confidence = rows[allowed], confidence[allowed]
         kept = matching.grown(scores[rows] >= threshold, functools.partial(connected, voxels[rows], edges[rows]))
         rows, confidence = rows[kept], confidence[kept]
-        regions = _regions(occupancy, voxels, edges, rows, scores[rows], confidence, options)
+        regions = _regions(occupancy, voxels, edges, rows, scores[rows], confidence, options, word)
         note = _note(word, part, text_encoder, scores, threshold, bool(regions))
         results.append(QueryResult(word, part, note, regions, np.ascontiguousarray(scores)))
     return results
@@ -260,6 +275,7 @@ def _regions(
     scores: NDArray[np.float32],
     confidence: NDArray[np.float32],
     options: Options,
+    label: str,
 ) -> list[Region]:
     """The best regions among matching voxels, given by their rows with their scores and confidences."""
     if len(rows) == 0:
@@ -275,7 +291,7 @@ def _regions(
     order, end = np.argsort(component, kind="stable"), np.cumsum(size)
     members = [order[end[c] - size[c] : end[c]] for c in chosen]
     return [
-        _region(occupancy, voxels, edges, rows[own], score[c], confidence[own])
+        _region(occupancy, voxels, edges, rows[own], score[c], confidence[own], label)
         for c, own in zip(chosen, members, strict=True)
     ]
 
@@ -287,6 +303,7 @@ def _region(
     rows: NDArray[np.int64],
     score: float,
     confidence: NDArray[np.float32],
+    label: str,
 ) -> Region:
     own, edge = voxels[rows], edges[rows]
     size = occupancy.finest
@@ -299,6 +316,7 @@ def _region(
         box_max=occupancy.origin + (own + edge[:, None]).max(axis=0) * size,
         volume_m3=float(volume.sum()),
         rows=rows,
+        label=label,
     )
 
 
@@ -324,8 +342,11 @@ def _note(
     return ""
 
 
-def to_json(map_path: Path, results: list[QueryResult]) -> dict[str, Any]:
-    """The document that ``query --json`` prints; metres, map frame, fractions 0…1."""
+def to_json(
+    map_path: Path, results: list[QueryResult], more: Callable[[Region], dict[str, Any]] | None = None
+) -> dict[str, Any]:
+    """The document that ``query --json`` prints; metres, map frame, fractions 0…1. more: gives further keys of a
+    region."""
     return {
         "version": __version__,
         "map": str(map_path),
@@ -337,6 +358,7 @@ def to_json(map_path: Path, results: list[QueryResult]) -> dict[str, Any]:
                 "note": result.note,
                 "regions": [
                     {
+                        "label": region.label,
                         "score": round(region.score, 4),
                         "confidence": round(region.confidence, 4),
                         "centroid": region.centroid.round(4).tolist(),
@@ -344,6 +366,7 @@ def to_json(map_path: Path, results: list[QueryResult]) -> dict[str, Any]:
                         "box_max": region.box_max.round(4).tolist(),
                         "volume_m3": round(region.volume_m3, 6),
                         "voxels": region.voxels,
+                        **(more(region) if more else {}),
                     }
                     for region in result.regions
                 ],

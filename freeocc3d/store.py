@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -29,7 +30,10 @@ from .types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, Traject
 if TYPE_CHECKING:
     from .keyframes import Keyframes
     from .language.encoders.base import TextEncoder
-    from .query import QueryResult
+    from .places import OrientedBox
+    from .query import QueryResult, Region
+    from .region_views import View
+    from .relations import Where
 
 FORMAT_VERSION = 3
 _UNIFORM_VERSION = 2
@@ -188,13 +192,39 @@ class Map:
         """Where ``word`` is: regions with score, box, centroid and volume. ``options``: fields of ``query.Options``."""
         return self.query_words([word], **options)[0]
 
-    def query_words(self, words: list[str], contrast: Sequence[str] = (), **options: Any) -> list[QueryResult]:
-        """``query`` for several words. contrast: words for what else is there, besides the encoder's own."""
-        from . import query
+    def query_words(
+        self,
+        words: list[str],
+        contrast: Sequence[str] = (),
+        negative: Sequence[str] = (),
+        where: Where | None = None,
+        **options: Any,
+    ) -> list[QueryResult]:
+        """``query`` for several words. contrast: words for what else is there, besides the encoder's own.  negative:
+        words for what is not meant.  where: conditions on the regions' places; see ``relations.Where``."""
+        from . import query, relations
 
         checked = registry.build_options(query, options)
         named = self.scene_words if self.text_encoder.open_vocabulary else []
-        return query.query(self.occupancy, self.text_encoder, words, checked, [*named, *contrast])
+        ask = functools.partial(query.query, self.occupancy, self.text_encoder)
+        if where is None:
+            return ask(words, checked, [*named, *contrast], negative)
+        every = replace(checked, top_k=max(len(self.occupancy.colors), 1))
+        found = ask(words, every, [*named, *contrast], negative)
+        references = ask(where.words, every, named) if where.words else []
+        return relations.only_where(self.occupancy, self.up, found, references, where, checked.top_k)
+
+    def box_of(self, region: Region) -> OrientedBox:
+        """The upright box of least level area around a region, turned as the region is."""
+        from .places import oriented_boxes
+
+        return oriented_boxes(self.occupancy, [region], self.T_gravity_map)[0]
+
+    def views_of(self, region: Region) -> list[View]:
+        """The up to three keyframes that show a region best, with the pixel box in each; see ``region_views``."""
+        from .region_views import best_views
+
+        return best_views(self.occupancy, self.trajectory, self.keyframes, [region])[0]
 
     @functools.cached_property
     def _feature_arrays(self) -> dict[str, NDArray[Any]]:

@@ -16,9 +16,13 @@ ROOT = Path(__file__).parents[1]
 SMALL = ["--set", "capture.stop=8", "--set", "capture.synthetic.width=160", "--set", "capture.synthetic.height=120"]
 
 
-def run(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
+def run(*arguments: object, code: int = 0, lines: str = "") -> subprocess.CompletedProcess[str]:
     done = subprocess.run(
-        [sys.executable, "-m", "freeocc3d.cli", *map(str, arguments)], capture_output=True, text=True, timeout=300
+        [sys.executable, "-m", "freeocc3d.cli", *map(str, arguments)],
+        input=lines,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
@@ -50,6 +54,51 @@ def test_query_json(room) -> None:
         "word": "unicorn", "matched": False, "understood": "", "regions": [],
         "note": document["results"][1]["note"],
     }  # fmt: skip
+
+
+def test_query_json_says_how_regions_stand_and_on_request_which_keyframes_show_them(room) -> None:
+    plain = json.loads(run("query", room, "red", "--json").stdout)["results"][0]["regions"]
+    seen = json.loads(run("query", room, "red", "--json", "--views").stdout)["results"][0]["regions"]
+    assert plain[0]["label"] == "red"
+    assert set(plain[0]["oriented_box"]) == {"extent", "yaw", "T_map_box"}
+    assert set(seen[0]) - set(plain[0]) == {"keyframes", "stand"}
+    assert 0 < len(seen[0]["keyframes"]) <= 3
+    x0, y0, x1, y1 = seen[0]["keyframes"][0]["box"]
+    assert 0 <= x0 < x1 < 160
+    assert 0 <= y0 < y1 < 120
+    assert "--json" in run("query", room, "red", "--views", code=2).stderr
+
+
+def test_query_with_conditions_on_places(room) -> None:
+    def corners(*arguments: object) -> list[list[float]]:
+        document = json.loads(run("query", room, *arguments, "--json").stdout)
+        return [region["box_min"] for region in document["results"][0]["regions"]]
+
+    every = corners("red")
+    assert len(every) > 1
+    assert len(corners("red", "--pick", "largest")) == 1
+    assert corners("red", "--within", -99, -99, -99, 99, 99, 99, "--near", "white:99") == every
+    assert "none is on 'unicorn'" in run("query", room, "red", "--on", "unicorn").stdout
+    assert "excluded" in refused("query", room, "red", "--not", "red")
+    assert "lies outside" in refused("query", room, "red", "--within", 98, 98, 98, 99, 99, 99)
+    assert "largest, highest" in refused("query", room, "red", "--pick", "nicest")
+
+
+def test_interactive_answers_every_line_and_survives_what_it_cannot_answer(room) -> None:
+    lines = "red\n\nred cup, unicorn\n" + "x" * 300 + "\nyellow"
+    told = run("query", room, "--interactive", "--json", lines=lines)
+    first, second, third, fourth = (json.loads(line) for line in told.stdout.splitlines())
+    assert first == json.loads(run("query", room, "red", "--json").stdout)
+    assert [result["word"] for result in second["results"]] == ["red cup", "unicorn"]
+    assert "300 characters" in third["error"]
+    assert fourth["results"][0]["matched"]
+    table = run("query", room, "--interactive", "--pick", "best", lines=lines)
+    assert "red: 1 region" in table.stdout
+    assert "yellow: 1 region" in table.stdout
+    assert "300 characters" in table.stderr
+    assert run("query", room, "--interactive", lines="").stdout == ""
+    for wrong in (["--interactive", "red"], [], ["--interactive", "--picture", "x.png"]):
+        assert run("query", room, *wrong, code=2).stdout == ""
 
 
 def test_query_text_ply_and_picture(room, tmp_path) -> None:

@@ -19,8 +19,9 @@ FLOORS = (
     ("language",),
     ("occupancy",),
     ("query",),
+    ("places", "region_views", "relations", "standing"),
     ("store", "palette"),
-    ("export", "viewer", "work"),
+    ("export", "viewer", "work", "details"),
     ("evaluation",),
     ("refine",),
     ("adaptive",),
@@ -35,7 +36,7 @@ LAYERS = ("capture", "tracking", "gaussians", "language", "occupancy")
 HEAVY = {"open3d", "torch", "pyvista", "vtk", "numba", "pycolmap", "scipy", "cv2", "onnxruntime"}
 """Packages whose import takes a good part of a second."""
 
-FAST = ("store", "query", "cli", "registry", "config", "__init__")
+FAST = ("store", "query", "places", "relations", "cli", "registry", "config", "__init__")
 """Modules that have to be imported in no time, for a query starts with them."""
 
 
@@ -154,7 +155,10 @@ def test_only_public_names_cross_between_parts(module: str) -> None:
         ("pipeline", {"cli", "__init__"}),
         ("cli", set()),
         ("config", {"pipeline", "refine", "adaptive", "cli", "work", "evaluation"}),
-        ("store", {"pipeline", "refine", "adaptive", "cli", "work", "__init__", "export", "evaluation", "viewer"}),
+        (
+            "store",
+            {"pipeline", "refine", "adaptive", "cli", "work", "__init__", "export", "evaluation", "viewer", "details"},
+        ),
     ],
 )
 def test_who_may_import(target: str, allowed: set[str]) -> None:
