@@ -13,7 +13,6 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -78,10 +77,10 @@ def adaptive(
     map's configuration.  Raises MapError for a size that halving does not reach.
     """
     count = halvings(base.voxel_size, finest)
-    surface = _Surface(gaussians, _changing(gaussians.means, features))
+    changing = _changing(gaussians.means, features)
     tree = cKDTree(gaussians.means) if len(gaussians) else None
     occupied = np.sort(pack(base.keys[(base.state == OCCUPIED).any(axis=1)]))
-    split = surface.detailed(occupied, base.origin, base.voxel_size) if count else occupied[:0]
+    split = _detailed(occupied, gaussians, changing, base.origin, base.voxel_size) if count else occupied[:0]
     whole = ~np.isin(pack(base.keys), split)
     found: list[Gaussians] = []
     leaves: list[NDArray[np.int64]] = []
@@ -94,8 +93,8 @@ def adaptive(
         parts = np.sort(pack(levels.children(unpack(split))))
         split = parts[:0]
         if level < count and tree is not None and len(made):
-            surface = _Surface(made, surface.changing_at(np.asarray(tree.query(made.means, workers=-1)[1])))
-            split = surface.detailed(parts, base.origin, size)
+            nearest = np.asarray(tree.query(made.means, workers=-1)[1])
+            split = _detailed(parts, made, changing[nearest], base.origin, size)
         found.append(made)
         leaves.append(np.setdiff1d(parts, split, assume_unique=True))
     if not found:
@@ -174,38 +173,35 @@ def refine_where_needed(
     return load_map(output)
 
 
-@dataclass(frozen=True)
-class _Surface:
-    """Gaussians of one size. changing: (M,) the rows among the coarsest Gaussians whose meaning differs from a
-    neighbour's, or for each of these Gaussians whether its nearest is one: (N,) bool."""
+def _detailed(
+    blocks: NDArray[np.int64],
+    gaussians: Gaussians,
+    changing: NDArray[np.bool_],
+    origin: NDArray[np.float64],
+    voxel_size: float,
+) -> NDArray[np.int64]:
+    """Those of the blocks, ascending packed keys, in which the surface is not flat or of several kinds.
 
-    gaussians: Gaussians
-    changing: NDArray[np.bool_]
-
-    def changing_at(self, nearest: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """The same for Gaussians whose nearest of these are given."""
-        return self.changing[nearest]
-
-    def detailed(self, blocks: NDArray[np.int64], origin: NDArray[np.float64], voxel_size: float) -> NDArray[np.int64]:
-        """Those of the blocks, ascending packed keys, in which the surface is not flat or of several kinds."""
-        edge = _CUBE * voxel_size
-        points = self.gaussians.means.astype(np.float64) - origin
-        _, first, cube = np.unique(cell_keys(points, edge), return_index=True, return_inverse=True)
-        index = np.floor(points / edge)
-        local = points - (index + 0.5) * edge
-        n = np.bincount(cube)
-        mean = np.stack([np.bincount(cube, local[:, i]) / n for i in range(3)], axis=1)
-        moments = np.empty((len(n), 3, 3))
-        for i in range(3):
-            for j in range(3):
-                moments[:, i, j] = np.bincount(cube, local[:, i] * local[:, j]) / n - mean[:, i] * mean[:, j]
-        off_plane = np.sqrt(np.maximum(np.linalg.eigvalsh(moments)[:, 0], 0.0))
-        noise = np.bincount(cube, depth_sigma(np.abs(self.gaussians.anchor_cam[:, 2]))) / n
-        uneven = (n >= _FEWEST) & (off_plane > np.hypot(_UNEVEN * voxel_size, noise))
-        uneven |= np.bincount(cube, self.changing) > 0
-        uneven &= noise <= 0.5 * voxel_size  # smaller voxels than that would show the noise
-        of_block = pack(index[first[uneven]].astype(np.int64) // (BLOCK // _CUBE))
-        return np.intersect1d(blocks, of_block)
+    gaussians: N of the blocks' size.  changing: (N,) whether the meaning changes at each.
+    """
+    edge = _CUBE * voxel_size
+    points = gaussians.means.astype(np.float64) - origin
+    _, first, cube = np.unique(cell_keys(points, edge), return_index=True, return_inverse=True)
+    index = np.floor(points / edge)
+    local = points - (index + 0.5) * edge
+    n = np.bincount(cube)
+    mean = np.stack([np.bincount(cube, local[:, i]) / n for i in range(3)], axis=1)
+    moments = np.empty((len(n), 3, 3))
+    for i in range(3):
+        for j in range(3):
+            moments[:, i, j] = np.bincount(cube, local[:, i] * local[:, j]) / n - mean[:, i] * mean[:, j]
+    off_plane = np.sqrt(np.maximum(np.linalg.eigvalsh(moments)[:, 0], 0.0))
+    noise = np.bincount(cube, depth_sigma(np.abs(gaussians.anchor_cam[:, 2]))) / n
+    uneven = (n >= _FEWEST) & (off_plane > np.hypot(_UNEVEN * voxel_size, noise))
+    uneven |= np.bincount(cube, changing) > 0
+    uneven &= noise <= 0.5 * voxel_size  # smaller voxels than that would show the noise
+    of_block = pack(index[first[uneven]].astype(np.int64) // (BLOCK // _CUBE))
+    return np.intersect1d(blocks, of_block)
 
 
 def _changing(means: NDArray[np.float32], features: NDArray[np.float16]) -> NDArray[np.bool_]:

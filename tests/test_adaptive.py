@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import lifted, posed, wall_frame
 from test_cli import refused, run
 
-from freeocc3d import adaptive, load_map, pipeline
+from freeocc3d import adaptive, config, load_map, pipeline
 from freeocc3d.capture.room import CUP_HEIGHT, CUPS
 from freeocc3d.errors import ConfigError, MapError
 from freeocc3d.export import export_map
-from freeocc3d.occupancy import levels
+from freeocc3d.occupancy import build, carve, levels, splat
 from freeocc3d.occupancy.connected import connected
 from freeocc3d.store import Map
 from freeocc3d.types import FREE, OCCUPIED, Gaussians
@@ -52,9 +53,9 @@ def flat(n: int, z: float = 0.0, depth: float = 1.0) -> Gaussians:
 
 def detailed(gaussians: Gaussians, features: np.ndarray) -> list[tuple[int, ...]]:
     """Keys of the blocks of 8 cm voxels that would be cut."""
-    surface = adaptive._Surface(gaussians, adaptive._changing(gaussians.means, features))
+    changing = adaptive._changing(gaussians.means, features)
     everywhere = adaptive.pack(np.array([(i, j, k) for i in range(-1, 3) for j in range(-1, 3) for k in range(-1, 2)]))
-    found = surface.detailed(np.sort(everywhere), np.zeros(3), 0.08)
+    found = adaptive._detailed(np.sort(everywhere), gaussians, changing, np.zeros(3), 0.08)
     return [tuple(key) for key in adaptive.unpack(found).tolist()]
 
 
@@ -81,6 +82,31 @@ def test_a_step_a_change_of_meaning_and_neither_where_it_is_noise() -> None:
     assert {key[1] for key in detailed(wall, other)} == {0}
     other[wall.means[:, 1] < 0.3] = 0  # nothing is known there
     assert detailed(wall, other) == []
+
+
+def test_down_to_the_finest_only_along_the_line_where_the_meaning_changes() -> None:
+    """A flat wall at half a metre, of two kinds: small voxels lie along the line between them, at every level."""
+    frames, poses = [wall_frame(0.5, n) for n in range(2)], np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 0.3
+    settings = config.resolve({})
+
+    def kinds(gaussians: Gaussians) -> np.ndarray:
+        return np.eye(2, dtype=np.float16)[(gaussians.means[:, 0] < 0.1).astype(int)]
+
+    wall = lifted(frames, poses, 0.04)
+    base = build.build_occupancy(
+        wall, kinds(wall), posed(frames, poses), splat.Options(), carve.Options(), origin=np.array((0, 0, 0.013))
+    )
+    made = adaptive.adaptive(
+        base, wall, kinds(wall), lambda: iter(posed(frames, poses)), poses, kinds, settings, 0.01, adaptive.Progress()
+    )
+    assert made.deepest == 3
+    centers = made.centers(made.occupied_voxels(), made.occupied_edges())
+    finest = made.occupied_edges() == 1
+    off = np.abs(centers[:, 0] - 0.1)
+    assert off[finest].max() < 0.16  # a block of 8 cm beside the line, and a Gaussian of 4 cm
+    assert (off[~finest & (np.abs(centers[:, 1]) < 0.15)] > 0.02).all()
+    assert {1, 2, 4} <= set(made.occupied_edges())
 
 
 def test_points_near_blocks() -> None:
