@@ -342,6 +342,8 @@ def _track(mapper: Mapper, work: WorkFolder, progress: Progress) -> None:
     """Layer 1 over all frames that are used, with checkpoints."""
     capture = mapper.capture
     frames = used_frames(capture)
+    if mapper.tracker.offline:
+        mapper.tracker.prepare(work.begin_offline(), frames, progress)
     first = _restore(mapper, work)
     progress.stage("tracking", len(frames))
     allowed = capture.options.max_broken * len(frames)
@@ -403,7 +405,7 @@ def _open(capture: str | Path, settings: Config, progress: Progress, work: WorkF
     section = settings["capture"]
     opened = open_capture(capture, _options(capture_base, config.options(settings, "capture")), section)
     used_frames(opened)
-    if warning := check_depth_scale(opened):
+    if opened.has_depth and (warning := check_depth_scale(opened)):
         work.warnings.append(warning)
         progress.warn(warning)
     return opened
@@ -412,6 +414,8 @@ def _open(capture: str | Path, settings: Config, progress: Progress, work: WorkF
 def _registered(capture: Capture, settings: Config, progress: Progress, work: WorkFolder) -> Capture:
     """The capture with colour brought to the depth's pixels, if its cameras' focal lengths differ."""
     ratio = settings["capture"]["color_focal"]
+    if not capture.has_depth:
+        return capture
     if ratio is None:
         progress.stage("calibration")
         ratio = calibration.color_focal(capture, used_frames(capture))

@@ -28,10 +28,10 @@ STAGES = {
 """Stages whose results are saved, and the configuration sections that they depend on."""
 
 _TRACKING, _STAGE_FEATURES, _MARKS = "tracking.npz", "features.stage.npz", "stages.json"
-_ANSWERS = "vocabulary.stage.json"
+_ANSWERS, _OFFLINE = "vocabulary.stage.json", "offline"
 _STAGE_FILES = (_TRACKING, "tracking.tmp.npz", _STAGE_FEATURES, _ANSWERS, f"{_ANSWERS}.tmp", _MARKS, f"{_MARKS}.tmp")
 _OWN_FILES = {
-    *_STAGE_FILES, store.MANIFEST, store.CONFIG, store.REPORT,
+    *_STAGE_FILES, _OFFLINE, store.MANIFEST, store.CONFIG, store.REPORT,
     store.TRAJECTORY, store.PATH_PICTURE, store.RENDER_PICTURE, store.GAUSSIANS, store.OCCUPANCY, store.FEATURES,
     store.KEYFRAMES,
 }  # fmt: skip
@@ -155,10 +155,19 @@ class WorkFolder:
         """Where the answers about keyframes are kept, which say themselves to which questions."""
         return self.folder / _ANSWERS
 
+    def begin_offline(self) -> Path:
+        """The folder of what a tracker does for the whole scan before its first frame; from now on the run can be taken
+        up again, and ``_OFFLINE`` says itself how far it is."""
+        (self.folder / _OFFLINE).mkdir(exist_ok=True)
+        if "tracking" not in self._valid:
+            self._mark("tracking")
+        return self.folder / _OFFLINE
+
     def finish(self, output: Path) -> None:
         """The work folder takes the map's name; a map that it replaces is gone only when the new one stands."""
         for name in _STAGE_FILES:
             (self.folder / name).unlink(missing_ok=True)
+        shutil.rmtree(self.folder / _OFFLINE, ignore_errors=True)
         if not output.exists():
             self.folder.rename(output)
             return

@@ -30,6 +30,8 @@ class Options:
     """Frame before which to stop; null = the last."""
     stride: int = 1
     """Use every n-th frame."""
+    depth: bool = True
+    """Read the capture's depth; false = colour alone, as of a plain video, though depth may be there."""
     depth_scale: float | None = None
     """Depth units per metre (1000 for millimetres); null = what the format or its files say."""
     max_depth: float = 6.0
@@ -54,6 +56,10 @@ class Capture(ABC):
     path: Path
     timestamps: NDArray[np.float64]
     """(N,) seconds, ascending; 0, 1, 2, … where the format has none."""
+    has_depth: bool = True
+    """Whether frames come with depth; where not, all of ``Frame.depth_m`` is 0."""
+    intrinsics_known: bool = True
+    """Whether files or the user say what the camera is; where not, ``Frame.intrinsics`` is a usual guess."""
     classes: tuple[str, ...] = ()
     """Names of the class images' values, index 0 = nothing; empty where the capture has no class images."""
 

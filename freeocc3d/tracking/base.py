@@ -9,11 +9,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..progress import Progress
 from ..types import Frame, Submap, Trajectory
 from .pose_graph import Edge, edges_to_arrays
 from .records import Records
@@ -46,10 +48,19 @@ class Tracker(ABC):
 
     world: ClassVar[str] = "OpenCV camera axes of the first keyframe, metres"
     """The frame that poses and maps are in, for the map's manifest."""
+    offline: bool = False
+    """Whether ``prepare`` works through the whole scan before the first frame is tracked."""
 
     def __init__(self) -> None:
         self.records = Records()
         self.edges: list[Edge] = []
+
+    def prepare(self, folder: Path, frames: range, progress: Progress) -> None:  # noqa: B027, most have nothing to do
+        """What is done for the whole scan before its first frame is tracked; called if ``offline``.
+
+        folder: takes whatever lets an interrupted run go on; gone when the map stands.  frames: those of the capture
+        that are used. Raises TrackingError for a scan that cannot be tracked.
+        """
 
     def completed(self, frame: Frame) -> Frame:
         """The frame with what the tracker knows of its depth beyond what was measured; ``track`` is given this one, and
