@@ -304,21 +304,36 @@ def export(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a map in another program's format."""
-    import yaml
-
+    from . import registry
     from .export import export_map
     from .store import load_map
 
+    known = registry.backend("export", format_name).options
     options = {} if frame is None else {"frame": frame}
-    for override in overrides or []:
-        name, separator, text = override.partition("=")
-        if not separator:
-            raise ConfigError(f"An option reads name=value, got '{override}'.")
-        options[name.strip()] = yaml.safe_load(text)
+    options |= _values(overrides or [], {option.name for option in known if option.type == "tuple[str, ...]"})
     refuse_existing(output, overwrite)
-    export_map(load_map(map_path), format_name, output, options, overwrite=overwrite)
+    progress = ConsoleProgress()
+    for note in export_map(load_map(map_path), format_name, output, options, overwrite=overwrite):
+        progress.warn(note)
     files = [path for path in output.rglob("*") if path.is_file()] if output.is_dir() else [output]
     print(f"{output}: {sum(path.stat().st_size for path in files):,} bytes")
+
+
+def _values(overrides: list[str], lists: set[str]) -> dict[str, Any]:
+    """Options from name=value, values being YAML; a plain word or several with commas will do for those of lists."""
+    import yaml
+
+    values = {}
+    for override in overrides:
+        name, separator, text = (part.strip() for part in override.partition("="))
+        if not separator:
+            raise ConfigError(f"An option reads name=value, got '{override}'.")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"The value of '{name}' is no YAML: '{text}'.") from error
+        values[name] = [part.strip() for part in text.split(",")] if name in lists and isinstance(value, str) else value
+    return values
 
 
 @app.command()
@@ -448,6 +463,10 @@ def info(map_path: MapPath, as_json: Json = False) -> None:
 
 @app.command("list")
 def list_backends(
+    kind: Annotated[
+        str | None,
+        typer.Argument(metavar="[KIND]", help="Only these: readers, trackers, rasterizers, encoders, exporters."),
+    ] = None,
     as_json: Json = False,
     as_yaml: Annotated[bool, typer.Option("--yaml", help="Print a configuration with every key, commented.")] = False,
 ) -> None:
@@ -458,7 +477,8 @@ def list_backends(
         print(config.documented(), end="")
         return
 
-    found = {title: registry.backends(folder) for folder, title in registry.FOLDERS.items()}
+    folders = registry.FOLDERS if kind is None else [registry.folder_of(kind)]
+    found = {registry.FOLDERS[folder]: registry.backends(folder) for folder in folders}
     if as_json:
         print(
             json.dumps(
