@@ -310,7 +310,7 @@ def export(
 
     known = registry.backend("export", format_name).options
     options = {} if frame is None else {"frame": frame}
-    options |= _values(overrides or [], {option.name for option in known if option.type == "tuple[str, ...]"})
+    options |= _values(overrides or [], {option.name: option.type for option in known})
     refuse_existing(output, overwrite)
     progress = ConsoleProgress()
     for note in export_map(load_map(map_path), format_name, output, options, overwrite=overwrite):
@@ -319,8 +319,8 @@ def export(
     print(f"{output}: {sum(path.stat().st_size for path in files):,} bytes")
 
 
-def _values(overrides: list[str], lists: set[str]) -> dict[str, Any]:
-    """Options from name=value, values being YAML; a plain word or several with commas will do for those of lists."""
+def _values(overrides: list[str], types: dict[str, str]) -> dict[str, Any]:
+    """Options from name=value, values being YAML; lists may go without brackets."""
     import yaml
 
     values = {}
@@ -328,11 +328,15 @@ def _values(overrides: list[str], lists: set[str]) -> dict[str, Any]:
         name, separator, text = (part.strip() for part in override.partition("="))
         if not separator:
             raise ConfigError(f"An option reads name=value, got '{override}'.")
+        kind = types.get(name, "")
+        bare = [part.strip() for part in text.split(",")] if kind.startswith("tuple[") and text[:1] != "[" else None
         try:
-            value = yaml.safe_load(text)
+            if bare is None:
+                values[name] = yaml.safe_load(text)
+            else:
+                values[name] = bare if "str" in kind else [yaml.safe_load(part) for part in bare]
         except yaml.YAMLError as error:
             raise ConfigError(f"The value of '{name}' is no YAML: '{text}'.") from error
-        values[name] = [part.strip() for part in text.split(",")] if name in lists and isinstance(value, str) else value
     return values
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from helpers import data_folder, write_scannet, write_seven_scenes
@@ -144,6 +145,9 @@ def test_words_of_an_export_may_be_given_plainly(room, tmp_path) -> None:
     assert {p.name for p in tmp_path.iterdir()} >= {"m.red.yaml", "m.white.pgm", "m.avoid.yaml"}
     told = run(*red, "avoid=[orange]", "--overwrite").stderr
     assert told.startswith("warning: Nothing in this map looks like 'orange'")
+    run("export", room, "--format", "npz", "-o", tmp_path / "b.npz", "--set", "box=-0.5, -0.5, 1, 0.5, 0.5, 4")
+    with np.load(tmp_path / "b.npz") as part:
+        assert max(part["occupancy"].shape[:2]) <= 13  # 1 m of voxels of 8 cm
     before = out.read_bytes()
     assert "'avoid' is no YAML" in refused(*red, "avoid=[red", "--overwrite")
     assert "'carpet' is not understood" in refused(*red, "avoid=carpet", "--overwrite")

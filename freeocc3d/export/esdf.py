@@ -21,7 +21,7 @@ from ..errors import ConfigError, ExportError
 from ..store import Map
 from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
 from .distances import LONGEST, signed
-from .frames import Placed, check_frame, placed, world_of
+from .frames import Placed, check_box, check_frame, placed, world_of
 from .vdb import write_vdb
 
 REQUIRES: tuple[str, ...] = ()
@@ -42,9 +42,13 @@ class Options:
     only, in the others they are sampled anew."""
     unknown: str = "free"
     """Unknown space: "free" is no obstacle, "obstacle" is one, "nan" is none and has no distance itself."""
+    box: tuple[float, ...] = ()
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
+    it are written, and only obstacles in it count; none = all."""
 
     def __post_init__(self) -> None:
         check_frame(self.frame)
+        check_box(self.box)
         if self.unknown not in UNKNOWN_IS:
             raise ConfigError(f"'unknown' must be free, obstacle or nan, got '{self.unknown}'.")
 
@@ -54,7 +58,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     fit into 2 GiB."""
     if path.suffix not in (".npz", ".vdb"):
         raise ConfigError(f"Distances are written to .npz or .vdb, got '{path.name}'.")
-    there = placed(scan_map, options.frame, one_size=True)
+    there = placed(scan_map, options.frame, one_size=True, box=options.box)
     distance, state, origin = signed_distances(there.occupancy, options.unknown)
     if path.suffix == ".vdb":
         _write_grid(path, there, distance)
@@ -114,7 +118,7 @@ def states(occupancy: Occupancy) -> tuple[NDArray[np.uint8], NDArray[np.float64]
     if size > _LARGEST or shape.max() > LONGEST:
         raise ExportError(
             f"Distances in {' x '.join(map(str, shape))} voxels take {size / 2**30:.1f} GiB of memory: export a part "
-            "of the map, or map with larger voxels."
+            "of the map with --set box=…, or map with larger voxels."
         )
     grid = np.full(shape, UNKNOWN, np.uint8)
     for start in range(0, len(occupancy.keys), _BLOCKS_AT_ONCE):

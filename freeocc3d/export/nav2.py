@@ -20,7 +20,7 @@ from ..registry import require_positive
 from ..store import Map
 from ..types import FREE, OCCUPIED, UNKNOWN, Occupancy
 from .cost_layers import parsed, write_layers
-from .frames import check_upright, floor_z, placed, write_description
+from .frames import check_box, check_upright, floor_z, placed, write_description
 from .map_server import PLAN, Grid, write_map
 
 REQUIRES: tuple[str, ...] = ()
@@ -47,9 +47,13 @@ class Options:
     """Words whose places cost a robot, as in [carpet:40%, glass:0.5]: WORD is not to be entered, WORD:METRES to be kept
     from by so much, WORD:COST% may be entered at a cost of 1 to 99, and WORD:METRES:COST% near by at a cost that falls
     to 0 over the metres. What hangs above max_height does not count."""
+    box: tuple[float, ...] = ()
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
+    it are written; none = all."""
 
     def __post_init__(self) -> None:
         check_upright(self.frame)
+        check_box(self.box)
         require_positive(self, "max_height")
         if self.min_height >= self.max_height:
             raise ConfigError(f"'min_height' must be below 'max_height', got {self.min_height} and {self.max_height}.")
@@ -65,7 +69,7 @@ def write(scan_map: Map, path: Path, options: Options) -> list[str]:
     named .yaml, ExportError if nothing is known between the heights, or of a word."""
     if path.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"A map_server map is named by its .yaml, got '{path.name}'.")
-    there = placed(scan_map, options.frame)
+    there = placed(scan_map, options.frame, box=options.box)
     floor, size = floor_z(scan_map, there.T_frame_map), there.occupancy.voxel_size
     cells, origin = plan(there.occupancy, floor + options.min_height, floor + options.max_height, options.min_free)
     if options.inflation > 0:
