@@ -295,7 +295,7 @@ def refine(
 @app.command()
 def export(
     map_path: MapPath,
-    format_name: Annotated[str, typer.Option("--format", help="See 'freeocc3d list'.")],
+    format_name: Annotated[str, typer.Option("--format", help="See 'freeocc3d list exporters'.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")],
     frame: Annotated[
         str | None, typer.Option("--frame", help="map, gravity (z up, floor at 0) or first-camera (z up, from there).")

@@ -178,8 +178,9 @@ def _checked(option: Option, value: Any, where: str) -> Any:
         fits, converted = _fit(kind, value)
         if fits:
             return converted
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"'{where}{option.name}' must be a finite number, got {value}.")
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        if not math.isfinite(float(value)):
+            raise ConfigError(f"'{where}{option.name}' must be a finite number, got {value}.")
     raise ConfigError(f"'{where}{option.name}' must be {option.type}, got {value!r} ({type(value).__name__}).")
 
 

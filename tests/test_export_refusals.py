@@ -81,7 +81,7 @@ def test_a_box_outside_of_the_map_is_refused(tmp_path, keyframes, kind, name) ->
 def test_numbers_that_are_none_are_refused(tmp_path, keyframes, kind, name) -> None:
     scan_map = whole(room()[0], keyframes)
     for option in registry.backends("export")[kind].options:
-        for value in (float("nan"), float("inf")):
+        for value in (float("nan"), float("inf"), "nan"):
             if option.type == "float":
                 said = refused(scan_map, kind, tmp_path / name, {option.name: value})
                 assert f"'{option.name}' must be a finite number" in said

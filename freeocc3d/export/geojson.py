@@ -58,7 +58,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 
     features = [
         _feature(result.word, region, corners(region.rows), transform(T_frame_map, region.centroid))
-        for result in scan_map.query_words(words)
+        for result in scan_map.query_words(words, top_k=len(occupancy.colors))
         for region in result.regions
     ]
     collection = {
