@@ -52,19 +52,17 @@ EXPORTS: dict[str, tuple[str, str, dict[str, str]]] = {
 
 def measure_exports(capture: str) -> Figures:
     """Map a capture at 4 cm with its own poses, and class images if it has them, and export it."""
-    from freeocc3d.pipeline import reconstruct
-    from freeocc3d.progress import Progress
-
     encoder = "labels" if (Path(capture) / "semantic_class").is_dir() else "colour"
-    settings = {
-        "tracking": {"backend": "known"},
-        "fitting": {"passes": 0},
-        "occupancy": {"voxel_size": 0.04},
-        "language": {"encoder": encoder},
-    }
+    settings = (
+        "tracking.backend=known",
+        "fitting.passes=0",
+        "occupancy.voxel_size=0.04",
+        f"language.encoder={encoder}",
+    )
     with tempfile.TemporaryDirectory() as folder:
-        reconstruct(capture, Path(folder) / "map", settings, progress=Progress())
-        return measure_map(str(Path(folder) / "map"))
+        made = str(Path(folder) / "map")
+        _timed(["reconstruct", capture, "-o", made, *(f"--set={setting}" for setting in settings)])
+        return measure_map(made)
 
 
 def measure_map(map_path: str) -> Figures:
@@ -94,16 +92,18 @@ def measure_map(map_path: str) -> Figures:
 
 
 def _timed(arguments: list[str]) -> tuple[float, int]:
-    """Wall seconds and peak resident bytes of a command of freeocc3d."""
-    mark = time.perf_counter()
+    """Wall seconds and peak resident bytes of a command of freeocc3d. A process begins with the peak of the one that
+    starts it, which therefore has to be small: it maps nothing itself, and loads no voxels before all is exported."""
     command = [sys.executable, "-m", "freeocc3d.cli", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    _, status, usage = os.wait4(process.pid, 0)
-    seconds = time.perf_counter() - mark
-    process.returncode = os.waitstatus_to_exitcode(status)
-    said = process.stderr.read().strip() if process.stderr else ""
-    if process.returncode:
-        raise SystemExit(said or f"export ended with {process.returncode}")
+    with tempfile.TemporaryFile("w+") as said:
+        mark = time.perf_counter()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
+        _, status, usage = os.wait4(process.pid, 0)
+        seconds = time.perf_counter() - mark
+        process.returncode = os.waitstatus_to_exitcode(status)
+        said.seek(0)
+        if process.returncode:
+            raise SystemExit(said.read().strip() or f"{arguments[0]} ended with {process.returncode}")
     return seconds, usage.ru_maxrss * 1024
 
 
