@@ -16,15 +16,15 @@ from freeocc3d.export.cost_layers import Avoided, cost_map, parsed
 from freeocc3d.export.frames import placed
 
 
-def asked(occupancy, regions):
-    """A map whose words are found in voxels: word -> mask of the occupied ones, None = not understood."""
+def asked(occupancy, regions, **notes):
+    """A map whose words are found in voxels: word -> masks of the occupied ones, None = not understood."""
 
     def query_words(words, top_k):
         assert top_k >= len(occupancy.colors)  # a robot keeps from all of them
         return [
             SimpleNamespace(
                 understood="" if regions.get(word, ()) is None else word,
-                note=f"Nothing looks like '{word}'.",
+                note=notes.get(word, "" if regions.get(word) else f"Nothing looks like '{word}'."),
                 regions=[SimpleNamespace(rows=np.flatnonzero(mask)) for mask in regions.get(word) or ()],
             )
             for word in words
@@ -103,8 +103,9 @@ def test_distances_from_a_disc_and_from_beyond_the_plan(size, cost) -> None:
 def test_a_layer_is_where_the_plan_is_whatever_the_lattice(tmp_path) -> None:
     occupancy, _ = room()
     table = (occupancy.occupied_voxels()[:, 0] >= 7) & (occupancy.occupied_voxels()[:, 2] == 7)
-    scan_map = asked(occupancy, {"table": [table]})
-    export_map(scan_map, "nav2", tmp_path / "map.yaml", {"avoid": ["table"]})
+    scan_map = asked(occupancy, {"table": [table]}, table="Only a part was understood.")
+    notes = export_map(scan_map, "nav2", tmp_path / "map.yaml", {"avoid": ["table"]})
+    assert notes == ["Only a part was understood."]
     data, size, origin = map_server(tmp_path / "map.table.yaml")
     there = placed(scan_map, "gravity")
     inside = np.isin(there.rows, np.flatnonzero(table))

@@ -71,7 +71,7 @@ def write_layers(
     scan_map: Map, path: Path, there: Placed, avoided: Sequence[Avoided], grid: Grid, highest: float
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Write a mask for each word and one of all, NAME.WORD.yaml and NAME.avoid.yaml for a plan NAME.yaml. Returns
-    what was written, and a sentence for each word that is nowhere and whose mask is therefore empty.
+    what was written, and a sentence for each word that is nowhere, so that its mask is empty, or half understood.
 
     highest: z in the frame up to which a thing counts; what hangs higher is driven under. Raises ExportError for a word
     that the map does not understand: an empty mask would look as if there were nothing to avoid.
@@ -93,6 +93,8 @@ def write_layers(
         if not inside.any():
             why = result.note if not len(rows) else f"All of '{one.word}' lies above the robot's height."
             notes.append(f"{why} Its mask {path.stem}.{one.file_part}.yaml is empty.")
+        elif result.note:  # of the word, only a part was understood
+            notes.append(result.note)
         layer = path.with_name(f"{path.stem}.{one.file_part}.yaml")
         about = f"costs of {json.dumps(one.word)}: {_about(one)}"
         write_map(layer, cost_pixels(costs), grid, COSTS, f"{about}; for Nav2's KeepoutFilter")
