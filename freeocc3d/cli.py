@@ -295,7 +295,7 @@ def refine(
 @app.command()
 def export(
     map_path: MapPath,
-    format_name: Annotated[str, typer.Option("--format", help="See 'freeocc3d list'.")],
+    format_name: Annotated[str, typer.Option("--format", help="See 'freeocc3d list exporters'.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")],
     frame: Annotated[
         str | None, typer.Option("--frame", help="map, gravity (z up, floor at 0) or first-camera (z up, from there).")
@@ -304,21 +304,40 @@ def export(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a map in another program's format."""
-    import yaml
-
+    from . import registry
     from .export import export_map
     from .store import load_map
 
+    known = registry.backend("export", format_name).options
     options = {} if frame is None else {"frame": frame}
-    for override in overrides or []:
-        name, separator, text = override.partition("=")
-        if not separator:
-            raise ConfigError(f"An option reads name=value, got '{override}'.")
-        options[name.strip()] = yaml.safe_load(text)
+    options |= _values(overrides or [], {option.name: option.type for option in known})
     refuse_existing(output, overwrite)
-    export_map(load_map(map_path), format_name, output, options, overwrite=overwrite)
+    progress = ConsoleProgress()
+    for note in export_map(load_map(map_path), format_name, output, options, overwrite=overwrite):
+        progress.warn(note)
     files = [path for path in output.rglob("*") if path.is_file()] if output.is_dir() else [output]
     print(f"{output}: {sum(path.stat().st_size for path in files):,} bytes")
+
+
+def _values(overrides: list[str], types: dict[str, str]) -> dict[str, Any]:
+    """Options from name=value, values being YAML; lists may go without brackets."""
+    import yaml
+
+    values = {}
+    for override in overrides:
+        name, separator, text = (part.strip() for part in override.partition("="))
+        if not separator:
+            raise ConfigError(f"An option reads name=value, got '{override}'.")
+        kind = types.get(name, "")
+        bare = [part.strip() for part in text.split(",")] if kind.startswith("tuple[") and text[:1] != "[" else None
+        try:
+            if bare is None:
+                values[name] = yaml.safe_load(text)
+            else:
+                values[name] = bare if "str" in kind else [yaml.safe_load(part) for part in bare]
+        except yaml.YAMLError as error:
+            raise ConfigError(f"The value of '{name}' is no YAML: '{text}'.") from error
+    return values
 
 
 @app.command()
@@ -448,6 +467,10 @@ def info(map_path: MapPath, as_json: Json = False) -> None:
 
 @app.command("list")
 def list_backends(
+    kind: Annotated[
+        str | None,
+        typer.Argument(metavar="[KIND]", help="Only these: readers, trackers, rasterizers, encoders, exporters."),
+    ] = None,
     as_json: Json = False,
     as_yaml: Annotated[bool, typer.Option("--yaml", help="Print a configuration with every key, commented.")] = False,
 ) -> None:
@@ -458,7 +481,8 @@ def list_backends(
         print(config.documented(), end="")
         return
 
-    found = {title: registry.backends(folder) for folder, title in registry.FOLDERS.items()}
+    folders = registry.FOLDERS if kind is None else [registry.folder_of(kind)]
+    found = {registry.FOLDERS[folder]: registry.backends(folder) for folder in folders}
     if as_json:
         print(
             json.dumps(

@@ -82,15 +82,33 @@ def backends(folder: str) -> dict[str, Backend]:
     return found
 
 
+def backend(folder: str, name: str) -> Backend:
+    """One of a folder's, which is not imported. Raises ConfigError for an unknown name, naming the nearest."""
+    known = backends(folder)
+    if name not in known:
+        raise ConfigError(f"Unknown {FOLDERS[folder]} '{name}'{nearest(name, known)}; there are: {', '.join(known)}.")
+    return known[name]
+
+
+def folder_of(kind: str) -> str:
+    """The key of FOLDERS that someone means: "exporters", "exporter" and "export" are one. Raises ConfigError."""
+    names = {
+        name: folder
+        for folder, title in FOLDERS.items()
+        for name in (folder, folder.split(".")[-1], title, f"{title}s", title.split()[-1], f"{title.split()[-1]}s")
+    }
+    if kind not in names:
+        kinds = [f"{title.split()[-1]}s" for title in FOLDERS.values()]
+        raise ConfigError(f"Unknown kind '{kind}'{nearest(kind, kinds)}; there are: {', '.join(kinds)}.")
+    return names[kind]
+
+
 def load(folder: str, name: str) -> types.ModuleType:
     """Import the backend ``name`` of ``folder``.
 
     Raises ConfigError for an unknown name (naming the nearest), DependencyError if a required package is missing.
     """
-    known = backends(folder)
-    if name not in known:
-        raise ConfigError(f"Unknown {FOLDERS[folder]} '{name}'{nearest(name, known)}; there are: {', '.join(known)}.")
-    if missing := known[name].missing:
+    if missing := backend(folder, name).missing:
         raise DependencyError(f"The {FOLDERS[folder]} '{name}' needs {', '.join(missing)}: pip install them first.")
     return importlib.import_module(f"{__package__}.{folder}.{name}")
 
@@ -160,6 +178,9 @@ def _checked(option: Option, value: Any, where: str) -> Any:
         fits, converted = _fit(kind, value)
         if fits:
             return converted
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        if not math.isfinite(float(value)):
+            raise ConfigError(f"'{where}{option.name}' must be a finite number, got {value}.")
     raise ConfigError(f"'{where}{option.name}' must be {option.type}, got {value!r} ({type(value).__name__}).")
 
 

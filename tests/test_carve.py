@@ -12,10 +12,10 @@ ORIGIN = np.array([-2.0, -2.0, 0.0])
 OPTIONS = carve.Options()
 
 
-def evidence_of(frame: Frame, T=None):
+def evidence_of(frame: Frame, T=None, options: carve.Options = OPTIONS):
     """Counts of one image over the blocks that it looks into, and the voxel centres in the world."""
     T = np.eye(4) if T is None else T
-    evidence = carve.Evidence(ORIGIN, V, OPTIONS)
+    evidence = carve.Evidence(ORIGIN, V, options)
     packed = evidence.add(frame, T)
     np.testing.assert_array_equal(packed, evidence.packed)
     local = np.stack((np.arange(512) // 64, np.arange(512) // 8 % 8, np.arange(512) % 8), axis=1)
@@ -64,6 +64,27 @@ def test_missing_depth_says_nothing() -> None:
     assert free[left].sum() == hits[left].sum() == 0
     empty = Frame(0, 0.0, frame.color, np.zeros_like(frame.depth_m), CAMERA)
     assert len(carve.Evidence(ORIGIN, V, OPTIONS).add(empty, np.eye(4))) == 0
+
+
+def test_wide_patches_without_depth_may_be_seen_through_up_to_a_distance() -> None:
+    frame = wall_frame(2.0)
+    frame.depth_m[:, 80:] = 0  # half of what the camera sees is out of range
+    frame.depth_m[50:54, 20:24] = 0  # a hole in the wall's image
+    options = carve.Options(no_return=4.0)
+    free, hits, centers = evidence_of(frame, options=options)
+    pixels, z = project(centers, CAMERA)
+    with np.errstate(invalid="ignore"):
+        inside = (pixels > 4).all(axis=-1) & (pixels < (CAMERA.width - 5, CAMERA.height - 5)).all(axis=-1) & (z > 0.2)
+        amid, measured = inside & (pixels[..., 0] > 80 + 8), inside & (pixels[..., 0] < 80)
+    assert (free[amid & (z < 4.0 - 2.5 * V)] == 1).all()
+    assert (free[z > 4.0 - 0.5 * V] == 0).all()
+    assert (free[measured & (z > 2.0 - 0.5 * V)] == 0).all()  # behind the wall, through the hole or not
+    assert (hits[np.abs(z - 2.0) > 1.5 * V] == 0).all()  # a missing measurement ends nowhere
+    evidence = carve.Evidence(ORIGIN, V, options)
+    evidence.add(frame, np.eye(4))
+    evidence.remove(frame, np.eye(4))
+    assert not evidence.free.any()
+    assert not evidence.hits.any()
 
 
 def test_the_margin_grows_with_the_depths_uncertainty() -> None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from helpers import data_folder, write_scannet, write_seven_scenes
@@ -138,11 +139,31 @@ def test_export_and_view(room, tmp_path) -> None:
     )
 
 
+def test_words_of_an_export_may_be_given_plainly(room, tmp_path) -> None:
+    out, red = tmp_path / "m.yaml", ("export", room, "--format", "nav2", "-o", tmp_path / "m.yaml", "--set")
+    assert run(*red, "avoid=red, white:0.3:50%").stderr == ""
+    assert {p.name for p in tmp_path.iterdir()} >= {"m.red.yaml", "m.white.pgm", "m.avoid.yaml"}
+    told = run(*red, "avoid=[orange]", "--overwrite").stderr
+    assert told.startswith("warning: Nothing in this map looks like 'orange'")
+    run("export", room, "--format", "npz", "-o", tmp_path / "b.npz", "--set", "box=-0.5, -0.5, 1, 0.5, 0.5, 4")
+    with np.load(tmp_path / "b.npz") as part:
+        assert max(part["occupancy"].shape[:2]) <= 13  # 1 m of voxels of 8 cm
+    before = out.read_bytes()
+    assert "'avoid' is no YAML" in refused(*red, "avoid=[red", "--overwrite")
+    assert "'carpet' is not understood" in refused(*red, "avoid=carpet", "--overwrite")
+    assert out.read_bytes() == before
+
+
 def test_list_names_every_backend_without_importing_them() -> None:
     text = run("list").stdout
     for name in ("seven_scenes", "replica", "scannet", "synthetic", "rgbd", "known", "colour", "labels", "npz", "ply"):
         assert f"  {name} " in text
     assert "encoder" in json.loads(run("list", "--json").stdout)
+    exporters = run("list", "exporters").stdout
+    assert exporters == run("list", "export").stdout
+    assert "min_height = 0.1  (float) Metres above the floor" in exporters
+    assert "rgbd" not in exporters
+    assert list(json.loads(run("list", "trackers", "--json").stdout)) == ["tracker"]
 
 
 def test_the_tools_are_the_same_commands(room) -> None:

@@ -79,7 +79,9 @@ def test_what_has_no_distances_is_told(tmp_path) -> None:
     with pytest.raises(ExportError, match="no obstacle"):
         export_map(map_of(occupancy_of([], free=[(0, 0, 0)])), "esdf", tmp_path / "a.npz", {"frame": "map"})
     with pytest.raises(ExportError, match="GiB"):
-        esdf.states(occupancy_of([(0, 0, 0), (100_000, 100_000, 9)]))
+        esdf.states(occupancy_of([(0, 0, 0), (10_000, 10_000, 9)]))
+    with pytest.raises(ExportError, match="30001 x 1 x 1 voxels"):
+        esdf.states(occupancy_of([(0, 0, 0), (30_000, 0, 0)]))
     with pytest.raises(ConfigError, match="free, obstacle or nan"):
         export_map(map_of(scene()), "esdf", tmp_path / "a.npz", {"unknown": "lava"})
     with pytest.raises(ConfigError, match=r"\.npz or \.vdb"):

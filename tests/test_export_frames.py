@@ -103,3 +103,35 @@ def test_bad_frames_are_told(tmp_path) -> None:
     scan_map.trajectory.has_pose[:] = False
     with pytest.raises(ExportError, match="no first camera"):
         placed(scan_map, "first-camera")
+
+
+@pytest.mark.parametrize("frame", ["map", "gravity"])
+def test_a_box_holds_the_voxels_whose_centres_lie_in_it(frame) -> None:
+    rng = np.random.default_rng(0)
+    voxels = np.unique(rng.integers(-12, 12, (300, 3)), axis=0)
+    occupied, free = voxels[::2], voxels[1::2]
+    scan_map = map_of(occupancy_of(occupied, colors=rng.integers(0, 255, (len(occupied), 3)), free=free))
+    box = (-0.62, -0.31, -0.78, 0.57, 0.74, 0.92)
+    every, part = placed(scan_map, frame), placed(scan_map, frame, box=box)
+    for state in (FREE, OCCUPIED):
+        centers = every.occupancy.centers(every.occupancy.voxels(state))
+        inside = ((centers > box[:3]) & (centers < box[3:])).all(axis=1)
+        assert inside.any() or frame == "gravity"
+        np.testing.assert_allclose(part.occupancy.centers(part.occupancy.voxels(state)), centers[inside])
+    np.testing.assert_array_equal(part.rows, every.rows[inside])
+    np.testing.assert_array_equal(part.occupancy.colors, every.occupancy.colors[inside])
+    assert len(part.occupancy.keys) < len(every.occupancy.keys)
+    assert len(part.occupancy.features) == len(part.rows)
+
+
+def test_a_box_of_a_map_of_several_sizes() -> None:
+    from test_export_octomap import of_several_sizes
+
+    several = of_several_sizes()
+    part = placed(map_of(several), "map", box=(0.0, 0.0, 0.0, 5.0, 1.0, 1.0)).occupancy
+    for state in (FREE, OCCUPIED):
+        centers, edges = several.centers(several.voxels(state), several.edges(state)), several.edges(state)
+        inside = ((centers > 0) & (centers < (5, 1, 1))).all(axis=1)
+        # Of the part, the smallest voxels may be larger than those of the whole.
+        np.testing.assert_allclose(part.centers(part.voxels(state), part.edges(state)), centers[inside])
+        np.testing.assert_allclose(part.edges(state) * part.finest, edges[inside] * several.finest)

@@ -17,9 +17,12 @@ def asked(scan_map):
     """The map with one region of all its voxels for "cup", and none for anything else."""
     center = scan_map.occupancy.centers(scan_map.occupancy.occupied_voxels())
     region = Region(0.8, 0.9, center.mean(axis=0), center.min(axis=0), center.max(axis=0), 8e-3, np.arange(len(center)))
-    scan_map.query_words = lambda words: [
-        SimpleNamespace(word=word, regions=[region] if word == "cup" else []) for word in words
-    ]
+
+    def query_words(words, top_k):
+        assert top_k >= len(center)  # every region, however many there are
+        return [SimpleNamespace(word=word, regions=[region] if word == "cup" else []) for word in words]
+
+    scan_map.query_words = query_words
     return scan_map
 
 

@@ -1,7 +1,10 @@
-"""glTF files, loaded by trimesh."""
+"""glTF files, loaded by trimesh and judged by Khronos' validator."""
 
+import contextlib
 import json
+import shutil
 import struct
+import subprocess
 
 import numpy as np
 import pytest
@@ -59,3 +62,41 @@ def test_the_file_says_which_frame_it_is(tmp_path) -> None:
         export_map(map_of(occupancy_of([], free=SPACE)), "glb", tmp_path / "b.glb")
     with pytest.raises(ConfigError, match="rgb, class"):
         export_map(scan_map, "glb", tmp_path / "b.glb", {"color": "loud"})
+
+
+VALIDATE = """
+const fs = require("fs"), validator = require("gltf-validator");
+validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then(
+    (report) => console.log(JSON.stringify(report)));
+"""
+
+
+@pytest.fixture(scope="module")
+def gltf_validator(tmp_path_factory):
+    """Khronos' validator, if npm can fetch it: (path) -> its report."""
+    folder = tmp_path_factory.mktemp("npm")
+    (folder / "validate.js").write_text(VALIDATE)
+    npm, node = shutil.which("npm"), shutil.which("node")
+    if npm and node:
+        command = [npm, "install", "--no-audit", "--no-fund", "gltf-validator@2.0.0-dev.3.10"]
+        with contextlib.suppress(subprocess.SubprocessError, OSError):
+            subprocess.run(command, check=True, capture_output=True, timeout=120, cwd=folder)
+            return lambda path: json.loads(
+                subprocess.run(
+                    [node, "validate.js", path], check=True, capture_output=True, timeout=60, cwd=folder
+                ).stdout
+            )
+    pytest.skip("npm cannot fetch gltf-validator")
+
+
+@pytest.mark.parametrize("options", [{"frame": "gravity"}, {"frame": "map", "color": "height"}])
+def test_khronos_validator_finds_nothing(tmp_path, gltf_validator, options) -> None:
+    scan_map = map_of(occupancy_of(VOXELS, free=SPACE))
+    export_map(scan_map, "glb", tmp_path / "map.glb", options)
+    report = gltf_validator(tmp_path / "map.glb")
+    assert report["issues"]["messages"] == []
+    assert report["info"]["totalTriangleCount"] == 2 * len(
+        exposed_faces(placed(scan_map, options["frame"]).occupancy)[1]
+    )
+    (tmp_path / "broken.glb").write_bytes((tmp_path / "map.glb").read_bytes()[:-4])
+    assert gltf_validator(tmp_path / "broken.glb")["issues"]["numErrors"] > 0

@@ -1,39 +1,18 @@
 """Plans for ROS, read by map_server's own rules on a room without symmetry."""
 
 import json
-from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
-import yaml
 from scenes import occupancy_of
 from test_export_frames import map_of
+from test_map_server import map_server
 
 from freeocc3d.errors import ConfigError, ExportError
 from freeocc3d.export import export_map
 from freeocc3d.export.frames import placed
 
 Z_UP = np.eye(4)
-
-
-def map_server(path):
-    """The occupancy grid that map_server publishes of a map.yaml: data[row, column] of -1, 0 or 100, row 0 at the
-    smallest y; resolution; and the position of the grid's corner. Trinary mode of nav2_map_server's map_io."""
-    told = yaml.safe_load(path.read_text())
-    assert told["mode"] == "trinary"
-    assert told["occupied_thresh"] > told["free_thresh"]
-    image = cv2.imread(str(path.with_name(told["image"])), cv2.IMREAD_UNCHANGED)
-    height, width = image.shape
-    data = np.full((height, width), -1)
-    for y in range(height):
-        for x in range(width):
-            shade = image[y, x] / 255.0
-            p = shade if told["negate"] else 1.0 - shade
-            value = 100 if p > told["occupied_thresh"] else 0 if p < told["free_thresh"] else -1
-            data[height - y - 1, x] = value
-    assert told["origin"][2] == 0
-    return data, told["resolution"], np.array(told["origin"][:2])
 
 
 def room():
@@ -103,35 +82,6 @@ def test_free_share_and_inflation(tmp_path) -> None:
     np.testing.assert_array_equal(wide, grown)
 
 
-def test_a_layer_a_word_keeps_robots_out_of_it(tmp_path) -> None:
-    occupancy, expected = room()
-    scan_map = map_of(occupancy, Z_UP)
-    at = occupancy.occupied_voxels()
-    regions = {"table": (at[:, 0] >= 7) & (at[:, 2] == 7), "old door": (at == (4, 2, 1)).all(axis=1)}
-    scan_map.query_words = lambda words: [
-        SimpleNamespace(regions=[SimpleNamespace(rows=np.flatnonzero(regions[word]))] if word in regions else [])
-        for word in words
-    ]
-    asked = {"max_height": 1.7, "avoid": ["table", "old door:0.1", "glass:0.5"]}
-    export_map(scan_map, "nav2", tmp_path / "map.yaml", asked)
-    plain, size, origin = map_server(tmp_path / "map.yaml")
-    np.testing.assert_array_equal(plain == 100, expected == 100)
-    layers = json.loads((tmp_path / "map.yaml.json").read_text())["avoid"]
-    assert [(layer["word"], layer["distance_m"], layer["matched"]) for layer in layers] == [
-        ("table", 0.0, True), ("old door", 0.1, True), ("glass", 0.5, False),
-    ]  # fmt: skip
-    masks = {}
-    for layer in layers:
-        masks[layer["word"]], layer_size, layer_origin = map_server(tmp_path / layer["file"])
-        assert layer_size == size
-        np.testing.assert_array_equal(layer_origin, origin)
-    table = np.zeros_like(expected)
-    table[4:6, 7:10] = 100
-    np.testing.assert_array_equal(masks["table"], table)
-    assert np.argwhere(masks["old door"] == 100).tolist() == [[1, 4], [2, 3], [2, 4], [2, 5], [3, 4]]
-    assert (masks["glass"] == 0).all()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -140,8 +90,6 @@ def test_a_layer_a_word_keeps_robots_out_of_it(tmp_path) -> None:
         ({"min_free": 1.5}, "0 to 1"),
         ({"inflation": -1.0}, "negative"),
         ({"inflation": float("nan")}, "inflation"),
-        ({"avoid": ["glass:near"]}, "glass:0.5, got 'glass:near'"),
-        ({"avoid": ["a b", "a_b"]}, "same file name"),
     ],
 )
 def test_bad_options_are_told(tmp_path, options, message) -> None:

@@ -97,6 +97,15 @@ def test_an_unknown_name_names_the_nearest_and_lists_all(package: Path) -> None:
         registry.load("export", "zzz")
 
 
+@pytest.mark.parametrize("kind", ["exporters", "exporter", "export"])
+def test_a_kind_of_backend_goes_by_several_names(kind: str) -> None:
+    assert registry.folder_of(kind) == "export"
+    assert registry.folder_of("readers") == registry.folder_of("capture reader") == "capture"
+    assert registry.folder_of("encoders") == "language.encoders"
+    with pytest.raises(ConfigError, match=r"'exportr' \(did you mean 'exporters'\?\); there are: readers, trackers"):
+        registry.folder_of("exportr")
+
+
 def test_the_contract_of_a_folder_is_not_a_backend(package: Path) -> None:
     with pytest.raises(ConfigError, match="Unknown exporter 'base'"):
         registry.load("export", "base")

@@ -30,6 +30,7 @@ from typing import Any
 
 import absent_words
 import encoders
+import exporters
 import held_out
 import kernels
 import language
@@ -71,6 +72,7 @@ LAYER_1 = {
 }
 
 WORDS = {"absent_words": "names of things that are not there: how often a region is returned all the same"}
+EXPORTS = {"exports": "every exporter at 4 cm: seconds, memory, bytes; the plan for robots beside the truth's"}
 
 SUITES = {
     "quick": (("house/bedroom",), (OURS, "rgbd_true_poses", "rgbd_true_poses_closed_set", *PEERS, *KERNELS, "lengths")),
@@ -324,6 +326,7 @@ INSIDE = {
     "rasterizer": lambda: rendering.measure_rasterizer(),
     "encoders": lambda: encoders.measure_encoders(),
     "words": lambda capture: absent_words.measure_words(capture),
+    "exports": lambda capture: exporters.measure_exports(capture),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
     "lifting": lambda: language.measure_lifting(),
     "fusion": lambda map_path: language.measure_fusion(Path(map_path)),
@@ -400,17 +403,18 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
             asked_map = job.folder / OURS
     measured = {name: _tried(name, lambda name=name: kernel(name, asked_map)) for name in KERNELS if name in names}
     layer_1 = measure_layer_1([capture.resolve() for capture in captures], names)
-    asked = [_absent_words(capture.resolve()) for capture in captures if "absent_words" in names]
+    asked = [_of_capture(capture, "words") for capture in captures if "absent_words" in names]
+    written = [_of_capture(capture, "exports") for capture in captures if "exports" in names]
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
     return {
         "machine": machine, "frames": frames, "rows": rows, "kernels": measured, "layer_1": layer_1, "layer_3": layer_3,
-        "words": asked,
+        "words": asked, "exports": written,
     }  # fmt: skip
 
 
-def _absent_words(capture: Path) -> Figures:
-    name = Job(capture, None, capture).name
-    return {"capture": name, **_tried(f"{name}: absent words", lambda: _inside("words", capture=str(capture)))}
+def _of_capture(capture: Path, part: str) -> Figures:
+    name = Job(capture.resolve(), None, capture).name
+    return {"capture": name, **_tried(f"{name}: {part}", lambda: _inside(part, capture=str(capture.resolve())))}
 
 
 def measure_layer_1(captures: list[Path], names: list[str]) -> Figures:
@@ -508,13 +512,13 @@ def markdown(results: Figures) -> str:
         if figures is not None and "error" in figures:
             lines.append(f"\n{name}: not available, {figures['error']}")
         elif figures is not None:
-            lines += ["", "| what | measured | asked |", "|---|---|---|"]
-            lines += [f"| {' | '.join(line)} |" for line in write(figures)]
+            lines += _asked_lines(write(figures))
     return "\n".join(
         [
             *lines,
             *_layer_1_lines(results.get("layer_1") or {}),
-            *_word_lines(results.get("words") or []),
+            *_asked_lines(absent_words.words_lines(results.get("words") or [])),
+            *_export_lines(results.get("exports") or []),
             *language.fusion_lines(results.get("layer_3") or {}),
             *_pose_lines(results["rows"]),
             *_fit_lines(results["rows"]),
@@ -532,12 +536,21 @@ def _layer_1_lines(figures: Figures) -> list[str]:
     return lines
 
 
-def _word_lines(rows: list[Figures]) -> list[str]:
-    """A table of "absent_words"."""
-    table = absent_words.words_lines(rows)
-    return ["", "| what | measured | asked |", "|---|---|---|", *(f"| {' | '.join(line)} |" for line in table)] * bool(
-        rows
-    )
+def _export_lines(rows: list[Figures]) -> list[str]:
+    """A table of "exports" for each capture."""
+    lines = []
+    for row in rows:
+        if "error" in row:
+            lines.append(f"\nexports of {row['capture']}: not available, {row['error']}")
+        else:
+            lines += [f"\n{row['capture']}:", *_asked_lines(exporters.exports_lines(row))]
+    return lines
+
+
+def _asked_lines(table: list[tuple[str, str, str]]) -> list[str]:
+    """A table of what was measured and what is asked for; nothing of nothing."""
+    lines = [f"| {' | '.join(line)} |" for line in table]
+    return ["", "| what | measured | asked |", "|---|---|---|", *lines] if lines else []
 
 
 def _pose_lines(rows: list[Figures]) -> list[str]:
@@ -650,7 +663,7 @@ def arguments() -> argparse.Namespace:
     given = parser.parse_args()
     captures, names = SUITES[given.suite]
     given.captures = given.captures or [DATA / name for name in captures]
-    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *LAYER_3, *WORDS]
+    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *LAYER_3, *WORDS, *EXPORTS]
     given.variants = given.variants or list(names or known)
     if unknown := [name for name in given.variants if name not in known]:
         parser.error(f"unknown variants {', '.join(unknown)}: --list names all")
@@ -674,7 +687,7 @@ def main() -> None:
             print(f"{name:<38} {variant.title}" + (f": not available, {variant.lacking}" if variant.lacking else ""))
         for name, title in PEERS.items():
             print(f"{name:<38} {title}")
-        for name, title in (LAYER_1 | LAYER_3 | WORDS).items():
+        for name, title in (LAYER_1 | LAYER_3 | WORDS | EXPORTS).items():
             print(f"{name:<38} {title}")
         print(f"{', '.join(KERNELS):<38} speed of the projection, of voxels, queries, rendering and encoders")
         return

@@ -20,13 +20,16 @@ from numpy.typing import NDArray
 from ..errors import ConfigError, ExportError
 from ..store import Map
 from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
-from .frames import Placed, check_frame, placed, world_of
+from .distances import LONGEST, signed
+from .frames import Placed, check_box, check_frame, placed, world_of
 from .vdb import write_vdb
 
 REQUIRES: tuple[str, ...] = ()
 
-_BYTES_A_VOXEL = 40  # of the transform, its indices and its results
+_BYTES_A_VOXEL = 6  # distance, state, and whether it is an obstacle
 _LARGEST = 2 << 30
+_BLOCKS_AT_ONCE = 1024
+_LOCAL = np.stack(np.unravel_index(np.arange(BLOCK**3), (BLOCK,) * 3), axis=1)
 UNKNOWN_IS = "free", "obstacle", "nan"
 
 
@@ -39,9 +42,13 @@ class Options:
     only, in the others they are sampled anew."""
     unknown: str = "free"
     """Unknown space: "free" is no obstacle, "obstacle" is one, "nan" is none and has no distance itself."""
+    box: tuple[float, ...] = ()
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
+    it are written, and only obstacles in it count; none = all."""
 
     def __post_init__(self) -> None:
         check_frame(self.frame)
+        check_box(self.box)
         if self.unknown not in UNKNOWN_IS:
             raise ConfigError(f"'unknown' must be free, obstacle or nan, got '{self.unknown}'.")
 
@@ -51,7 +58,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     fit into 2 GiB."""
     if path.suffix not in (".npz", ".vdb"):
         raise ConfigError(f"Distances are written to .npz or .vdb, got '{path.name}'.")
-    there = placed(scan_map, options.frame, one_size=True)
+    there = placed(scan_map, options.frame, one_size=True, box=options.box)
     distance, state, origin = signed_distances(there.occupancy, options.unknown)
     if path.suffix == ".vdb":
         _write_grid(path, there, distance)
@@ -73,11 +80,12 @@ def _write_grid(path: Path, there: Placed, distance: NDArray[np.float32]) -> Non
     """The distances of the known voxels, block by block."""
     occupancy = there.occupancy
     known = occupancy.state != UNKNOWN
-    low = np.minimum(*(occupancy.voxels(state).min(axis=0, initial=1 << 20) for state in (FREE, OCCUPIED)))
-    block, local = np.nonzero(known)
-    at = occupancy.keys[block] * BLOCK + np.stack(np.unravel_index(local, (BLOCK,) * 3), axis=1) - low
+    low = known_box(occupancy)[0]
     values = np.zeros(known.shape, np.float32)
-    values[known] = distance[tuple(at.T)]
+    for start in range(0, len(known), _BLOCKS_AT_ONCE):
+        part = slice(start, start + _BLOCKS_AT_ONCE)
+        at = occupancy.keys[part, None] * BLOCK + _LOCAL - low
+        values[part][known[part]] = distance[tuple(at[known[part]].T)]
     described = {name: json.dumps(value) for name, value in there.described().items()}
     center = occupancy.origin + 0.5 * occupancy.voxel_size
     write_vdb(path, "distance", occupancy.keys, values, known, occupancy.voxel_size, center, described)
@@ -88,15 +96,13 @@ def signed_distances(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float64]]:
     """(X, Y, Z) distances and states over the box of all known voxels, which are of one size, and the (3,) lower corner
     of the box. Exact; raises ExportError as ``write`` does."""
-    from scipy import ndimage
-
     state, origin = states(occupancy)
     obstacle = state != FREE if unknown == "obstacle" else state == OCCUPIED
     if not obstacle.any():
         raise ExportError("The map has no obstacle, so that there is no distance to one.")
-    distance = np.asarray(ndimage.distance_transform_edt(~obstacle), np.float32)
-    distance -= np.asarray(ndimage.distance_transform_edt(obstacle), np.float32) if not obstacle.all() else np.inf
-    distance -= np.where(obstacle, -0.5, 0.5).astype(np.float32)
+    distance = signed(obstacle)
+    distance[obstacle] += np.float32(0.5)
+    np.subtract(distance, np.float32(0.5), out=distance, where=~obstacle)
     distance *= np.float32(occupancy.voxel_size)
     if unknown == "nan":
         distance[state == UNKNOWN] = np.nan
@@ -106,19 +112,33 @@ def signed_distances(
 def states(occupancy: Occupancy) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """(X, Y, Z) states over the box of all known voxels, which are of one size, and its lower corner. Raises
     ExportError where distances over it would not fit into 2 GiB, or nothing is known."""
-    known = {state: occupancy.voxels(state) for state in (FREE, OCCUPIED)}
-    every = np.concatenate(list(known.values()))
-    if not len(every):
-        raise ExportError("Nothing of the map is known: there are no distances to write.")
-    low = every.min(axis=0)
-    shape = every.max(axis=0).astype(np.int64) - low + 1
+    low, high = known_box(occupancy)
+    shape = high - low
     size = _BYTES_A_VOXEL * float(np.prod(shape.astype(np.float64)))
-    if size > _LARGEST:
+    if size > _LARGEST or shape.max() > LONGEST:
         raise ExportError(
             f"Distances in {' x '.join(map(str, shape))} voxels take {size / 2**30:.1f} GiB of memory: export a part "
-            "of the map, or map with larger voxels."
+            "of the map with --set box=…, or map with larger voxels."
         )
     grid = np.full(shape, UNKNOWN, np.uint8)
-    for state, voxels in known.items():
-        grid[tuple((voxels - low).T)] = state
+    for start in range(0, len(occupancy.keys), _BLOCKS_AT_ONCE):
+        part = slice(start, start + _BLOCKS_AT_ONCE)
+        known = occupancy.state[part] != UNKNOWN
+        at = occupancy.keys[part, None] * BLOCK + _LOCAL - low
+        grid[tuple(at[known].T)] = occupancy.state[part][known]
     return grid, occupancy.origin + low * occupancy.voxel_size
+
+
+def known_box(occupancy: Occupancy) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(3,) indices of the first voxel of the box of all known ones, which are of one size, and of the voxel behind it.
+    Raises ExportError if nothing is known."""
+    known = (occupancy.state != UNKNOWN).reshape(-1, BLOCK, BLOCK, BLOCK)
+    if not known.any():
+        raise ExportError("Nothing of the map is known: there are no distances to write.")
+    low, high = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    for axis in range(3):
+        others = tuple(1 + other for other in range(3) if other != axis)
+        block, layer = np.nonzero(known.any(axis=others))
+        index = occupancy.keys[block, axis].astype(np.int64) * BLOCK + layer
+        low[axis], high[axis] = index.min(), index.max() + 1
+    return low, high

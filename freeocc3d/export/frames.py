@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import ConfigError, ExportError
 from ..geometry import invert
 from ..store import Map
-from ..types import Occupancy
+from ..types import BLOCK, OCCUPIED, UNKNOWN, Occupancy
 
 FRAMES = "map", "gravity", "first-camera"
 """The map's own; z up with the floor at z = 0 and the walls along x and y; z up with the first camera at the origin,
@@ -24,6 +24,15 @@ def check_frame(frame: str) -> None:
     """Raises ConfigError for an unknown frame."""
     if frame not in FRAMES:
         raise ConfigError(f"'frame' must be {', '.join(FRAMES[:-1])} or {FRAMES[-1]}, got '{frame}'.")
+
+
+def check_box(box: tuple[float, ...]) -> None:
+    """Raises ConfigError unless it is empty or a lower and an upper corner."""
+    if box and not (len(box) == 6 and np.less(box[:3], box[3:]).all()):
+        raise ConfigError(
+            "'box' has a lower and an upper corner, x0, y0, z0, x1, y1, z1 in metres, each of the first three less "
+            f"than its counterpart; got {', '.join(f'{value:g}' for value in box)}."
+        )
 
 
 def check_upright(frame: str) -> None:
@@ -72,14 +81,26 @@ def to_frame(scan_map: Map, frame: str) -> NDArray[np.float64]:
     return first_camera_frame(scan_map.T_gravity_map, trajectory.T_world_cam[posed[0]])
 
 
-def placed(scan_map: Map, frame: str, origin: ArrayLike | None = None, one_size: bool = False) -> Placed:
+def placed(
+    scan_map: Map,
+    frame: str,
+    origin: ArrayLike | None = None,
+    one_size: bool = False,
+    box: tuple[float, ...] = (),
+) -> Placed:
     """The map's voxels in a frame. In the map's own they are what they are; in another they are sampled anew on a
     lattice of the map's voxel size (the largest, of a map of several), and so they are where ``one_size`` asks for it
     or where ``origin``, a place of the new lattice, does not lie on the old one.
 
     origin: (3,) lower corner of some voxel, in the frame; by default such that z = 0 lies amid a layer of voxels, the
-    map's own lattice in its own frame. Raises ExportError for a map of which nothing is known.
+    map's own lattice in its own frame.  box: x0, y0, z0, x1, y1, z1 in the frame: what is not in it, by voxels'
+    centres, is unknown. Raises ExportError for a map of which nothing is known, there.
     """
+    there = _placed(scan_map, frame, origin, one_size)
+    return _within(there, np.array(box).reshape(2, 3)) if box else there
+
+
+def _placed(scan_map: Map, frame: str, origin: ArrayLike | None, one_size: bool) -> Placed:
     from ..occupancy.levels import uniform
     from ..occupancy.resample import resampled
 
@@ -96,6 +117,30 @@ def placed(scan_map: Map, frame: str, origin: ArrayLike | None = None, one_size:
     at = (0.0, 0.0, -0.5 * one.voxel_size) if origin is None else origin
     new, rows = resampled(one, T, np.asarray(at, np.float64))
     return Placed(new, _nearest(plain, one)[rows] if occupancy.deepest else rows, frame, T)
+
+
+def _within(there: Placed, corners: NDArray[np.float64]) -> Placed:
+    occupancy = there.occupancy
+    edge = occupancy.voxel_size / 2.0 ** occupancy.levels[:, None, None]
+    centers = occupancy.origin[:, None] + (BLOCK * occupancy.keys[:, :, None] + np.arange(BLOCK) + 0.5) * edge
+    x, y, z = ((centers >= corners[0, :, None]) & (centers <= corners[1, :, None])).transpose(1, 0, 2)
+    inside = (x[:, :, None, None] & y[:, None, :, None] & z[:, None, None, :]).reshape(-1, BLOCK**3)
+    state = np.where(inside, occupancy.state, UNKNOWN).astype(np.uint8)
+    blocks = (state != UNKNOWN).any(axis=1)
+    if not blocks.any():
+        known = centers[(occupancy.state != UNKNOWN).any(axis=1)]
+        low, high = known.min(axis=(0, 2)), known.max(axis=(0, 2))
+        spans = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high, strict=True))
+        raise ExportError(f"Nothing of the map lies in the box: in the {there.frame} frame it reaches from {spans} m.")
+    kept = inside[occupancy.state == OCCUPIED]
+    part = occupancy.replace(
+        features=occupancy.features[kept],
+        colors=occupancy.colors[kept],
+        levels=occupancy.levels[blocks],
+        state=state[blocks],
+        **{name: getattr(occupancy, name)[blocks] for name in ("keys", "probability", "free", "hits")},
+    )
+    return Placed(part, there.rows[kept], there.frame, there.T_frame_map)
 
 
 def floor_z(scan_map: Map, T_frame_map: NDArray[np.float64]) -> float:

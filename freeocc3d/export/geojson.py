@@ -40,12 +40,15 @@ class Options:
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the regions. Raises ExportError without any word to ask; a word that nothing matches has no feature."""
+    """Write the regions. Raises ExportError without any word to ask or voxel to find it in; a word that nothing matches
+    has no feature."""
     words = list(options.words) or scan_map.vocabulary
     if not words:
         raise ExportError("The map has no vocabulary of its own: name words with --set 'words=[sofa, chair]'.")
     T_frame_map = to_frame(scan_map, options.frame)
     occupancy = scan_map.occupancy
+    if not len(occupancy.colors):
+        raise ExportError("The map has no occupied voxel, in which words could be found.")
     voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
 
     def corners(rows: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -55,7 +58,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 
     features = [
         _feature(result.word, region, corners(region.rows), transform(T_frame_map, region.centroid))
-        for result in scan_map.query_words(words)
+        for result in scan_map.query_words(words, top_k=len(occupancy.colors))
         for region in result.regions
     ]
     collection = {

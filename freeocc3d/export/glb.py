@@ -20,7 +20,7 @@ from ..errors import ConfigError, ExportError
 from ..geometry import invert
 from ..occupancy.faces import exposed_faces
 from ..store import Map
-from .frames import Placed, check_frame, placed
+from .frames import Placed, check_box, check_frame, placed
 from .ply import COLORS, colors_of
 
 REQUIRES: tuple[str, ...] = ()
@@ -39,18 +39,22 @@ class Options:
     others they are sampled anew."""
     color: str = "rgb"
     """"rgb" for the surface's own colour, "class", "height" or "probability", as of `ply`."""
+    box: tuple[float, ...] = ()
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
+    it are written; none = all."""
 
     def __post_init__(self) -> None:
         check_frame(self.frame)
+        check_box(self.box)
         if self.color not in COLORS:
             raise ConfigError(f"'color' must be {', '.join(COLORS[:-1])} or {COLORS[-1]}, got '{self.color}'.")
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the mesh. Raises ExportError for a map without an occupied voxel."""
-    there = placed(scan_map, options.frame)
+    there = placed(scan_map, options.frame, box=options.box)
     if not len(there.occupancy.colors):
-        raise ExportError("The map has no occupied voxel to write.")
+        raise ExportError("There is no occupied voxel to write.")
     positions, quads, rows = exposed_faces(there.occupancy)
     triangles = quads[:, (0, 1, 2, 0, 2, 3)].astype(np.uint32)
     colors = np.full((len(positions), 4), 255, np.uint8)  # with alpha, for attributes begin at multiples of 4 bytes

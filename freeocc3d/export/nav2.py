@@ -3,17 +3,14 @@
 A pixel is occupied (0) where any voxel of its column between the heights is; else free (254) where enough of them are
 free; else unknown (205). The floor lies below the lower height and is no obstacle. The top row is the largest y,
 `origin` the lower left corner of the lower left pixel, as map_server reads them. NAME.yaml.json holds the frame.
-`avoid` adds a layer a word, NAME.WORD.yaml and .pgm of the same size: occupied where a robot is to keep out, free
-elsewhere, a mask for Nav2's keepout filter. Source: nav2_map_server's map_io.
+`avoid` adds a layer of costs a word, NAME.WORD.yaml and .pgm of the same cells, and NAME.avoid.yaml of all words: masks
+for Nav2's KeepoutFilter. Source: nav2_map_server's map_io.
 """
 
 from __future__ import annotations
 
-import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +19,13 @@ from ..errors import ConfigError, ExportError
 from ..registry import require_positive
 from ..store import Map
 from ..types import FREE, OCCUPIED, UNKNOWN, Occupancy
-from .frames import Placed, check_upright, floor_z, placed, write_description
+from .cost_layers import parsed, write_layers
+from .frames import check_box, check_upright, floor_z, placed, write_description
+from .map_server import PLAN, Grid, write_map
 
 REQUIRES: tuple[str, ...] = ()
 
 _PIXEL = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
-_THRESHOLDS = 0.65, 0.196  # an unknown pixel is 1 - 205 / 255 = 0.19608, which 0.196 does not take for free
 _MOST_PIXELS = 1 << 28
 
 
@@ -46,11 +44,16 @@ class Options:
     inflation: float = 0.0
     """Metres around obstacles that are occupied as well; planners mostly inflate by themselves."""
     avoid: tuple[str, ...] = ()
-    """Words whose places a robot is to keep out of, each with the metres to keep from them, 0 if not given, as in
-    [carpet, glass:0.5]."""
+    """Words whose places cost a robot, as in [carpet:40%, glass:0.5]: WORD is not to be entered, WORD:METRES to be kept
+    from by so much, WORD:COST% may be entered at a cost of 1 to 99, and WORD:METRES:COST% near by at a cost that falls
+    to 0 over the metres. What hangs above max_height does not count."""
+    box: tuple[float, ...] = ()
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
+    it are written; none = all."""
 
     def __post_init__(self) -> None:
         check_upright(self.frame)
+        check_box(self.box)
         require_positive(self, "max_height")
         if self.min_height >= self.max_height:
             raise ConfigError(f"'min_height' must be below 'max_height', got {self.min_height} and {self.max_height}.")
@@ -58,88 +61,28 @@ class Options:
             raise ConfigError(f"'min_free' must be 0 to 1, got {self.min_free}.")
         if self.inflation < 0:
             raise ConfigError(f"'inflation' must not be negative, got {self.inflation}.")
-        _avoided(self.avoid)
+        parsed(self.avoid)
 
 
-def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the plan. Raises ConfigError unless the file is named .yaml, ExportError if nothing is known between the
-    heights."""
+def write(scan_map: Map, path: Path, options: Options) -> list[str]:
+    """Write the plan; returns a sentence for each word to avoid that is nowhere. Raises ConfigError unless the file is
+    named .yaml, ExportError if nothing is known between the heights, or of a word."""
     if path.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"A map_server map is named by its .yaml, got '{path.name}'.")
-    there = placed(scan_map, options.frame)
-    floor = floor_z(scan_map, there.T_frame_map)
+    there = placed(scan_map, options.frame, box=options.box)
+    floor, size = floor_z(scan_map, there.T_frame_map), there.occupancy.voxel_size
     cells, origin = plan(there.occupancy, floor + options.min_height, floor + options.max_height, options.min_free)
     if options.inflation > 0:
-        cells = inflated(cells, options.inflation / there.occupancy.voxel_size)
-    heights = f"obstacles {options.min_height:g} to {options.max_height:g} m above the floor"
-    _write_map(path, cells, origin, there.occupancy.voxel_size, f"{there.frame} frame; {heights}")
+        cells = inflated(cells, options.inflation / size)
+    grid = Grid(origin, size, (cells.shape[0], cells.shape[1]), there.frame)
+    pixels = np.zeros(256, np.uint8)
+    pixels[list(_PIXEL)] = list(_PIXEL.values())
+    about = f"obstacles {options.min_height:g} to {options.max_height:g} m above the floor"
+    write_map(path, pixels[cells], grid, PLAN, about)
+    layers, notes = write_layers(scan_map, path, there, parsed(options.avoid), grid, floor + options.max_height)
     described = {"floor_z_m": floor, "min_height_m": options.min_height, "max_height_m": options.max_height}
-    layers = _write_layers(scan_map, path, there, _avoided(options.avoid), cells.shape, origin)
     write_description(path, {**there.described(), **described, **({"avoid": layers} if layers else {})})
-
-
-def _write_map(path: Path, cells: NDArray[np.uint8], origin: NDArray[np.float64], size: float, about: str) -> None:
-    image = path.with_suffix(".pgm")
-    write_pgm(image, cells)
-    occupied, free = _THRESHOLDS
-    lines = [
-        f"# freeocc3d, {about}",
-        f"image: {image.name}",
-        "mode: trinary",
-        f"resolution: {size:.12g}",
-        f"origin: [{origin[0]:.9g}, {origin[1]:.9g}, 0.0]",
-        "negate: 0",
-        f"occupied_thresh: {occupied}",
-        f"free_thresh: {free}",
-    ]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _avoided(entries: tuple[str, ...]) -> dict[str, float]:
-    """Word -> metres to keep from it. Raises ConfigError."""
-    found = {}
-    for entry in entries:
-        word, separator, distance = entry.partition(":")
-        try:
-            metres = float(distance) if separator else 0.0
-        except ValueError:
-            metres = -1.0
-        if not 0 <= metres < np.inf:
-            raise ConfigError(f"'avoid' takes words with metres to keep from them, as in glass:0.5, got '{entry}'.")
-        found[word.strip()] = metres
-    if len({_file_part(word) for word in found}) < len(found):
-        raise ConfigError("'avoid' names two words whose layers would have the same file name: leave one out.")
-    return found
-
-
-def _write_layers(
-    scan_map: Map,
-    path: Path,
-    there: Placed,
-    avoided: dict[str, float],
-    shape: tuple[int, ...],
-    origin: NDArray[np.float64],
-) -> list[dict[str, Any]]:
-    """Write a mask for each word, over the plan's cells, and say what was written."""
-    if not avoided:
-        return []
-    occupancy, layers = there.occupancy, []
-    offset = np.rint((origin - occupancy.origin[:2]) / occupancy.voxel_size).astype(np.int64)
-    cell = occupancy.occupied_voxels()[:, :2] - offset
-    for result, (word, metres) in zip(scan_map.query_words(list(avoided)), avoided.items(), strict=True):
-        rows = np.concatenate([region.rows for region in result.regions] or [np.zeros(0, np.int64)])
-        inside = np.isin(there.rows, rows) & ((cell >= 0) & (cell < shape)).all(axis=1)
-        mask = np.full(shape, FREE, np.uint8)
-        mask[tuple(cell[inside].T)] = OCCUPIED
-        layer = path.with_name(f"{path.stem}.{_file_part(word)}.yaml")
-        about = f"{there.frame} frame; {metres:g} m around {json.dumps(word)}"
-        _write_map(layer, inflated(mask, metres / occupancy.voxel_size), origin, occupancy.voxel_size, about)
-        layers.append({"word": word, "distance_m": metres, "matched": bool(inside.any()), "file": layer.name})
-    return layers
-
-
-def _file_part(word: str) -> str:
-    return re.sub(r"\W+", "_", word.strip()) or "_"
+    return notes
 
 
 def plan(
@@ -178,12 +121,3 @@ def inflated(cells: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
         return cells
     near = ndimage.distance_transform_edt(cells != OCCUPIED) <= radius
     return np.where(near, OCCUPIED, cells).astype(np.uint8)
-
-
-def write_pgm(path: Path, cells: NDArray[np.uint8]) -> None:
-    """Write (X, Y) states as the image that map_server reads: x to the right, y upwards. Raises OSError."""
-    pixels = np.zeros(256, np.uint8)
-    pixels[list(_PIXEL)] = list(_PIXEL.values())
-    rows = pixels[cells].T[::-1]
-    header = f"P5\n{rows.shape[1]} {rows.shape[0]}\n255\n"
-    path.write_bytes(header.encode("ascii") + np.ascontiguousarray(rows).tobytes())

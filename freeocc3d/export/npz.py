@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..errors import ConfigError, ExportError
 from ..store import Map
 from ..types import FREE, OCCUPIED, UNKNOWN, Occupancy
-from .frames import check_frame, placed, world_of
+from .frames import check_box, check_frame, placed, world_of
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -42,9 +42,13 @@ class Options:
     frame: str = "map"
     """"map", "gravity" (z up, floor at 0) or "first-camera" (z up, from there); but for the first, voxels are sampled
     anew."""
+    box: tuple[float, ...] = ()
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
+    it are written; none = all."""
 
     def __post_init__(self) -> None:
         check_frame(self.frame)
+        check_box(self.box)
         if self.form not in ("dense", "sparse"):
             raise ConfigError(f"'form' must be dense or sparse, got '{self.form}'.")
 
@@ -53,7 +57,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the arrays. Raises ExportError if the dense grid would not fit into memory."""
     form = dense if options.form == "dense" else sparse
     classes = scan_map.vocabulary[:_MOST_CLASSES]
-    there = placed(scan_map, options.frame)
+    there = placed(scan_map, options.frame, box=options.box)
     arrays = form(there.occupancy, scan_map.labels()[there.rows], len(classes))
     arrays |= {
         "voxel_size": np.float64(there.occupancy.finest),

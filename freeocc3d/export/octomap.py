@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import ConfigError, ExportError
 from ..store import Map
 from ..types import FREE, OCCUPIED, Occupancy
-from .frames import check_frame, placed, write_description
+from .frames import check_box, check_frame, placed, write_description
 from .octree import KEY_ORIGIN, Leaves, Octree, octree
 
 REQUIRES: tuple[str, ...] = ()
@@ -37,9 +37,13 @@ class Options:
     only, in the others they are sampled anew."""
     color: bool = False
     """Write a ColorOcTree, for .ot: occupied leaves have the surface's colour."""
+    box: tuple[float, ...] = ()
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
+    it are written; none = all."""
 
     def __post_init__(self) -> None:
         check_frame(self.frame)
+        check_box(self.box)
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
@@ -50,7 +54,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         raise ConfigError(f"An OctoMap file is named .bt (free or occupied) or .ot (log-odds), got '{path.name}'.")
     if binary and options.color:
         raise ConfigError("A .bt holds no colours: name the file .ot.")
-    there = placed(scan_map, options.frame, origin=(0.0, 0.0, 0.0))
+    there = placed(scan_map, options.frame, origin=(0.0, 0.0, 0.0), box=options.box)
     tree = octree(leaves(there.occupancy, log_odds=not binary, color=options.color))
     with path.open("wb") as stream:
         kind = "OcTree binary" if binary else "OcTree"
@@ -73,7 +77,7 @@ def leaves(occupancy: Occupancy, log_odds: bool, color: bool) -> list[Leaves]:
         reach = KEY_ORIGIN * occupancy.finest
         raise ExportError(
             f"The map reaches farther than {reach:.0f} m from its origin, which is as far as an octree of "
-            f"{occupancy.finest:g} m voxels goes: export a part of it, or map with larger voxels."
+            f"{occupancy.finest:g} m voxels goes: export a part of it with --set box=…, or map with larger voxels."
         )
     states = np.repeat((OCCUPIED, FREE), [np.count_nonzero(occupancy.state == state) for state in (OCCUPIED, FREE)])
     values = np.where(states == OCCUPIED, 1.0, -1.0).astype(np.float32)

@@ -17,7 +17,7 @@ from ..palette import class_colors, height_colors, highlighted, ramp
 from ..query import QueryResult
 from ..store import Map
 from ..types import OCCUPIED, Occupancy
-from .frames import Placed, check_frame, placed
+from .frames import Placed, check_box, check_frame, placed
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -37,9 +37,13 @@ class Options:
     frame: str = "map"
     """"map", "gravity" (z up, floor at 0) or "first-camera" (z up, from there); but for the first, voxels are sampled
     anew."""
+    box: tuple[float, ...] = ()
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
+    it are written; none = all."""
 
     def __post_init__(self) -> None:
         check_frame(self.frame)
+        check_box(self.box)
         if self.form not in ("cubes", "points"):
             raise ConfigError(f"'form' must be cubes or points, got '{self.form}'.")
         if self.color not in COLORS:
@@ -49,7 +53,8 @@ class Options:
 def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the occupied voxels. Raises ExportError for a map without any."""
     _refuse_empty(scan_map.occupancy)
-    there = placed(scan_map, options.frame)
+    there = placed(scan_map, options.frame, box=options.box)
+    _refuse_empty(there.occupancy)
     _write(there.occupancy, colors_of(scan_map, there, options.color), path, options.form, there.described())
 
 
@@ -63,7 +68,7 @@ def write_query_ply(occupancy: Occupancy, results: list[QueryResult], path: Path
 
 def _refuse_empty(occupancy: Occupancy) -> None:
     if len(occupancy.colors) == 0:
-        raise ExportError("The map has no occupied voxel to write.")
+        raise ExportError("There is no occupied voxel to write.")
 
 
 def colors_of(scan_map: Map, there: Placed, by: str) -> NDArray[np.uint8]:

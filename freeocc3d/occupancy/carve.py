@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit, prange
@@ -14,6 +14,10 @@ from ..geometry import back_project, invert, transform
 from ..registry import require_positive
 from ..types import BLOCK, Frame
 from .grid import blocks_along_rays, unpack
+
+_NARROW = 64
+"""Of the image's width: where no depth is measured within one such part of a pixel, the pixel is amid a wide patch, and
+not in a hole along the edge of a thing."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +37,17 @@ class Options:
     """Depth images that must see through a voxel that holds no surface before it counts as free."""
     every: int = 1
     """Every n-th tracked frame tells what is free, besides the keyframes; 0 = keyframes alone."""
+    no_return: float = 0.0
+    """Metres up to which space counts as seen through where a wide patch of a depth image holds no measurement; 0 =
+    that tells nothing. For sensors that fail beyond their range alone: what is black, shiny or too near has no depth
+    either, and would be carved away."""
     ray_step: int = 16
     """Every n-th pixel's ray (more where blocks are small) is followed to find the blocks that a camera looked into."""
 
     def __post_init__(self) -> None:
         require_positive(self, "margin", "hit", "miss", "min_free", "ray_step")
-        if self.noise < 0 or self.every < 0:
-            raise ConfigError("'noise' and 'every' must not be negative.")
+        if self.noise < 0 or self.every < 0 or self.no_return < 0:
+            raise ConfigError("'noise', 'every' and 'no_return' must not be negative.")
 
 
 def log_odds(free: NDArray[np.uint16], hits: NDArray[np.uint16], options: Options) -> NDArray[np.float32]:
@@ -94,6 +102,7 @@ class Evidence:
 
     def add(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
         """Count one depth image. Returns the packed keys of the blocks that it looks into."""
+        frame = self._told(frame)
         packed = self.visible_blocks(frame, T_world_cam)
         self._make_room(np.setdiff1d(packed, self.packed, assume_unique=True))
         self._count(packed, frame, T_world_cam, 1)
@@ -102,6 +111,7 @@ class Evidence:
     def remove(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
         """Take back a depth image that was added at this pose. Returns the packed keys of the blocks that it looked
         into; they stay, with counts that may be zero."""
+        frame = self._told(frame)
         packed = self.visible_blocks(frame, T_world_cam)
         self._count(packed, frame, T_world_cam, -1)
         return packed
@@ -112,15 +122,27 @@ class Evidence:
         if self.within is not None:
             return self.within
         camera = frame.intrinsics
-        farthest = max(float(frame.depth_m.max(initial=0.0)), 1e-3)
+        reach = np.abs(frame.depth_m)
+        farthest = max(float(reach.max(initial=0.0)), 1e-3)
         step = max(1, min(self.options.ray_step, int(0.5 * BLOCK * self.voxel_size * camera.fx / farthest)))
         rows, columns = (np.union1d(np.arange(0, n, step), n - 1) for n in frame.depth_m.shape)
-        measured = frame.depth_m[np.ix_(rows, columns)]
+        measured = reach[np.ix_(rows, columns)]
         v, u = np.nonzero(measured)
         pixels = np.stack((columns[u], rows[v]), axis=1)
         z = measured[v, u] + 0.5 * self.voxel_size + 3 * self.options.noise * measured[v, u] ** 2
         points = transform(T_world_cam, back_project(pixels, z.astype(np.float32), camera).astype(np.float64))
         return blocks_along_rays(points, T_world_cam[:3, 3], self.origin, self.voxel_size)
+
+    def _told(self, frame: Frame) -> Frame:
+        """The frame with the depth of pixels amid a wide patch of none at minus ``no_return``: nothing up to there."""
+        if not self.options.no_return:
+            return frame
+        from scipy import ndimage
+
+        wide = 2 * (frame.depth_m.shape[1] // _NARROW) + 1
+        nothing = ndimage.maximum_filter(frame.depth_m, wide, mode="nearest") == 0
+        depth = np.where(nothing, np.float32(-self.options.no_return), frame.depth_m)
+        return replace(frame, depth_m=depth)
 
     def at(self, packed: NDArray[np.int64]) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """(B, 512) free and hits of some blocks, zeros where nothing looked."""
@@ -194,10 +216,10 @@ def _count(
             if column < 0 or row < 0 or column >= width or row >= height:
                 continue
             depth = depth_m[row, column]
-            if depth <= 0:
+            if depth == 0:
                 continue
             far = margin + noise * z * z
-            if depth - z > far:
+            if abs(depth) - z > far:
                 du, dv = int(fx * half / z), int(fy * half / z)
                 if (
                     _beyond(depth_m, row, column - du, z + far)
@@ -206,7 +228,7 @@ def _count(
                     and _beyond(depth_m, row + dv, column, z + far)
                 ):
                     free[row_of_block, voxel] += change
-            elif abs(depth - z) <= half + noise * z * z:
+            elif depth > 0 and abs(depth - z) <= half + noise * z * z:
                 hits[row_of_block, voxel] += change
 
 

@@ -1,0 +1,92 @@
+"""Exact Euclidean distances between two kinds of voxels in a dense grid, in the memory of their result.
+
+Squared distances are found axis by axis as lower envelopes of parabolas. A voxel's own kind tells which of the two
+distances it holds, so that one array of 4 bytes a voxel serves both and becomes the result in place.
+Source: P. Felzenszwalb and D. Huttenlocher, Distance Transforms of Sampled Functions, Theory of Computing 8, 2012.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+_NONE = np.int32(2**31 - 1)
+"""Squared distance where there is no voxel of the other kind."""
+LONGEST = 26_000
+"""Voxels along an edge up to which squared distances fit into 32 bits."""
+
+
+def signed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(X, Y, Z) distance, in voxels, from each voxel's centre to that of the nearest one of the other kind, negative
+    inside; infinite where there is none. No edge may be longer than LONGEST."""
+    inside = np.ascontiguousarray(inside)
+    squared = np.full(inside.shape, _NONE, np.int32)
+    x, y, z = inside.shape
+    for lines in ((x * y, z, 1), (x, y, z), (1, x, y * z)):
+        _along(squared.reshape(lines), inside.reshape(lines))
+    distance = squared.view(np.float32)
+    _rooted(squared.ravel(), inside.ravel(), distance.ravel())
+    return distance
+
+
+def signed_reference(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The same by SciPy, in ten times the memory."""
+    from scipy import ndimage
+
+    out = np.full(inside.shape, np.inf)
+    if inside.any():
+        out = np.asarray(ndimage.distance_transform_edt(~inside))
+    if inside.all():
+        return np.full(inside.shape, -np.inf, np.float32)
+    return np.asarray(out - ndimage.distance_transform_edt(inside), np.float32)
+
+
+@njit(parallel=True, cache=True)
+def _along(squared: NDArray[np.int32], inside: NDArray[np.bool_]) -> None:
+    """Take one more axis, the middle one of (A, N, B), into account."""
+    length, width = squared.shape[1], squared.shape[2]
+    for line in prange(squared.shape[0] * width):
+        a, b = line // width, line % width
+        height = np.empty(length, np.int64)
+        site = np.empty(length, np.int64)
+        begins = np.empty(length, np.float64)
+        for kind in (False, True):
+            present = False
+            for q in range(length):
+                own = inside[a, q, b] == kind
+                present = present or own
+                height[q] = squared[a, q, b] if own else 0
+            if not present:
+                continue
+            # Parabolas of the lower envelope: from ``begins`` on, that over ``site`` is the lowest.
+            last = -1
+            for q in range(length):
+                if height[q] == _NONE:
+                    continue
+                start = -np.inf
+                while last >= 0:
+                    p = site[last]
+                    start = (height[q] + q * q - height[p] - p * p) / (2.0 * (q - p))
+                    if start > begins[last]:
+                        break
+                    last -= 1
+                    start = -np.inf
+                last += 1
+                site[last], begins[last] = q, start
+            if last < 0:
+                continue
+            k = 0
+            for q in range(length):
+                if inside[a, q, b] == kind:
+                    while k < last and begins[k + 1] < q:
+                        k += 1
+                    squared[a, q, b] = height[site[k]] + (q - site[k]) ** 2
+
+
+@njit(parallel=True, cache=True)
+def _rooted(squared: NDArray[np.int32], inside: NDArray[np.bool_], distance: NDArray[np.float32]) -> None:
+    """Signed roots; ``distance`` may be the memory of ``squared``."""
+    for n in prange(len(squared)):
+        root = np.inf if squared[n] == _NONE else np.sqrt(np.float64(squared[n]))
+        distance[n] = np.float32(-root if inside[n] else root)

@@ -1,0 +1,66 @@
+"""The pair of files that ROS map_server reads: NAME.yaml and NAME.pgm.
+
+`origin` is the lower left corner of the lower left pixel, and the top row of the image is the largest y.
+Source: nav2_map_server's map_io.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Where cells are: x of cell (i, j) is origin[0] + [i, i + 1) * size, metres; y likewise of j.
+
+    origin: (2,) lower corner of cell (0, 0).  frame: name of the frame that this is in.
+    """
+
+    origin: NDArray[np.float64]
+    size: float
+    shape: tuple[int, int]
+    frame: str
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a pixel p is read as: with o = 1 - p / 255, occupied (100) where o > occupied, free (0) where o < free, and
+    between them unknown (-1) in mode "trinary", or the share of the way from free to occupied in per cent in "scale".
+    """
+
+    mode: str
+    occupied: float
+    free: float
+
+
+PLAN = Reading("trinary", 0.65, 0.196)
+"""An unknown pixel, 205, is 0.19608, which 0.196 does not take for free."""
+COSTS = Reading("scale", 0.999, 0.001)
+"""White is 0 and black 100; ``cost_pixels`` are read as what they were."""
+
+
+def cost_pixels(costs: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pixels that are read as costs 0…100 with COSTS."""
+    return np.rint(255 - 2.55 * costs.astype(np.float64)).astype(np.uint8)
+
+
+def write_map(path: Path, pixels: NDArray[np.uint8], grid: Grid, reading: Reading, about: str) -> None:
+    """Write ``path``, a .yaml, and the image beside it of (X, Y) pixels: x to the right, y upwards. Raises OSError."""
+    image = path.with_suffix(".pgm")
+    rows = np.ascontiguousarray(pixels.T[::-1])
+    image.write_bytes(f"P5\n{rows.shape[1]} {rows.shape[0]}\n255\n".encode("ascii") + rows.tobytes())
+    lines = [
+        f"# freeocc3d, {grid.frame} frame; {about}",
+        f"image: {image.name}",
+        f"mode: {reading.mode}",
+        f"resolution: {grid.size:.12g}",
+        f"origin: [{grid.origin[0]:.9g}, {grid.origin[1]:.9g}, 0.0]",
+        "negate: 0",
+        f"occupied_thresh: {reading.occupied}",
+        f"free_thresh: {reading.free}",
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,159 @@
+#!/usr/bin/env python3
+"""Every exporter on a map of a capture: seconds, peak memory and bytes. Part of tools/benchmark.py.
+
+    python tools/exporters.py MAP [--json]
+    python tools/benchmark.py --variants exports --captures SCAN
+
+Each runs as `freeocc3d export` does, in a process of its own, start and loading of the map included. The `.bt` stands
+beside what OctoMap itself writes of the same voxels, and the plan for robots beside the truth's (tools/plans.py).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import plans
+
+Figures = dict[str, Any]
+Line = tuple[str, str, str]
+
+SECONDS, BYTES = 10, 2e9
+"""What is asked of each at 4 cm."""
+
+BT = "octomap .bt"
+EXPORTS: dict[str, tuple[str, str, dict[str, str]]] = {
+    "ply": ("map.ply", "ply", {}),
+    "ply, points": ("points.ply", "ply", {"form": "points", "frame": "gravity"}),
+    "npz": ("map.npz", "npz", {"frame": "gravity"}),
+    "npz, sparse": ("sparse.npz", "npz", {"form": "sparse"}),
+    BT: ("map.bt", "octomap", {}),
+    "octomap .ot": ("map.ot", "octomap", {}),
+    "octomap, ColorOcTree": ("colors.ot", "octomap", {"color": "true"}),
+    "nav2": ("map.yaml", "nav2", {}),
+    "nav2, with costs of three words": ("costs.yaml", "nav2", {"avoid": "WORDS"}),
+    "esdf .npz": ("esdf.npz", "esdf", {}),
+    "esdf .vdb": ("esdf.vdb", "esdf", {}),
+    "glb": ("map.glb", "glb", {}),
+    "geojson": ("map.geojson", "geojson", {}),
+    "gaussians": ("gaussians.ply", "gaussians", {}),
+    "poses, colmap": ("colmap", "poses", {}),
+    "poses, nerfstudio": ("nerfstudio", "poses", {"form": "nerfstudio"}),
+}
+"""What is written: file, format, options."""
+
+
+def measure_exports(capture: str) -> Figures:
+    """Map a capture at 4 cm with its own poses, and class images if it has them, and export it."""
+    encoder = "labels" if (Path(capture) / "semantic_class").is_dir() else "colour"
+    settings = (
+        "tracking.backend=known",
+        "fitting.passes=0",
+        "occupancy.voxel_size=0.04",
+        f"language.encoder={encoder}",
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        made = str(Path(folder) / "map")
+        _timed(["reconstruct", capture, "-o", made, *(f"--set={setting}" for setting in settings)])
+        return measure_map(made)
+
+
+def measure_map(map_path: str) -> Figures:
+    """Seconds, peak bytes and bytes written of each of EXPORTS; OctoMap's own file; the plan's agreement."""
+    from freeocc3d.store import load_map
+
+    loaded = load_map(map_path)
+    words = ", ".join(f"{word}{how}" for word, how in zip(loaded.vocabulary, (":40%", ":0.5", ":1:60%"), strict=False))
+    with tempfile.TemporaryDirectory() as folder:
+        rows = {}
+        for name, (file, kind, options) in EXPORTS.items():
+            path = Path(folder) / name / file
+            path.parent.mkdir()
+            chosen = [f"--set={key}={words if value == 'WORDS' else value}" for key, value in options.items()]
+            seconds, peak = _timed(["export", map_path, "--format", kind, "-o", str(path), *chosen])
+            size = sum(each.stat().st_size for each in path.parent.rglob("*") if each.is_file())
+            rows[name] = {"seconds": seconds, "peak_memory_bytes": peak, "bytes": size}
+        own = Path(folder) / "own.bt"
+        octomap = {}
+        if _octomaps_own(loaded, own):
+            bodies = [path.read_bytes().split(b"data\n", 1)[1] for path in (Path(folder) / BT / "map.bt", own)]
+            octomap = {"bt_bytes": len(bodies[0]), "octomaps_bytes": len(bodies[1]), "same": bodies[0] == bodies[1]}
+    counts = loaded.manifest["counts"]["voxels"]
+    figures = {"voxel_size_m": loaded.occupancy.finest, "voxels": counts, "exports": rows, "octomap": octomap}
+    truth = Path(loaded.manifest["capture"]["path"]) / "ground_truth.npz"
+    return {**figures, **({"plan": plans.measure_plan(map_path)} if truth.is_file() else {})}
+
+
+def _timed(arguments: list[str]) -> tuple[float, int]:
+    """Wall seconds and peak resident bytes of a command of freeocc3d. A process begins with the peak of the one that
+    starts it, which therefore has to be small: it maps nothing itself, and loads no voxels before all is exported."""
+    command = [sys.executable, "-m", "freeocc3d.cli", *arguments]
+    with tempfile.TemporaryFile("w+") as said:
+        mark = time.perf_counter()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
+        _, status, usage = os.wait4(process.pid, 0)
+        seconds = time.perf_counter() - mark
+        process.returncode = os.waitstatus_to_exitcode(status)
+        said.seek(0)
+        if process.returncode:
+            raise SystemExit(said.read().strip() or f"{arguments[0]} ended with {process.returncode}")
+    return seconds, usage.ru_maxrss * 1024
+
+
+def _octomaps_own(made: Any, path: Path) -> bool:
+    """Have OctoMap write the voxels, pruned. False where it is not installed."""
+    import numpy as np
+
+    try:
+        import pyoctomap
+    except ImportError:
+        return False
+    from freeocc3d.export.frames import placed
+    from freeocc3d.types import FREE, OCCUPIED
+
+    there = placed(made, "gravity", origin=np.zeros(3)).occupancy
+    tree = pyoctomap.OcTree(there.voxel_size)
+    for state in (FREE, OCCUPIED):
+        for center in there.centers(there.voxels(state)):
+            tree.updateNode(center, state == OCCUPIED, lazy_eval=True)
+    tree.updateInnerOccupancy()
+    return bool(tree.writeBinary(str(path)))
+
+
+def exports_lines(figures: Figures) -> list[Line]:
+    """Rows of a table: what, measured, asked."""
+    size, occupied = figures["voxel_size_m"], figures["voxels"]["occupied"]
+    lines: list[Line] = [(f"exports of {occupied:,} occupied voxels of {100 * size:g} cm", "", "")]
+    asked = f"{SECONDS} s, {BYTES / 1e9:g} GB"
+    for name, row in figures["exports"].items():
+        measured = f"{row['seconds']:.1f} s, {row['peak_memory_bytes'] / 1e9:.2f} GB, {row['bytes'] / 1e6:.2f} MB"
+        lines.append((f"  {name}", measured, asked))
+    if octomap := figures["octomap"]:
+        same = "the same bytes" if octomap["same"] else "other bytes"
+        measured = f"{octomap['bt_bytes']:,} of {octomap['octomaps_bytes']:,} bytes, {same}"
+        lines.append(("  .bt beside OctoMap's own", measured, "no larger"))
+    return [*lines, *(plans.plan_lines(figures["plan"]) if "plan" in figures else [])]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("map", help="map folder")
+    parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
+    given = parser.parse_args()
+    figures = measure_map(given.map)
+    if given.json:
+        print(json.dumps(figures))
+        return
+    for line in exports_lines(figures):
+        print(f"| {' | '.join(line)} |")
+
+
+if __name__ == "__main__":
+    main()
