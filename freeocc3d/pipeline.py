@@ -56,6 +56,12 @@ class Mapper:
         self.capture = capture
         self.keyframes = Keyframes(folder / store.KEYFRAMES)
         self.tracker: Tracker = _load_backend(settings, "tracking", "backend", capture)
+        if self.tracker.needs_depth and not capture.has_depth:
+            raise TrackingError(
+                f"tracking.backend={settings['tracking']['backend']} needs depth, which {capture.path} has none of (or "
+                "capture.depth=false): estimate poses from colour with tracking.backend=colmap, or give them (known, "
+                "file)."
+            )
         self.rasterizer: Rasterizer = _load_backend(settings, "fitting", "rasterizer")
         self._fitted: tuple[Gaussians, Trajectory] | None = None
 

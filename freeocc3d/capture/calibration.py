@@ -24,6 +24,12 @@ MAX_SKEW_PX = 1.0
 """Calibrations state tiny skews that no pixel notices; the camera model here has none."""
 
 
+USUAL_FOCAL = 0.85
+"""Focal length over the longer side of an image where nothing says it: between a phone's main camera (a 24 to 28 mm
+equivalent: 0.72 to 0.78 of a photograph, 0.8 to 0.95 of a video, which stabilisation crops) and the 0.82 to 0.96 of
+depth cameras' colour images; within a fifth of all of them, from where it can be estimated."""
+
+
 @dataclass(frozen=True)
 class Calibration:
     """fx, fy, cx, cy in pixels, the image size that they are meant for (None = that of the images found), and where
@@ -71,6 +77,13 @@ def seen_at(camera: Intrinsics, size: Size) -> Intrinsics:
             "pixels: colour and depth need a calibration each (the scannet layout has room for both)."
         )
     return camera.resized(*size)
+
+
+def usual(size: Size) -> Intrinsics:
+    """A guess at the camera of images of ``size`` of which nothing is known."""
+    width, height = size
+    focal = USUAL_FOCAL * max(size)
+    return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def given(options: Options) -> Calibration | None:
