@@ -43,7 +43,7 @@ class Reader(ImagePairs):
         camera = calibration.camera(pairs.color_size) if calibration else usual(pairs.color_size)
         grid = Grid(camera, seen_at(camera, pairs.depth_size))
         super().__init__(path, options, pairs, grid, units_per_metre)
-        self.intrinsics_known = calibration is not None
+        self.intrinsics_known = self.focal_stated = calibration is not None
         self.classes = read_class_names(path / "classes.json")
 
     @classmethod

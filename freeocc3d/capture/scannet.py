@@ -51,6 +51,7 @@ class Reader(ImagePairs):
     def __init__(self, path: Path, options: Options):
         pairs = pair(numbered(path / "color", COLOR), numbered(path / "depth", IMAGE), path, options)
         grid, self.intrinsics_known = _grid(path, options, pairs)
+        self.focal_stated = self.intrinsics_known
         super().__init__(path, options, pairs, grid, units_per_metre=1000.0)
         self.classes = read_class_names(path / "classes.json")
 
