@@ -17,6 +17,10 @@ from numpy.typing import NDArray
 
 from ..types import Frame
 
+NOMINAL_DEPTH = 2.0
+"""The median depth that scans of unknown scale are given, as rooms have it in metres: voxels and tolerances, which are
+in metres, are then of a sensible size beside the scene."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -57,6 +61,9 @@ class Capture(ABC):
     """The reader's name, the same as its file's."""
     layout: ClassVar[str]
     """What ``recognises`` looks for, in words, for the message about an unrecognised folder."""
+
+    general: ClassVar[bool] = False
+    """Whether other formats' folders may look like this one's, too, so that they are looked for first."""
 
     path: Path
     timestamps: NDArray[np.float64]

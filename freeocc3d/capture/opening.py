@@ -149,7 +149,8 @@ def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mappin
 def _recognise(folder: Path) -> str:
     """Name of the one reader that recognises the folder. Raises CaptureError if none does, or several."""
     readers = _readers()
-    found = [name for name, reader in readers.items() if reader.recognises(folder)]
+    found = [name for name, reader in readers.items() if not reader.general and reader.recognises(folder)]
+    found = found or [name for name, reader in readers.items() if reader.general and reader.recognises(folder)]
     if len(found) > 1:
         raise CaptureError(f"{folder} looks like {' and like '.join(found)}: name one with capture.format.")
     if found:
