@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import __version__, adaptive, config, registry, store
+from . import __version__, adaptive, config, registry, scale, store
 from .capture import Capture, check_depth_scale, open_capture, read_ahead, used_frames
 from .capture import base as capture_base
 from .capture.reregistered import Reregistered
@@ -314,6 +314,9 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
             "occupancy.voxel_size smaller than the scene?"
         )
     _check_result(trajectory, progress, work)
+    if not mapper.tracker.metric:
+        work.warnings.append(scale.UNKNOWN)
+        progress.warn(scale.UNKNOWN)
     progress.stage("saving")
     _save(work, mapper, trajectory, gaussians, features, occupancy, encoder, vocabulary)
     work.finish(output)
@@ -514,6 +517,7 @@ def _manifest(
         "poses": "camera to world",
         **store.sizes(occupancy),
         "origin": occupancy.origin.tolist(),
+        "scale": _scale(mapper),
         "up": estimate_up(trajectory.T_world_keyframe, gaussians.means).tolist(),
         "T_world_map": np.eye(4).tolist(),
         "T_gravity_map": gravity_frame(trajectory.T_world_keyframe, gaussians).tolist(),
@@ -528,6 +532,15 @@ def _manifest(
         },
         "keyframes": trajectory.keyframes.tolist(),
     }
+
+
+def _scale(mapper: Mapper) -> dict[str, Any]:
+    """Whether lengths are metres, what says so, and how many a unit of what the tracker gives is."""
+    capture, given = mapper.capture, mapper.capture.options.scale
+    if not mapper.tracker.metric:
+        return {"metric": False, "by": "none", "factor": 1.0}
+    by = "sensor" if capture.has_depth else "given" if given is not None else "poses"
+    return {"metric": True, "by": by, "factor": given or 1.0}
 
 
 def _report(work: WorkFolder, capture: Capture, trajectory: Trajectory, submaps: list[Submap]) -> dict[str, Any]:

@@ -32,8 +32,8 @@ class Reader(PosedImages):
     """Frames are in the natural order of their files' names. Intrinsics stand in the file or in each frame, with the
     origin at the corner of the first pixel; poses are of OpenGL cameras; depth is 16-bit millimetres, of any size.
 
-    With depth, poses are in metres; without it they are in the file's unit, of which ``capture.scale`` says how many
-    metres it is. Raises CaptureError, naming the file, for what it lacks.
+    Poses that come with depth are in metres, whether it is read or not; others are in the file's unit, of which
+    ``capture.scale`` says how many metres it is. Raises CaptureError, naming the file, for what it lacks.
     """
 
     format = "nerfstudio"
@@ -53,7 +53,8 @@ class Reader(PosedImages):
             posed.append(PosedImage(image, depth_path, _lens({**content, **frame}, image, file), T_world_cam))
         posed.sort(key=lambda view: natural(view.image))
         super().__init__(path, options, posed, options.scale)
-        self.metric_poses = self.has_depth or options.scale is not None
+        comes_with_depth = any("depth_file_path" in frame for frame in content["frames"])
+        self.metric_poses = comes_with_depth or options.scale is not None
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
