@@ -82,6 +82,9 @@ def score_map(
                 raise
     alignment = Alignment.identity() if poses is None else align(estimated, poses, how)
     predicted, note = project.of_map(scan_map, settings, alignment, truth, classes)
+    notes = [note] if note else []
+    if not scan_map.metric and how != "sim3":
+        notes.append("The map's scale is unknown: --align sim3 compares it at the true one.")
     return Scene(
         name=str(scan_map.path),
         truth=truth,
@@ -91,7 +94,7 @@ def score_map(
         frames=len(scan_map.trajectory),
         frames_with_pose=len(estimated),
         up=alignment.rotation @ scan_map.up,
-        notes=(note,) if note else (),
+        notes=tuple(notes),
     )
 
 
