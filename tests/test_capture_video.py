@@ -120,7 +120,7 @@ def test_what_is_no_video_is_told_in_a_sentence(tmp_path: Path) -> None:
     truncate(cut)
     with pytest.raises(CaptureError, match=r"cut\.mp4 is no video that can be read"):
         open_capture(cut)
-    with pytest.raises(CaptureError, match=r"one\.mp4 is no video that can be used: it holds 1 frame\."):
+    with pytest.raises(CaptureError, match=r"one\.mp4 is no video that can be used: it holds 1 frame\. Is it cut off"):
         open_capture(write_video(tmp_path / "one.mp4", count=1))
 
 
@@ -161,3 +161,22 @@ def test_a_file_is_only_read_as_a_video_and_a_folder_never(tmp_path: Path) -> No
         open_capture(path, Options(max_size=2))
     with pytest.raises(ConfigError, match=r"capture\.scale must be positive"):
         open_capture(path, Options(scale=0.0))
+
+
+def test_damage_costs_the_frames_that_hang_on_it_alone(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "scan.mp4")
+    data = bytearray(path.read_bytes())
+    start = data.find(b"mdat") + 4
+    at = data.find(b"\x00\x00\x00", start + 900)  # a later frame's length
+    data[at + 5 : at + 60] = bytes(55)
+    path.write_bytes(bytes(data))
+    capture = open_capture(path)
+    shown, broken = {}, []
+    for index, frame in read_ahead(capture, range(len(capture))):
+        if isinstance(frame, FrameError):
+            broken.append(index)
+        else:
+            shown[index] = number_of(frame.color)
+    assert len(shown) + len(broken) == 60
+    assert len(shown) >= 40
+    assert sum(number != index for index, number in shown.items()) <= 12, "concealed, within one group of pictures"

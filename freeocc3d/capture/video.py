@@ -7,6 +7,7 @@ before it: reading in ascending order, with any stride, passes through the file 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
 from collections.abc import Iterator
@@ -83,7 +84,7 @@ class _Decoder:
         if len(keys) < _LEAST_FRAMES:
             raise CaptureError(
                 f"{path} is no video that can be used: it holds {len(keys)} frame{'s' if len(keys) != 1 else ''}. Is "
-                "it cut off?"
+                "it cut off, or an image? Images are read as a folder of many."
             )
         self.keys, self._starts = keys, starts
         self.time_base = self._stream.time_base
@@ -138,13 +139,21 @@ class _Decoder:
         """To a key frame; to the beginning where a container goes beyond what it is asked for."""
         self._last = None
         self._container.seek(start, stream=self._stream)
-        frames = self._container.decode(self._stream)
+        frames = self._decoded()
         first = next(frames, None)
         if first is None or _key(first) > start:
             self._open()
-            frames = self._container.decode(self._stream)
+            frames = self._decoded()
             first = next(frames)
         self._frames = itertools.chain((first,), frames)
+
+    def _decoded(self) -> Iterator[Any]:
+        """Frames from where the file stands; what does not decode is left out."""
+        import av
+
+        for packet in self._container.demux(self._stream):
+            with contextlib.suppress(av.error.InvalidDataError):
+                yield from packet.decode()
 
     def _first_frame(self) -> Any:
         """The first that decodes, by which a file that does not decode at all is told when it is opened."""

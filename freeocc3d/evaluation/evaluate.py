@@ -294,7 +294,7 @@ def capture_of(scan_map: Map, settings: Config | None = None) -> Capture:
     """The capture that a map was made of, opened as it was then. Raises FreeOccError if it is not there any more."""
     settings = settings or config.load(scan_map.path / CONFIG)
     path = scan_map.manifest["capture"]["path"]
-    if not str(path).startswith("builtin:") and not Path(path).is_dir():
+    if not str(path).startswith("builtin:") and not Path(path).exists():
         raise FreeOccError(
             f"The capture {path}, of which {scan_map.path} was made, is not there: name the true poses with --poses."
         )

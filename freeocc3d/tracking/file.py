@@ -105,9 +105,9 @@ def depth_of_points(points_cam: NDArray[np.float32], frame: Frame) -> NDArray[np
 
 
 def _beside(path: str, capture: Capture) -> Path:
-    """The path as given, or, where there is no such file, in the capture's folder."""
+    """The path as given, or, where there is no such file, in the capture's folder or beside the video."""
     given = Path(path).expanduser()
-    inside = capture.path / given
+    inside = (capture.path.parent if capture.path.is_file() else capture.path) / given
     return inside if not given.exists() and inside.exists() else given
 
 
