@@ -485,10 +485,12 @@ def _save(
         store.write_occupancy(folder, occupancy, codec, features)
         store.write_tum(folder / store.TRAJECTORY, trajectory)
         (folder / store.CONFIG).write_text(config.dump(mapper.settings), encoding="utf-8")
-        paths.path_picture(folder / store.PATH_PICTURE, submaps, trajectory, gaussians, capture.path)
+        metric = mapper.tracker.metric
+        paths.path_picture(folder / store.PATH_PICTURE, submaps, trajectory, gaussians, capture.path, metric)
         views = list(zip(trajectory.keyframes.tolist(), mapper.views(trajectory), strict=True))
         shown = [views[row] for row in _evenly(len(views), renders.SHOWN)]
-        renders.render_picture(folder / store.RENDER_PICTURE, gaussians, shown, mapper.rasterizer, capture.path)
+        picture = folder / store.RENDER_PICTURE
+        renders.render_picture(picture, gaussians, shown, mapper.rasterizer, capture.path, metric)
         measured = [views[row][1] for row in _evenly(len(views), _MEASURED_VIEWS)]
         fidelity = images.fidelity(gaussians, measured, mapper.rasterizer)
         if len(keyframes) < len(mapper.keyframes):

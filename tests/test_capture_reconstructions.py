@@ -97,6 +97,20 @@ def test_nerfstudio_without_depth_has_no_scale_unless_one_is_given(tmp_path: Pat
     np.testing.assert_allclose(scaled.pose(2)[:3, 3], 2.5 * pose_matrix(2)[:3, 3])
 
 
+def test_nerfstudio_without_depth_has_a_nominal_scale_by_its_points(tmp_path: Path) -> None:
+    import open3d as o3d
+
+    write_nerfstudio(tmp_path, 3, depth=False, ply_file_path="sparse_pc.ply")
+    assert open_capture(tmp_path).pose(2)[0, 3] == pytest.approx(pose_matrix(2)[0, 3]), "the file is not there"
+    points = np.random.default_rng(0).uniform((-1, -1, 8), (1, 1, 8), (200, 3))
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    o3d.io.write_point_cloud(str(tmp_path / "sparse_pc.ply"), cloud)
+    capture = open_capture(tmp_path)
+    assert not capture.metric_poses
+    assert capture.pose(2)[0, 3] == pytest.approx(pose_matrix(2)[0, 3] * NOMINAL_DEPTH / 8, rel=0.05)
+    assert open_capture(tmp_path, Options(scale=1.0)).pose(2)[0, 3] == pytest.approx(pose_matrix(2)[0, 3])
+
+
 def test_a_scale_beside_depth_is_refused_and_depth_can_be_left_out(tmp_path: Path) -> None:
     write_nerfstudio(tmp_path, 3)
     with pytest.raises(ConfigError, match=r"capture\.scale is for scans without depth"):

@@ -6,20 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import CaptureError
-from ..geometry import invert, project, transform
+from ..geometry import invert
 from ..types import Intrinsics
-from .base import NOMINAL_DEPTH, Options
+from .base import Options
 from .photos import natural
-from .posed_images import PosedImage, PosedImages, inside
+from .posed_images import PosedImage, PosedImages, inside, nominal_scale
 from .rectified import Lens
 from .trajectories import colmap_folder, read_colmap_model
 
 REQUIRES: tuple[str, ...] = ("pycolmap",)
-
-_SAMPLES = 20_000
 
 
 class Reader(PosedImages):
@@ -48,26 +45,13 @@ class Reader(PosedImages):
                 posed.append(PosedImage(file, None, lenses[image.camera_id], invert(T_cam_world)))
         posed.sort(key=lambda view: natural(view.image))
         points = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
-        self.points = points[:: max(1, len(points) // _SAMPLES)]
-        super().__init__(path, options, posed, options.scale or nominal_scale(posed, self.points))
+        super().__init__(path, options, posed, options.scale or nominal_scale(posed, points))
         self.metric_poses = options.scale is not None
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         names_images = colmap_folder(path) is not None and (path / "images").is_dir()
         return names_images and not (path / "transforms.json").is_file()
-
-
-def nominal_scale(posed: list[PosedImage], points: NDArray[np.float64]) -> float | None:
-    """What brings the median depth of (P, 3) points, where images show them, to ``NOMINAL_DEPTH``; None without any."""
-    depths = []
-    for view in posed:
-        camera = view.lens.camera
-        pixels, depth = project(transform(invert(view.T_world_cam), points), camera)
-        seen = (pixels >= 0).all(axis=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
-        if seen.any():
-            depths.append(float(np.median(depth[seen])))
-    return NOMINAL_DEPTH / float(np.median(depths)) if depths else None
 
 
 def _lens(camera: Any, folder: Path) -> Lens:

@@ -10,12 +10,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..errors import CaptureError
 from ..types import Intrinsics
 from .base import Options
 from .calibration import Calibration, read_json
 from .photos import natural, read_header
-from .posed_images import PosedImage, PosedImages, inside
+from .posed_images import PosedImage, PosedImages, inside, nominal_scale
 from .rectified import Lens
 from .trajectories import read_trajectory
 
@@ -33,7 +36,8 @@ class Reader(PosedImages):
     origin at the corner of the first pixel; poses are of OpenGL cameras; depth is 16-bit millimetres, of any size.
 
     Poses that come with depth are in metres, whether it is read or not; others are in the file's unit, of which
-    ``capture.scale`` says how many metres it is. Raises CaptureError, naming the file, for what it lacks.
+    ``capture.scale`` says how many metres it is; without it, the file's points, if it has any, are scaled to a median
+    depth of ``NOMINAL_DEPTH``. Raises CaptureError, naming the file, for what it lacks.
     """
 
     format = "nerfstudio"
@@ -52,13 +56,25 @@ class Reader(PosedImages):
             depth_path = None if depth is None else inside(path, str(depth), file)
             posed.append(PosedImage(image, depth_path, _lens({**content, **frame}, image, file), T_world_cam))
         posed.sort(key=lambda view: natural(view.image))
-        super().__init__(path, options, posed, options.scale)
         comes_with_depth = any("depth_file_path" in frame for frame in content["frames"])
+        scale = options.scale
+        if scale is None and not comes_with_depth and (points := content.get("ply_file_path")):
+            scale = nominal_scale(posed, _read_points(inside(path, str(points), file)))
+        super().__init__(path, options, posed, scale)
         self.metric_poses = comes_with_depth or options.scale is not None
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return (path / TRANSFORMS).is_file()
+
+
+def _read_points(file: Path) -> NDArray[np.float64]:
+    """(P, 3), of a PLY file; none if it is not there or damaged, for they are not needed."""
+    import open3d as o3d
+
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.io.read_point_cloud(str(file), remove_nan_points=True, remove_infinite_points=True)
+    return np.asarray(cloud.points, np.float64).reshape(-1, 3)
 
 
 def _lens(stated: Mapping[str, Any], image: Path, file: Path) -> Lens:

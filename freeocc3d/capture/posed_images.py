@@ -12,14 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CaptureError, FrameError
+from ..geometry import invert, project, transform
 from ..types import Frame
-from .base import Capture, Options
+from .base import NOMINAL_DEPTH, Capture, Options
 from .calibration import given, seen_at
 from .images import metres, read_color, read_depth
 from .rectified import Lens, Rectified
 
 UNITS_PER_METRE = 1000.0
 """Of stored depth, unless ``capture.depth_scale`` says otherwise."""
+
+_SAMPLES = 20_000
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,19 @@ class PosedImages(Capture):
 
     def pose(self, index: int) -> NDArray[np.float64]:
         return self._posed[index].T_world_cam
+
+
+def nominal_scale(posed: Sequence[PosedImage], points: NDArray[np.float64]) -> float | None:
+    """What brings the median depth of (P, 3) points, where images show them, to ``NOMINAL_DEPTH``; None without any."""
+    points = points[:: max(1, len(points) // _SAMPLES)]
+    depths = []
+    for view in posed:
+        camera = view.lens.camera
+        pixels, depth = project(transform(invert(view.T_world_cam), points), camera)
+        seen = (pixels >= 0).all(axis=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+        if seen.any():
+            depths.append(float(np.median(depth[seen])))
+    return NOMINAL_DEPTH / float(np.median(depths)) if depths else None
 
 
 def inside(folder: Path, name: str, stated_by: Path) -> Path:
