@@ -11,7 +11,7 @@ from helpers import SIZE, camera_matrix, color_image, write_replica, write_scann
 from freeocc3d import pipeline
 from freeocc3d.capture import Options, open_capture
 from freeocc3d.capture.calibration import USUAL_FOCAL
-from freeocc3d.errors import CaptureError, TrackingError
+from freeocc3d.errors import CaptureError, ConfigError, TrackingError
 
 COLOUR_ALONE = Options(depth=False)
 
@@ -94,6 +94,12 @@ def test_the_built_in_room_has_the_same_colour() -> None:
     frame = open_capture("builtin:room", COLOUR_ALONE, small)[3]
     assert not frame.depth_m.any()
     np.testing.assert_array_equal(frame.color, open_capture("builtin:room", Options(), small)[3].color)
+
+
+def test_a_scale_is_refused_where_depth_says_it() -> None:
+    with pytest.raises(ConfigError, match=r"capture\.scale is for scans without depth, but builtin:room has depth"):
+        open_capture("builtin:room", Options(scale=2.0))
+    assert not open_capture("builtin:room", Options(scale=2.0, depth=False)).has_depth
 
 
 @pytest.mark.parametrize("backend", ["rgbd", "odometry"])

@@ -55,15 +55,9 @@ def open_capture(
         )
     try:
         name = VIDEO if is_video else _recognise(folder) if options.format == "auto" else options.format
-        opened = _construct(name, folder, options, backend_options or {})
+        return _construct(name, folder, options, backend_options or {})
     except OSError as error:
         raise CaptureError(f"Cannot read {error.filename or folder}: {error.strerror}.") from error
-    if options.scale is not None and opened.has_depth:
-        raise ConfigError(
-            f"capture.scale is for scans without depth, but {folder} has depth, which says how large everything is: "
-            "leave it out, or give capture.depth=false."
-        )
-    return opened
 
 
 def used_frames(capture: Capture) -> range:
@@ -141,9 +135,14 @@ def _check(options: Options) -> None:
 
 def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mapping[str, Any]]) -> Capture:
     module = registry.load("capture", name)
-    if registry.backends("capture")[name].options:
-        return module.Reader(path, options, registry.build_options(module, own.get(name) or {}))
-    return module.Reader(path, options)
+    extra = [registry.build_options(module, own.get(name) or {})] if registry.backends("capture")[name].options else []
+    opened: Capture = module.Reader(path, options, *extra)
+    if options.scale is not None and opened.has_depth:
+        raise ConfigError(
+            f"capture.scale is for scans without depth, but {path} has depth, which says how large everything is: "
+            "leave it out, or give capture.depth=false."
+        )
+    return opened
 
 
 def _recognise(folder: Path) -> str:
