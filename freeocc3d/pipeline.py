@@ -290,6 +290,14 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
     mapper = Mapper(settings, capture, work.folder)
     encoder: Encoder = _load_backend(settings, "language", "encoder", capture)
 
+    if not (capture.intrinsics_known or mapper.tracker.estimates_camera):
+        text = (
+            f"Nothing says what camera took {capture.path}: its focal length is "
+            f"{'what the images roughly state' if capture.focal_stated else 'a guess'}, and what is mapped is bent as "
+            "far as that is wrong. Give capture.intrinsics, if you have them."
+        )
+        work.warnings.append(text)
+        progress.warn(text)
     with work.timed("tracking"):
         _track(mapper, work, progress)
     with work.timed("refinement"):

@@ -65,6 +65,7 @@ def test_a_video_becomes_a_map_whose_scale_is_said_to_be_unknown_and_can_be_give
     assert scan_map.manifest["capture"]["format"] == "video"
     assert scan_map.manifest["scale"] == {"metric": False, "by": "none", "factor": 1.0}
     assert scale.UNKNOWN in scan_map.report["warnings"]
+    assert not any("what camera" in text for text in scan_map.report["warnings"])
     assert scan_map.trajectory.has_pose.all()
     assert scale.by_poses(scan_map, str(scan / "metric.txt")) == pytest.approx(UNIT_M, rel=1e-3)
     assert scale.by_camera_height(scan_map, 1.5) == pytest.approx(UNIT_M, rel=0.06)
@@ -82,3 +83,13 @@ def test_with_a_scale_given_from_the_start_the_map_is_metric(scan: Path, tmp_pat
     found = scan_map.occupancy.centers(scan_map.occupancy.occupied_voxels())
     near = np.array([np.abs(occupied - center).max(axis=1).min() for center in found[::20]])
     assert (near < 0.16).mean() > 0.9
+
+
+def test_a_guessed_camera_is_told(scan: Path, tmp_path: Path) -> None:
+    settings = {
+        "capture": {"stop": 8},
+        "tracking": {"backend": "file", "file": {"path": "other.txt", "points": "points.ply", "scale": None}},
+        "fitting": {"passes": 0},
+    }
+    scan_map = pipeline.reconstruct(scan / "scan.mp4", tmp_path / "map", settings)
+    assert any("what camera took" in text and "a guess" in text for text in scan_map.report["warnings"])
