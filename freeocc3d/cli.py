@@ -93,18 +93,22 @@ def _options(
 
 @app.command()
 def reconstruct(
-    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Folder of a scan, or builtin:room.")],
+    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Folder of a scan, a video, or builtin:room.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="MAP", help="Map folder to write.")],
     config_file: Annotated[Path | None, typer.Option("--config", help="YAML file with options.")] = None,
     overrides: Set = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
     overwrite: Overwrite = False,
     device: Annotated[str | None, typer.Option("--device", help="cpu (the default) or cuda:0.")] = None,
+    scale: Annotated[
+        float | None,
+        typer.Option("--scale", metavar="S", help="Metres per unit of the poses, where there is no depth to say it."),
+    ] = None,
 ) -> None:
     """Turn a captured scan into a map."""
     from . import config, pipeline
 
-    settings = config.load(config_file, overrides or [])
+    settings = config.load(config_file, [*(overrides or []), *([] if scale is None else [f"capture.scale={scale}"])])
     if device is not None:
         chosen = [(section, settings[section][key]) for section, key in _DEVICES]
         movable = [settings[section][name] for section, name in chosen if "device" in settings[section].get(name, {})]
@@ -216,10 +220,11 @@ def _answer(map_path: Path, loaded: Any, results: list[Any], as_json: bool, view
     from . import query as asking
 
     if not as_json:
-        return asking.to_text(results)
+        unit = "" if loaded.metric else "\nLengths are not metres: the map's scale is unknown (freeocc3d scale)."
+        return asking.to_text(results) + unit
     from .details import details
 
-    return json.dumps(asking.to_json(map_path, results, details(loaded, results, views)))
+    return json.dumps(asking.to_json(map_path, results, details(loaded, results, views), loaded.metric))
 
 
 def _answer_lines(loaded: Any, options: dict[str, Any], as_json: bool, views: bool) -> None:
@@ -293,6 +298,45 @@ def refine(
 
 
 @app.command()
+def scale(
+    map_path: MapPath,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="MAP", help="Map folder to write.")],
+    factor: Annotated[float | None, typer.Option("--factor", metavar="S", help="Metres per unit of the map.")] = None,
+    length: Annotated[
+        tuple[str, str, float] | None,
+        typer.Option(
+            "--length",
+            metavar="POINT POINT METRES",
+            help="How far two points are apart: each a pixel of a keyframe, FRAME:X,Y, or a word.",
+        ),
+    ] = None,
+    camera_height: Annotated[
+        float | None, typer.Option("--camera-height", metavar="METRES", help="Of the cameras above the floor.")
+    ] = None,
+    poses: Annotated[
+        str | None, typer.Option("--poses", metavar="FILE|CAPTURE", help="Poses of the same frames in metres.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Give a map whose scale is unknown lengths in metres."""
+    from . import scale as scaling
+    from .store import load_map
+
+    if [factor, length, camera_height, poses].count(None) != 3:
+        raise typer.BadParameter("give one of --factor, --length, --camera-height and --poses.")
+    loaded = load_map(map_path)
+    by = "given"
+    if length is not None:
+        factor, by = scaling.by_length(loaded, length[:2], length[2]), "length"
+    elif camera_height is not None:
+        factor, by = scaling.by_camera_height(loaded, camera_height), "camera height"
+    elif poses is not None:
+        factor, by = scaling.by_poses(loaded, poses), "poses"
+    assert factor is not None
+    print(_info_text(_info(scaling.scaled(loaded, factor, by, output, overwrite=overwrite))))
+
+
+@app.command()
 def export(
     map_path: MapPath,
     format_name: Annotated[str, typer.Option("--format", help="See 'freeocc3d list exporters'.")],
@@ -312,9 +356,11 @@ def export(
     options = {} if frame is None else {"frame": frame}
     options |= _values(overrides or [], {option.name: option.type for option in known})
     refuse_existing(output, overwrite)
-    progress = ConsoleProgress()
-    for note in export_map(load_map(map_path), format_name, output, options, overwrite=overwrite):
+    progress, loaded = ConsoleProgress(), load_map(map_path)
+    for note in export_map(loaded, format_name, output, options, overwrite=overwrite):
         progress.warn(note)
+    if not loaded.metric:
+        print("note: lengths are not metres, for the map's scale is unknown (freeocc3d scale).", file=sys.stderr)
     files = [path for path in output.rglob("*") if path.is_file()] if output.is_dir() else [output]
     print(f"{output}: {sum(path.stat().st_size for path in files):,} bytes")
 
@@ -631,6 +677,8 @@ def _info(loaded: Any) -> dict[str, Any]:
         "color_focal": report.get("color_focal", 1.0),
         "gaussians": counts["gaussians"],
         "voxels": {"occupied": counts["voxels"]["occupied"], "free": counts["voxels"]["free"]},
+        "metric": loaded.metric,
+        "scale": manifest.get("scale", {"metric": True, "by": "sensor", "factor": 1.0}),
         "voxel_size_m": manifest["voxel_size_m"],
         "finest_voxel_m": manifest.get("finest_voxel_m", manifest["voxel_size_m"]),
         "refined": manifest.get("refined"),
@@ -651,6 +699,7 @@ def _info_text(facts: dict[str, Any]) -> str:
     size = sum(facts["bytes"].values())
     used = facts["frames"] - facts["frame_status"].get("unused", 0)
     largest, smallest = facts["voxel_size_m"], facts["finest_voxel_m"]
+    unit = "m" if facts["metric"] else "units of unknown length"
     plural = {name: "s" if facts[name] != 1 else "" for name in ("keyframes", "submaps")}
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in facts["seconds"].items())
     lines = [
@@ -668,7 +717,8 @@ def _info_text(facts: dict[str, Any]) -> str:
         ),
         f"gaussians  {facts['gaussians']:,}",
         f"voxels     {facts['voxels']['occupied']:,} occupied, {facts['voxels']['free']:,} free, "
-        + (f"edge {largest:g} m" if largest == smallest else f"edges {largest:g} to {smallest:g} m"),
+        + (f"edge {largest:.3g} {unit}" if largest == smallest else f"edges {largest:.3g} to {smallest:.3g} {unit}"),
+        *([] if facts["scale"]["by"] == "sensor" else [_scale_text(facts["scale"])]),
         f"encoder    {facts['encoder']}, which knows {facts['encoder_knows']}",
         *([_vocabulary_text(facts["vocabulary"])] if facts["vocabulary"] else []),
         f"time       {sum(facts['seconds'].values()):.1f} s: {seconds}",
@@ -682,6 +732,14 @@ def _info_text(facts: dict[str, Any]) -> str:
         ]
     lines += [f"warning    {text}" for text in facts["warnings"]]
     return "\n".join(lines)
+
+
+def _scale_text(scale: dict[str, Any]) -> str:
+    if not scale["metric"]:
+        return "scale      unknown: lengths are not metres"
+    told = {"given": "as given", "length": "by a known length", "camera height": "by the cameras' height"}
+    times = "" if scale["factor"] == 1 else f", {scale['factor']:.4g} of them per unit of what was tracked"
+    return f"scale      metres, {told.get(scale['by'], 'by the poses')}{times}"
 
 
 def _vocabulary_text(vocabulary: dict[str, Any]) -> str:

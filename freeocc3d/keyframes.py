@@ -43,16 +43,25 @@ class Keyframes(Sequence[Frame]):
         self.folder.mkdir(parents=True, exist_ok=True)
         bgr = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
         color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-        units = np.clip(np.rint(frame.depth_m * _UNITS_PER_METRE), 0, 65535).astype(np.uint16)
-        depth = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
         color_path, depth_path = self._paths(frame.index)
         color_path.write_bytes(color.tobytes())
-        depth_path.write_bytes(depth.tobytes())
+        depth_path.write_bytes(_encoded_depth(frame.depth_m))
         camera = frame.intrinsics
         self._entries.append(
             {"frame": frame.index, "timestamp": frame.timestamp, "width": camera.width, "height": camera.height,
              "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
         )  # fmt: skip
+
+    def write_scaled(self, folder: Path, factor: float) -> None:
+        """Write them to another folder with depth times ``factor``; colour is copied. Raises OSError, MapError."""
+        folder.mkdir(parents=True, exist_ok=True)
+        written = Keyframes(folder)
+        for row, entry in enumerate(self._entries):
+            color_path, depth_path = self._paths(int(entry["frame"]))
+            (folder / color_path.name).write_bytes(color_path.read_bytes())
+            (folder / depth_path.name).write_bytes(_encoded_depth(self.depth_m(row) * np.float32(factor)))
+            written._entries.append(entry)
+        written.save_index()
 
     def only(self, frames: NDArray[np.integer]) -> Keyframes:
         """Those of the given frames of the capture, in the same folder."""
@@ -122,6 +131,11 @@ class Keyframes(Sequence[Frame]):
     def _paths(self, index: int) -> tuple[Path, Path]:
         """Colour and depth image of a frame."""
         return self.folder / f"{index:06d}.color.jpg", self.folder / f"{index:06d}.depth.png"
+
+
+def _encoded_depth(depth_m: NDArray[np.float32]) -> bytes:
+    units = np.clip(np.rint(depth_m * _UNITS_PER_METRE), 0, 65535).astype(np.uint16)
+    return bytes(cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
 
 
 def _camera(entry: dict[str, float]) -> Intrinsics:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import __version__, adaptive, config, registry, store
+from . import __version__, adaptive, config, registry, scale, store
 from .capture import Capture, check_depth_scale, open_capture, read_ahead, used_frames
 from .capture import base as capture_base
 from .capture.reregistered import Reregistered
@@ -56,6 +56,12 @@ class Mapper:
         self.capture = capture
         self.keyframes = Keyframes(folder / store.KEYFRAMES)
         self.tracker: Tracker = _load_backend(settings, "tracking", "backend", capture)
+        if self.tracker.needs_depth and not capture.has_depth:
+            raise TrackingError(
+                f"tracking.backend={settings['tracking']['backend']} needs depth, which {capture.path} has none of (or "
+                "capture.depth=false): estimate poses from colour with tracking.backend=colmap, or give them (known, "
+                "file)."
+            )
         self.rasterizer: Rasterizer = _load_backend(settings, "fitting", "rasterizer")
         self._fitted: tuple[Gaussians, Trajectory] | None = None
 
@@ -284,6 +290,14 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
     mapper = Mapper(settings, capture, work.folder)
     encoder: Encoder = _load_backend(settings, "language", "encoder", capture)
 
+    if not (capture.intrinsics_known or mapper.tracker.estimates_camera):
+        text = (
+            f"Nothing says what camera took {capture.path}: its focal length is "
+            f"{'what the images roughly state' if capture.focal_stated else 'a guess'}, and what is mapped is bent as "
+            "far as that is wrong. Give capture.intrinsics, if you have them."
+        )
+        work.warnings.append(text)
+        progress.warn(text)
     with work.timed("tracking"):
         _track(mapper, work, progress)
     with work.timed("refinement"):
@@ -308,6 +322,9 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
             "occupancy.voxel_size smaller than the scene?"
         )
     _check_result(trajectory, progress, work)
+    if not mapper.tracker.metric:
+        work.warnings.append(scale.UNKNOWN)
+        progress.warn(scale.UNKNOWN)
     progress.stage("saving")
     _save(work, mapper, trajectory, gaussians, features, occupancy, encoder, vocabulary)
     work.finish(output)
@@ -476,10 +493,12 @@ def _save(
         store.write_occupancy(folder, occupancy, codec, features)
         store.write_tum(folder / store.TRAJECTORY, trajectory)
         (folder / store.CONFIG).write_text(config.dump(mapper.settings), encoding="utf-8")
-        paths.path_picture(folder / store.PATH_PICTURE, submaps, trajectory, gaussians, capture.path)
+        metric = mapper.tracker.metric
+        paths.path_picture(folder / store.PATH_PICTURE, submaps, trajectory, gaussians, capture.path, metric)
         views = list(zip(trajectory.keyframes.tolist(), mapper.views(trajectory), strict=True))
         shown = [views[row] for row in _evenly(len(views), renders.SHOWN)]
-        renders.render_picture(folder / store.RENDER_PICTURE, gaussians, shown, mapper.rasterizer, capture.path)
+        picture = folder / store.RENDER_PICTURE
+        renders.render_picture(picture, gaussians, shown, mapper.rasterizer, capture.path, metric)
         measured = [views[row][1] for row in _evenly(len(views), _MEASURED_VIEWS)]
         fidelity = images.fidelity(gaussians, measured, mapper.rasterizer)
         if len(keyframes) < len(mapper.keyframes):
@@ -508,6 +527,7 @@ def _manifest(
         "poses": "camera to world",
         **store.sizes(occupancy),
         "origin": occupancy.origin.tolist(),
+        "scale": _scale(mapper),
         "up": estimate_up(trajectory.T_world_keyframe, gaussians.means).tolist(),
         "T_world_map": np.eye(4).tolist(),
         "T_gravity_map": gravity_frame(trajectory.T_world_keyframe, gaussians).tolist(),
@@ -522,6 +542,15 @@ def _manifest(
         },
         "keyframes": trajectory.keyframes.tolist(),
     }
+
+
+def _scale(mapper: Mapper) -> dict[str, Any]:
+    """Whether lengths are metres, what says so, and how many a unit of what the tracker gives is."""
+    capture, given = mapper.capture, mapper.capture.options.scale
+    if not mapper.tracker.metric:
+        return {"metric": False, "by": "none", "factor": 1.0}
+    by = "sensor" if capture.has_depth else "given" if given is not None else "poses"
+    return {"metric": True, "by": by, "factor": given or 1.0}
 
 
 def _report(work: WorkFolder, capture: Capture, trajectory: Trajectory, submaps: list[Submap]) -> dict[str, Any]:

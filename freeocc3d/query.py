@@ -343,13 +343,17 @@ def _note(
 
 
 def to_json(
-    map_path: Path, results: list[QueryResult], more: Callable[[Region], dict[str, Any]] | None = None
+    map_path: Path,
+    results: list[QueryResult],
+    more: Callable[[Region], dict[str, Any]] | None = None,
+    metric: bool = True,
 ) -> dict[str, Any]:
-    """The document that ``query --json`` prints; metres, map frame, fractions 0…1. more: gives further keys of a
-    region."""
+    """The document that ``query --json`` prints; metres (if ``metric``), map frame, fractions 0…1. more: gives further
+    keys of a region."""
     return {
         "version": __version__,
         "map": str(map_path),
+        "metric": metric,
         "results": [
             {
                 "word": result.word,

@@ -67,6 +67,11 @@ class Map:
         """(3,) unit vector that points up in the map's frame, as well as the camera's attitude tells."""
         return np.array(self.manifest["up"], np.float64)
 
+    @property
+    def metric(self) -> bool:
+        """Whether lengths are metres; where not, their unit is unknown."""
+        return bool(self.manifest.get("scale", {}).get("metric", True))
+
     @functools.cached_property
     def T_gravity_map(self) -> NDArray[np.float64]:
         """(4, 4) to the frame with z up and the floor at z = 0; found now where an earlier version made the map."""
@@ -370,6 +375,9 @@ def _check_manifest(manifest: dict[str, Any], path: Path) -> None:
             raise MapError(f"{path / MANIFEST} is damaged: '{key}' lacks {', '.join(missing)}.")
     if (named := manifest.get("vocabulary")) is not None and not _is_vocabulary(named):
         raise MapError(f"{path / MANIFEST} is damaged: 'vocabulary' does not hold names with their counts.")
+    scale = manifest.get("scale", {"metric": True})
+    if not isinstance(scale, dict) or not isinstance(scale.get("metric"), bool):
+        raise MapError(f"{path / MANIFEST} is damaged: 'scale' does not say whether lengths are metres.")
     for name in manifest["files"]:
         inside = (path / str(name)).resolve().is_relative_to(path.resolve())
         if not inside:

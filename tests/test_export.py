@@ -18,6 +18,7 @@ FREE = [(-9, 3, 0), (0, 0, 0), (6, 7, 10)]
 def map_of(occupancy, labels=None):
     labels = np.zeros(len(occupancy.occupied_voxels()), np.uint8) if labels is None else np.uint8(labels)
     return SimpleNamespace(
+        metric=True,
         occupancy=occupancy,
         manifest={"T_world_map": np.eye(4).tolist()},
         vocabulary=["cup", "table"],

@@ -19,6 +19,7 @@ CAMERA_TO_UP = np.array([(0.0, 0, 1, 0), (-1, 0, 0, 0), (0, -1, 0, 1.52), (0, 0,
 def map_of(occupancy: Occupancy, T_gravity_map=CAMERA_TO_UP):
     poses = np.stack([np.full((4, 4), np.nan), np.eye(4)])
     return SimpleNamespace(
+        metric=True,
         occupancy=occupancy,
         manifest={"T_world_map": np.eye(4).tolist()},
         vocabulary=["cup", "table"],

@@ -20,7 +20,7 @@ from freeocc3d.geometry import quats_to_rotations, transform
 
 
 def map_of(gaussians, up=(0.0, -1.0, 0.0)):
-    return SimpleNamespace(gaussians=gaussians, up=np.array(up))
+    return SimpleNamespace(gaussians=gaussians, up=np.array(up), metric=True)
 
 
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0.6, 0, -0.8), (0, 1, 0)])

@@ -12,6 +12,7 @@ from freeocc3d.export import export_map
 def exported(tmp_path, words, labels, options=None):
     """What is read back of a map of two voxels with that vocabulary and those labels."""
     scan_map = SimpleNamespace(
+        metric=True,
         occupancy=occupancy_of([(-1, 0, 0), (0, 0, 0)]), manifest={"T_world_map": np.eye(4).tolist()},
         vocabulary=words, labels=lambda: np.array(labels, np.uint8),
     )  # fmt: skip

@@ -18,7 +18,9 @@ def point_colors(tmp_path, occupancy, color):
     """(V, 3) colours that Open3D reads of the voxels' centres."""
     import open3d as o3d
 
-    scan_map = SimpleNamespace(occupancy=occupancy, up=np.array((0.0, -1.0, 0.0)), vocabulary=[], labels=None)
+    scan_map = SimpleNamespace(
+        metric=True, occupancy=occupancy, up=np.array((0.0, -1.0, 0.0)), vocabulary=[], labels=None
+    )
     export_map(scan_map, "ply", tmp_path / "map.ply", {"form": "points", "color": color}, overwrite=True)
     cloud = o3d.io.read_point_cloud(str(tmp_path / "map.ply"))
     return np.rint(255 * np.asarray(cloud.colors)).astype(int)
@@ -46,7 +48,7 @@ def test_a_level_map_has_one_height(tmp_path) -> None:
 
 @pytest.mark.parametrize("color", ["rgb", "height", "probability"])
 def test_an_empty_map_is_refused_in_a_sentence(tmp_path, color) -> None:
-    empty = SimpleNamespace(occupancy=occupancy_of([]), up=np.array((0.0, 0.0, 1.0)))
+    empty = SimpleNamespace(metric=True, occupancy=occupancy_of([]), up=np.array((0.0, 0.0, 1.0)))
     with pytest.raises(ExportError, match="no occupied voxel"):
         export_map(empty, "ply", tmp_path / "map.ply", {"color": color})
     with pytest.raises(ExportError, match="no occupied voxel"):

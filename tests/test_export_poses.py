@@ -22,6 +22,7 @@ def scan_map(tmp_path):
         keyframes.append(wall_frame(2.0, index))
     rng = np.random.default_rng(0)
     return SimpleNamespace(
+        metric=True,
         keyframes=keyframes,
         trajectory=SimpleNamespace(T_world_keyframe=cameras(3)),
         gaussians=gaussians(rng.uniform(0, 3, (500, 3)), 0.02),

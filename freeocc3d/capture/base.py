@@ -1,4 +1,4 @@
-"""The contract of a capture: a folder of frames that are decoded one at a time.
+"""The contract of a capture: a folder of frames, or a video, of which frames are decoded one at a time.
 
 A reader is one file of this folder with a class ``Reader(Capture)``. It finds its files and intrinsics when it is
 constructed (cheaply: nothing is decoded), and decodes frame i when asked. Everything that is peculiar to a format
@@ -16,6 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Frame
+
+NOMINAL_DEPTH = 2.0
+"""The median depth that scans of unknown scale are given, as rooms have it in metres: voxels and tolerances, which are
+in metres, are then of a sensible size beside the scene."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,11 @@ class Options:
     """Depth units per metre (1000 for millimetres); null = what the format or its files say."""
     max_depth: float = 6.0
     """Depth beyond this many metres counts as not measured."""
+    max_size: int | None = 960
+    """Longer side in pixels that images of videos, photographs and reconstructions are reduced to if they are larger;
+    null = as they are."""
+    scale: float | None = None
+    """Metres per unit of poses that come without a scale, those of a scan without depth; null = unknown."""
     intrinsics: tuple[float, float, float, float] | None = None
     """fx, fy, cx, cy of the colour image in pixels, in place of what the files say."""
     color_focal: float | None = None
@@ -53,6 +62,9 @@ class Capture(ABC):
     layout: ClassVar[str]
     """What ``recognises`` looks for, in words, for the message about an unrecognised folder."""
 
+    general: ClassVar[bool] = False
+    """Whether other formats' folders may look like this one's, too, so that they are looked for first."""
+
     path: Path
     timestamps: NDArray[np.float64]
     """(N,) seconds, ascending; 0, 1, 2, … where the format has none."""
@@ -60,6 +72,10 @@ class Capture(ABC):
     """Whether frames come with depth; where not, all of ``Frame.depth_m`` is 0."""
     intrinsics_known: bool = True
     """Whether files or the user say what the camera is; where not, ``Frame.intrinsics`` is a usual guess."""
+    focal_stated: bool = True
+    """Whether at least the focal length is stated, if roughly, as EXIF does; true where the intrinsics are known."""
+    metric_poses: bool = True
+    """Whether ``pose`` is in metres."""
     classes: tuple[str, ...] = ()
     """Names of the class images' values, index 0 = nothing; empty where the capture has no class images."""
 

@@ -24,6 +24,16 @@ MAX_SKEW_PX = 1.0
 """Calibrations state tiny skews that no pixel notices; the camera model here has none."""
 
 
+USUAL_FOCAL = 0.85
+"""Focal length over the longer side of an image where nothing says it: between a phone's main camera (a 24 to 28 mm
+equivalent: 0.72 to 0.78 of a photograph, 0.8 to 0.95 of a video, which stabilisation crops) and the 0.82 to 0.96 of
+depth cameras' colour images; within a fifth of all of them, from where it can be estimated."""
+
+
+DIAGONAL_35MM = 43.27
+"""Of the 36 x 24 mm frame, millimetres."""
+
+
 @dataclass(frozen=True)
 class Calibration:
     """fx, fy, cx, cy in pixels, the image size that they are meant for (None = that of the images found), and where
@@ -71,6 +81,32 @@ def seen_at(camera: Intrinsics, size: Size) -> Intrinsics:
             "pixels: colour and depth need a calibration each (the scannet layout has room for both)."
         )
     return camera.resized(*size)
+
+
+def usual(size: Size) -> Intrinsics:
+    """A guess at the camera of images of ``size`` of which nothing is known."""
+    width, height = size
+    focal = USUAL_FOCAL * max(size)
+    return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def equivalent(focal_35mm: float, size: Size) -> Intrinsics | None:
+    """The camera of images of ``size`` whose lens is stated as the focal length in millimetres of a 35 mm camera with
+    the same view across its diagonal; None where it cannot be one."""
+    if not 8 <= focal_35mm <= 500:
+        return None
+    width, height = size
+    focal = focal_35mm / DIAGONAL_35MM * float(np.hypot(width, height))
+    return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def reduced(camera: Intrinsics, max_size: int | None) -> Intrinsics:
+    """The camera of the same images, reduced such that their longer side has no more than ``max_size`` pixels."""
+    longer = max(camera.width, camera.height)
+    if max_size is None or longer <= max_size:
+        return camera
+    width, height = (max(1, round(side * max_size / longer)) for side in (camera.width, camera.height))
+    return camera.resized(width, height)
 
 
 def given(options: Options) -> Calibration | None:

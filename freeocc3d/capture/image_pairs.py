@@ -1,7 +1,8 @@
 """What the readers of numbered colour and depth files share: pairing them by number, and decoding a pair.
 
 Where a few frames lack one of their two files (at most ``capture.max_broken`` of them), these frames are broken, and
-reading one raises FrameError; where more do, the capture is not usable and the constructor raises CaptureError.
+reading one raises FrameError; where more do, the capture is not usable and the constructor raises CaptureError. With
+``capture.depth=false`` there are colour files alone, and no depth file is looked at.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from .registration import Grid
 
 @dataclass(frozen=True)
 class Pairs:
-    """Colour and depth files of N frames, ascending by number. A missing file is None.
+    """Colour and depth files of N frames, ascending by number. A missing file is None; so are all of depth where depth
+    is not to be read, and the depth images' size is colour's then.
 
     numbers: the frames' numbers in the file names.  color_size, depth_size: of the first readable image of each kind.
     """
@@ -34,18 +36,25 @@ class Pairs:
     depth_size: Size
 
 
-def pair(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Path, max_broken: float) -> Pairs:
-    """Pair the files by their numbers.
+def pair(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Path, options: Options) -> Pairs:
+    """Pair the files by their numbers, or take colour's alone if ``options.depth`` is false.
 
     Raises CaptureError: no colour, no depth, more than ``max_broken`` of the frames lack a file, no readable image.
     """
     if not color:
         raise CaptureError(f"{folder} holds no colour images of this format.")
+    if not options.depth:
+        numbers = sorted(color)
+        size = _first_size(color.values(), folder)
+        return Pairs(tuple(numbers), tuple(color[n] for n in numbers), (None,) * len(numbers), size, size)
     if not depth:
-        raise CaptureError(f"{folder} holds {len(color)} colour images but no depth: a capture needs both.")
+        raise CaptureError(
+            f"{folder} holds {len(color)} colour images but no depth: add it, or map colour alone with "
+            "capture.depth=false."
+        )
     numbers = sorted(color.keys() | depth.keys())
     incomplete = sorted(color.keys() ^ depth.keys())
-    if len(incomplete) > max_broken * len(numbers):
+    if len(incomplete) > options.max_broken * len(numbers):
         alone = color.get(incomplete[0]) or depth[incomplete[0]]
         missing = "depth" if incomplete[0] in color else "colour"
         raise CaptureError(
@@ -71,23 +80,26 @@ class ImagePairs(Capture):
         self._pairs = pairs
         self._grid = grid
         self._units_per_metre = options.depth_scale or units_per_metre
+        self.has_depth = options.depth
         self.timestamps = np.arange(len(pairs.numbers), dtype=np.float64)
 
     def __getitem__(self, index: int) -> Frame:
         color_path, depth_path = self._files(index)
-        color = read_color(color_path)
-        _check_size(color, self._pairs.color_size, color_path)
-        depth_m = metres(self._stored_depth(depth_path), self._units_per_metre, self.options.max_depth)
-        grid = self._grid
-        timestamp = float(self.timestamps[index])
-        return Frame(index, timestamp, grid.color(color), grid.depth(depth_m), grid.intrinsics)
+        color = self._grid.color(self._stored_color(color_path))
+        if depth_path is None:
+            depth_m = np.zeros(color.shape[:2], np.float32)
+        else:
+            stored = metres(self._stored_depth(depth_path), self._units_per_metre, self.options.max_depth)
+            depth_m = self._grid.depth(stored)
+        return Frame(index, float(self.timestamps[index]), color, depth_m, self._grid.intrinsics)
 
     def name(self, index: int) -> str:
         path = self._pairs.color[index]
         return path.name if path else ""
 
-    def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float]:
-        return self._stored_depth(self._files(index)[1]), self._units_per_metre
+    def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
+        path = self._files(index)[1]
+        return None if path is None else (self._stored_depth(path), self._units_per_metre)
 
     def _class_image(self, path: Path | None) -> NDArray[np.uint8] | None:
         """The class image at ``path`` on the frames' pixel grid. Raises FrameError if it is there but not usable."""
@@ -97,14 +109,20 @@ class ImagePairs(Capture):
         _check_size(image, self._pairs.color_size, path)
         return self._grid.classes(image)
 
-    def _files(self, index: int) -> tuple[Path, Path]:
+    def _files(self, index: int) -> tuple[Path, Path | None]:
+        """Colour and, if depth is read, depth file of a frame."""
         if not 0 <= index < len(self):
             raise IndexError(f"Frame {index} of a capture of {len(self)} frames.")
         color, depth = self._pairs.color[index], self._pairs.depth[index]
-        if color is None or depth is None:
+        if color is None or (depth is None and self.has_depth):
             alone, missing = (color, "depth") if color else (depth, "colour")
             raise FrameError(f"Frame {self._pairs.numbers[index]} has no {missing} image beside {alone}.")
         return color, depth
+
+    def _stored_color(self, path: Path) -> NDArray[np.uint8]:
+        color = read_color(path)
+        _check_size(color, self._pairs.color_size, path)
+        return color
 
     def _stored_depth(self, path: Path) -> NDArray[np.uint16]:
         raw = read_depth(path)

@@ -13,6 +13,12 @@ from .. import registry
 from ..errors import CaptureError, ConfigError, FrameError
 from .base import Capture, Options
 
+VIDEO = "video"
+"""The reader of files; all others read folders."""
+
+VIDEO_SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"}
+"""By which a folder that is no capture is looked through for a file that may be one."""
+
 BUILTIN = "builtin:"
 """Paths that start with this name something that is rendered, not a folder."""
 
@@ -40,11 +46,15 @@ def open_capture(
         return _construct("synthetic", Path(path), options, backend_options or {})
     folder = Path(path).expanduser()
     if not folder.exists():
-        raise CaptureError(f"There is no folder {folder}: check the path of the capture.")
-    if not folder.is_dir():
-        raise CaptureError(f"{folder} is a file, but a capture is a folder: give the folder that holds the frames.")
+        raise CaptureError(f"There is no folder {folder}, nor a video of that name: check the path of the capture.")
+    is_video = options.format == VIDEO or (options.format == "auto" and folder.is_file())
+    if folder.is_file() != is_video:
+        raise CaptureError(
+            f"{folder} is a {'folder' if is_video else 'file'}, but capture.format={options.format} reads a "
+            f"{'video file' if is_video else 'folder of frames'}."
+        )
     try:
-        name = _recognise(folder) if options.format == "auto" else options.format
+        name = VIDEO if is_video else _recognise(folder) if options.format == "auto" else options.format
         return _construct(name, folder, options, backend_options or {})
     except OSError as error:
         raise CaptureError(f"Cannot read {error.filename or folder}: {error.strerror}.") from error
@@ -113,6 +123,10 @@ def _check(options: Options) -> None:
         raise ConfigError(f"capture.color_focal must lie in 0.5…2, got {options.color_focal:g}.")
     if not 0 <= options.max_broken <= 1:
         raise ConfigError(f"capture.max_broken must lie in 0…1, got {options.max_broken:g}.")
+    if options.scale is not None and not options.scale > 0:
+        raise ConfigError(f"capture.scale must be positive, got {options.scale:g}.")
+    if options.max_size is not None and options.max_size < 16:
+        raise ConfigError(f"capture.max_size must be at least 16 pixels, got {options.max_size}.")
     if options.stride < 1 or options.start < 0:
         raise ConfigError(
             f"capture.stride must be at least 1 and capture.start at least 0, got {options.stride} and {options.start}."
@@ -121,15 +135,21 @@ def _check(options: Options) -> None:
 
 def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mapping[str, Any]]) -> Capture:
     module = registry.load("capture", name)
-    if registry.backends("capture")[name].options:
-        return module.Reader(path, options, registry.build_options(module, own.get(name) or {}))
-    return module.Reader(path, options)
+    extra = [registry.build_options(module, own.get(name) or {})] if registry.backends("capture")[name].options else []
+    opened: Capture = module.Reader(path, options, *extra)
+    if options.scale is not None and opened.has_depth:
+        raise ConfigError(
+            f"capture.scale is for scans without depth, but {path} has depth, which says how large everything is: "
+            "leave it out, or give capture.depth=false."
+        )
+    return opened
 
 
 def _recognise(folder: Path) -> str:
     """Name of the one reader that recognises the folder. Raises CaptureError if none does, or several."""
     readers = _readers()
-    found = [name for name, reader in readers.items() if reader.recognises(folder)]
+    found = [name for name, reader in readers.items() if not reader.general and reader.recognises(folder)]
+    found = found or [name for name, reader in readers.items() if reader.general and reader.recognises(folder)]
     if len(found) > 1:
         raise CaptureError(f"{folder} looks like {' and like '.join(found)}: name one with capture.format.")
     if found:
@@ -148,8 +168,10 @@ def _readers() -> dict[str, type[Capture]]:
 
 
 def _below(folder: Path, readers: Mapping[str, type[Capture]]) -> str:
-    """A hint at the first subfolder that is a capture, for data sets that hold several."""
+    """A hint at the first subfolder that is a capture, for data sets that hold several, or at a video."""
     for child in sorted(folder.iterdir()):
         if child.is_dir() and any(reader.recognises(child) for reader in readers.values()):
             return f", but {child} is: give that folder"
+        if child.is_file() and child.suffix.lower() in VIDEO_SUFFIXES:
+            return f", but {child} may be: give that file"
     return ""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import CaptureError
 from ..geometry import is_rigid
 from .base import Options
-from .calibration import Calibration, given, read_class_names, read_json, read_text, seen_at
+from .calibration import Calibration, given, read_class_names, read_json, read_text, seen_at, usual
 from .image_pairs import ImagePairs, pair
 from .images import holds, numbered
 from .registration import Grid
@@ -38,11 +38,12 @@ class Reader(ImagePairs):
 
     def __init__(self, path: Path, options: Options):
         results = path / "results"
-        pairs = pair(numbered(results, COLOR), numbered(results, DEPTH), results, options.max_broken)
+        pairs = pair(numbered(results, COLOR), numbered(results, DEPTH), results, options)
         calibration, units_per_metre = _parameters(path, options)
-        camera = calibration.camera(pairs.color_size)
+        camera = calibration.camera(pairs.color_size) if calibration else usual(pairs.color_size)
         grid = Grid(camera, seen_at(camera, pairs.depth_size))
         super().__init__(path, options, pairs, grid, units_per_metre)
+        self.intrinsics_known = self.focal_stated = calibration is not None
         self.classes = read_class_names(path / "classes.json")
 
     @classmethod
@@ -81,12 +82,12 @@ class Reader(ImagePairs):
         return poses
 
 
-def _parameters(path: Path, options: Options) -> tuple[Calibration, float]:
-    """Colour camera and depth units per metre. Raises CaptureError."""
+def _parameters(path: Path, options: Options) -> tuple[Calibration | None, float]:
+    """Colour camera, None if it is unknown and depth is not read, and depth units per metre. Raises CaptureError."""
     override = given(options)
     file = next((f for f in (path / "cam_params.json", path.parent / "cam_params.json") if f.is_file()), None)
     if file is None:
-        if override is None:
+        if override is None and options.depth:
             raise CaptureError(
                 f"There is no cam_params.json in {path} or beside it: add it, or give capture.intrinsics "
                 "(and capture.depth_scale)."

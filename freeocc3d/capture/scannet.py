@@ -13,7 +13,7 @@ from ..errors import CaptureError
 from ..geometry import invert
 from ..types import Intrinsics
 from .base import Options
-from .calibration import given, read_class_names, read_intrinsics, read_pose, read_rigid, seen_at
+from .calibration import given, read_class_names, read_intrinsics, read_pose, read_rigid, seen_at, usual
 from .image_pairs import ImagePairs, Pairs, pair
 from .images import holds, numbered
 from .registration import Grid
@@ -39,7 +39,8 @@ class Reader(ImagePairs):
     The colour and depth cameras are in ``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` (4 x 4 or 3 x 3);
     a file that is missing is derived from the other where both images have the same aspect ratio.
     ``extrinsic_color.txt`` and ``extrinsic_depth.txt`` beside them map a camera to the rig; where they differ, depth is
-    moved to the colour camera, otherwise colour is resampled to the depth's pixels (see ``registration``).
+    moved to the colour camera, otherwise colour is resampled to the depth's pixels (see ``registration``). With
+    ``capture.depth=false`` colour is left as it is.
 
     With a ``classes.json`` in the folder, ``label-filt/N.png`` are class images that hold indices into its names.
     """
@@ -48,9 +49,10 @@ class Reader(ImagePairs):
     layout = "color/N.jpg (or .png) with depth/N.png and intrinsic/intrinsic_color.txt"
 
     def __init__(self, path: Path, options: Options):
-        pairs = pair(numbered(path / "color", COLOR), numbered(path / "depth", IMAGE), path, options.max_broken)
-        color, depth = _cameras(path, options, pairs)
-        super().__init__(path, options, pairs, Grid(color, depth, _T_color_depth(path)), units_per_metre=1000.0)
+        pairs = pair(numbered(path / "color", COLOR), numbered(path / "depth", IMAGE), path, options)
+        grid, self.intrinsics_known = _grid(path, options, pairs)
+        self.focal_stated = self.intrinsics_known
+        super().__init__(path, options, pairs, grid, units_per_metre=1000.0)
         self.classes = read_class_names(path / "classes.json")
 
     @classmethod
@@ -71,6 +73,17 @@ class Reader(ImagePairs):
     @functools.cached_property
     def _class_files(self) -> dict[int, Path]:
         return numbered(self.path / "label-filt", IMAGE)
+
+
+def _grid(path: Path, options: Options, pairs: Pairs) -> tuple[Grid, bool]:
+    """The frames' pixel grid, and whether anything says what the colour camera is. Raises CaptureError."""
+    if options.depth:
+        color, depth = _cameras(path, options, pairs)
+        return Grid(color, depth, _T_color_depth(path)), True
+    file = _first(path, (*COLOR_CAMERA, *ONE_CAMERA))
+    stated = given(options) or (read_intrinsics(file) if file else None)
+    camera = stated.camera(pairs.color_size) if stated else usual(pairs.color_size)
+    return Grid(camera, camera), stated is not None
 
 
 def _cameras(path: Path, options: Options, pairs: Pairs) -> tuple[Intrinsics, Intrinsics]:

@@ -24,18 +24,20 @@ KINECT = Calibration((585.0, 585.0, 320.0, 240.0), (640, 480), "the Kinect calib
 
 class Reader(ImagePairs):
     """Depth is uint16 millimetres, 0 and 65535 invalid, and as large as colour. Both have the same intrinsics: the data
-    set registers them only roughly and says no more. Poses are camera-to-world and optional."""
+    set registers them only roughly and says no more: they are the depth camera's, so that without depth they are only
+    a guess. Poses are camera-to-world and optional."""
 
     format = "seven_scenes"
     layout = "frame-N.color.png (or .jpg) with frame-N.depth.png"
 
     def __init__(self, path: Path, options: Options):
-        pairs = pair(numbered(path, COLOR), numbered(path, DEPTH), path, options.max_broken)
+        pairs = pair(numbered(path, COLOR), numbered(path, DEPTH), path, options)
         stated = path / "camera-intrinsics.txt"
         calibration = given(options) or (read_intrinsics(stated) if stated.is_file() else KINECT)
         camera = calibration.camera(pairs.color_size)
         grid = Grid(camera, seen_at(camera, pairs.depth_size))
         super().__init__(path, options, pairs, grid, units_per_metre=1000.0)
+        self.intrinsics_known = options.depth or options.intrinsics is not None
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -79,6 +79,7 @@ class Reader(base.Capture):
         if str(path) != PATH:
             raise CaptureError(f"There is no built-in capture '{path}': the one there is is called {PATH}.")
         self.own = own
+        self.has_depth = options.depth
         self.timestamps = np.arange(own.frames) / _RATE_HZ
         self.classes = room.CLASSES
         focal = _FOCAL_PER_WIDTH * own.width
@@ -97,7 +98,8 @@ class Reader(base.Capture):
         if self.own.noise:
             rng = np.random.default_rng((self.own.seed, index))
             depth_m, color = disturbed_depth(depth_m, view.cosine, rng), _disturbed_color(color, index, rng)
-        depth_m = np.where(depth_m <= self.options.max_depth, depth_m, np.float32(0))
+        farthest = self.options.max_depth if self.has_depth else 0.0
+        depth_m = np.where(depth_m <= farthest, depth_m, np.float32(0))
         return Frame(index, float(self.timestamps[index]), color, depth_m, self.intrinsics)
 
     def pose(self, index: int) -> NDArray[np.float64]:

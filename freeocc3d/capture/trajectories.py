@@ -14,6 +14,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,9 +122,8 @@ def _read_folder(folder: Path) -> PoseFile:
     if files := sorted(folder.glob("*.pose.txt")):
         T = np.stack([np.loadtxt(file).reshape(4, 4) for file in files])
         return _checked(PoseFile(folder, T, names=tuple(file.name for file in files)))
-    for model in (folder, folder / "sparse" / "0", folder / "0"):
-        if any((model / name).is_file() for name in ("images.bin", "images.txt")):
-            return _checked(_read_colmap(model))
+    if model := colmap_folder(folder):
+        return _checked(_read_colmap(model))
     if (folder / "transforms.json").is_file():
         return _checked(_read_nerfstudio(folder / "transforms.json"))
     raise CaptureError(f"{folder} holds no trajectory: expected {FORMS}.")
@@ -171,7 +171,14 @@ def _read_nerfstudio(path: Path) -> PoseFile:
     return PoseFile(path, T, names=tuple(Path(frame["file_path"]).name for frame in frames))
 
 
-def _read_colmap(folder: Path) -> PoseFile:
+def colmap_folder(folder: Path) -> Path | None:
+    """Where the COLMAP model of a folder lies, if it has one."""
+    models = (folder, folder / "sparse" / "0", folder / "sparse", folder / "0")
+    return next((m for m in models if any((m / name).is_file() for name in ("images.bin", "images.txt"))), None)
+
+
+def read_colmap_model(folder: Path) -> Any:
+    """The ``pycolmap.Reconstruction`` in a folder. Raises CaptureError."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -184,6 +191,11 @@ def _read_colmap(folder: Path) -> PoseFile:
         raise CaptureError(
             f"{folder} is no COLMAP model: it needs cameras, images and points3D, all .txt or all .bin."
         ) from error
+    return model
+
+
+def _read_colmap(folder: Path) -> PoseFile:
+    model = read_colmap_model(folder)
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     if not images:
         raise CaptureError(f"The COLMAP model {folder} holds no image with a pose.")

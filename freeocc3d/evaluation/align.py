@@ -124,12 +124,16 @@ def read_poses(path: str | Path) -> Poses:
         raise FreeOccError(f"There is no file or capture {path} to take poses from.")
     if Path(path).is_dir():
         try:
-            return true_poses(open_capture(path))
+            capture = open_capture(path)
+            if capture.metric_poses:
+                return true_poses(capture)
         except CaptureError as no_capture:
             try:
                 found = read_trajectory(path)
             except CaptureError:
                 raise no_capture from None
+        else:  # a reconstruction: its images are some of the frames, which are known by the numbers in their names
+            found = read_trajectory(path)
     else:
         found = read_trajectory(path)
     finite = np.isfinite(found.T_world_cam).all(axis=(1, 2))

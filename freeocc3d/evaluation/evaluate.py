@@ -82,6 +82,9 @@ def score_map(
                 raise
     alignment = Alignment.identity() if poses is None else align(estimated, poses, how)
     predicted, note = project.of_map(scan_map, settings, alignment, truth, classes)
+    notes = [note] if note else []
+    if not scan_map.metric and how != "sim3":
+        notes.append("The map's scale is unknown: --align sim3 compares it at the true one.")
     return Scene(
         name=str(scan_map.path),
         truth=truth,
@@ -91,7 +94,7 @@ def score_map(
         frames=len(scan_map.trajectory),
         frames_with_pose=len(estimated),
         up=alignment.rotation @ scan_map.up,
-        notes=(note,) if note else (),
+        notes=tuple(notes),
     )
 
 
@@ -291,7 +294,7 @@ def capture_of(scan_map: Map, settings: Config | None = None) -> Capture:
     """The capture that a map was made of, opened as it was then. Raises FreeOccError if it is not there any more."""
     settings = settings or config.load(scan_map.path / CONFIG)
     path = scan_map.manifest["capture"]["path"]
-    if not str(path).startswith("builtin:") and not Path(path).is_dir():
+    if not str(path).startswith("builtin:") and not Path(path).exists():
         raise FreeOccError(
             f"The capture {path}, of which {scan_map.path} was made, is not there: name the true poses with --poses."
         )

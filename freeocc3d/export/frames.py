@@ -47,13 +47,14 @@ class Placed:
     """Voxels in a frame.
 
     occupancy: in coordinates of the frame, without features where it is not the map's own.  rows: (V,) row of the map's
-    occupied voxel that each occupied one stands for.  T_frame_map: (4, 4).
+    occupied voxel that each occupied one stands for.  T_frame_map: (4, 4).  metric: whether lengths are metres.
     """
 
     occupancy: Occupancy
     rows: NDArray[np.int64]
     frame: str
     T_frame_map: NDArray[np.float64]
+    metric: bool
 
     def described(self) -> dict[str, Any]:
         """What a reader of an export has to know of its frame; of plain values."""
@@ -61,6 +62,7 @@ class Placed:
             "frame": self.frame,
             "T_frame_map": self.T_frame_map.tolist(),
             "voxel_size_m": self.occupancy.finest,
+            "metric": self.metric,
             "up": "z" if self.frame != "map" else "see the map's 'up'",
         }
 
@@ -109,14 +111,14 @@ def _placed(scan_map: Map, frame: str, origin: ArrayLike | None, one_size: bool)
         raise ExportError("The map has no voxel to write.")
     own = frame == "map" and _on_lattice(occupancy, origin)
     if own and not (one_size and occupancy.deepest):
-        return Placed(occupancy, np.arange(len(occupancy.colors)), frame, T)
+        return Placed(occupancy, np.arange(len(occupancy.colors)), frame, T, scan_map.metric)
     plain = occupancy.replace(features=np.zeros((len(occupancy.colors), 0), np.float16))
     one = uniform(plain) if occupancy.deepest else plain
     if own:
-        return Placed(one, _nearest(plain, one), frame, T)
+        return Placed(one, _nearest(plain, one), frame, T, scan_map.metric)
     at = (0.0, 0.0, -0.5 * one.voxel_size) if origin is None else origin
     new, rows = resampled(one, T, np.asarray(at, np.float64))
-    return Placed(new, _nearest(plain, one)[rows] if occupancy.deepest else rows, frame, T)
+    return Placed(new, _nearest(plain, one)[rows] if occupancy.deepest else rows, frame, T, scan_map.metric)
 
 
 def _within(there: Placed, corners: NDArray[np.float64]) -> Placed:
@@ -140,7 +142,7 @@ def _within(there: Placed, corners: NDArray[np.float64]) -> Placed:
         state=state[blocks],
         **{name: getattr(occupancy, name)[blocks] for name in ("keys", "probability", "free", "hits")},
     )
-    return Placed(part, there.rows[kept], there.frame, there.T_frame_map)
+    return Placed(part, there.rows[kept], there.frame, there.T_frame_map, there.metric)
 
 
 def floor_z(scan_map: Map, T_frame_map: NDArray[np.float64]) -> float:
@@ -150,7 +152,8 @@ def floor_z(scan_map: Map, T_frame_map: NDArray[np.float64]) -> float:
 
 def write_description(path: Path, described: dict[str, Any]) -> None:
     """Write ``PATH.json`` beside an export whose format has no room for its frame. Raises OSError."""
-    text = json.dumps({"file": path.name, "unit": "metre", **described}, indent=1)
+    unit = "metre" if described.get("metric", True) else "unknown"
+    text = json.dumps({"file": path.name, "unit": unit, **described}, indent=1)
     path.with_name(f"{path.name}.json").write_text(text + "\n", encoding="utf-8")
 
 

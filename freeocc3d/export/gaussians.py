@@ -47,7 +47,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         gaussians = aligned(gaussians, 1.0, T_file_map[:3, :3], T_file_map[:3, 3])
     write_standard_ply(gaussians, path)
     told = {"frame": options.frame, "up": "-y" if options.upright else "the frame's"}
-    write_description(path, {**told, "T_file_map": T_file_map.tolist()})
+    write_description(path, {**told, "metric": scan_map.metric, "T_file_map": T_file_map.tolist()})
 
 
 def _to_minus_y(up: NDArray[np.float64]) -> NDArray[np.float64]:

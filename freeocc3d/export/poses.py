@@ -63,7 +63,8 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         shutil.copyfile(image, path / "images" / image.name)
     form = _write_colmap if options.form == "colmap" else _write_nerfstudio
     form(path, views, T_frame_cam, points, chosen)
-    write_description(path / "frame", {"frame": options.frame, "T_frame_map": T_frame_map.tolist()})
+    told = {"metric": scan_map.metric}
+    write_description(path / "frame", {"frame": options.frame, "T_frame_map": T_frame_map.tolist(), **told})
 
 
 def _write_colmap(

@@ -49,6 +49,16 @@ def gravity_frame(T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> NDArr
     return T_gravity_map
 
 
+def floor_seen(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> bool:
+    """Whether z = 0 of ``gravity_frame`` is a floor, and not just the lowest that there is."""
+    points, normals = _planes(gaussians.means)
+    up = T_gravity_map[2, :3]
+    level = (points @ up + T_gravity_map[2, 3])[np.abs(normals @ up) > _LEVEL]
+    cameras = T_map_cam[:, :3, 3] @ up + T_gravity_map[2, 3]
+    height = floor_height(level, float(np.median(cameras))) if len(cameras) else None
+    return height is not None and abs(height) < 2 * _BAND[0]
+
+
 def first_camera_frame(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) rigid ``T_first_map``: z up, the origin at the centre of the camera ``T_map_cam`` (4, 4), x where it
     looked, as robots take the place that they start from."""

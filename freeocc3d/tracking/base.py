@@ -48,6 +48,12 @@ class Tracker(ABC):
 
     world: ClassVar[str] = "OpenCV camera axes of the first keyframe, metres"
     """The frame that poses and maps are in, for the map's manifest."""
+    needs_depth: ClassVar[bool] = False
+    """Whether it cannot work on a capture without depth."""
+    estimates_camera: ClassVar[bool] = False
+    """Whether it finds out what the camera is where the capture does not know."""
+    metric: bool = True
+    """Whether its poses are in metres; where not, their unit is unknown, and so is the scale of what is mapped."""
     offline: bool = False
     """Whether ``prepare`` works through the whole scan before the first frame is tracked."""
 

@@ -37,7 +37,8 @@ class Options:
     max_time_difference: float = 0.02
     """Seconds by which a pose and its frame may differ, for files that state times."""
     scale: float | None = 1.0
-    """Metres per unit of the file; null = as the capture's depth says, for monocular systems."""
+    """Metres per unit of the file; null = as the capture's depth says, for monocular systems, and without depth as
+    capture.scale says, else unknown."""
     points: str | None = None
     """Point cloud (PLY, PCD, XYZ) in the file's world: where a frame has no depth, its points are the anchors."""
     keyframe_overlap: float = 0.85
@@ -60,7 +61,10 @@ def load(options: Options, capture: Capture) -> FileTracker:
     points = None if options.points is None else _read_points(_beside(options.points, capture))
     scale = _scale(T_world_cam, capture, options)
     T_world_cam[:, :3, 3] *= scale
-    return FileTracker(T_world_cam, options.keyframe_overlap, None if points is None else points * np.float32(scale))
+    scaled = None if points is None else points * np.float32(scale)
+    tracker = FileTracker(T_world_cam, options.keyframe_overlap, scaled)
+    tracker.metric = capture.has_depth or options.scale is not None or capture.options.scale is not None
+    return tracker
 
 
 class FileTracker(GivenTracker):
@@ -101,9 +105,9 @@ def depth_of_points(points_cam: NDArray[np.float32], frame: Frame) -> NDArray[np
 
 
 def _beside(path: str, capture: Capture) -> Path:
-    """The path as given, or, where there is no such file, in the capture's folder."""
+    """The path as given, or, where there is no such file, in the capture's folder or beside the video."""
     given = Path(path).expanduser()
-    inside = capture.path / given
+    inside = (capture.path.parent if capture.path.is_file() else capture.path) / given
     return inside if not given.exists() and inside.exists() else given
 
 
@@ -121,7 +125,9 @@ def _read_points(path: Path) -> NDArray[np.float32]:
 
 
 def _scale(T_world_cam: NDArray[np.float64], capture: Capture, options: Options) -> float:
-    """Metres per unit, from the options, checked against what depth says, or from depth."""
+    """Metres per unit, from the options, checked against what depth says, or from depth; 1 where nothing says it."""
+    if not capture.has_depth:
+        return capture.options.scale or options.scale or 1.0
     measured = depth_scale(T_world_cam, capture)
     if options.scale is None:
         if measured is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -81,6 +82,8 @@ class OdometryTracker(Tracker):
     Odometry: J. Park, Q.-Y. Zhou, V. Koltun, Colored Point Cloud Registration Revisited, ICCV 2017, in Open3D's tensor
     implementation (hybrid photometric and geometric residual, multi-scale).
     """
+
+    needs_depth: ClassVar[bool] = True
 
     def __init__(self, options: Options):
         super().__init__()

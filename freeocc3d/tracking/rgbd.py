@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +81,8 @@ class RgbdTracker(Tracker):
     ``optimize`` closes loops, ties submaps together where they show the same place, and aligns all keyframes jointly.
     The largest piece that hangs together is what is mapped.
     """
+
+    needs_depth: ClassVar[bool] = True
 
     def __init__(self, options: Options):
         super().__init__()

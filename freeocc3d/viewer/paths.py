@@ -28,20 +28,27 @@ _RULERS_M = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
 
 def path_picture(
-    path: Path, submaps: Sequence[Submap], trajectory: Trajectory, gaussians: Gaussians, capture: Path
+    path: Path,
+    submaps: Sequence[Submap],
+    trajectory: Trajectory,
+    gaussians: Gaussians,
+    capture: Path,
+    metric: bool = True,
 ) -> None:
-    """Write a PNG. submaps: the mapped one first, whose world the Gaussians are in. Raises OSError."""
+    """Write a PNG. submaps: the mapped one first, whose world the Gaussians are in.  metric: whether lengths are
+    metres. Raises OSError."""
+    unit = "m" if metric else "units of unknown length"
     picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
     apart = list(submaps[1:])
     width = SIZE[0] - (_ASIDE if apart else 0)
     if submaps:
         box = (0, _BAR, width, SIZE[1] - _BAR - _LEGEND)
-        _draw(picture, box, submaps[0], trajectory, gaussians)
+        _draw(picture, box, submaps[0], trajectory, gaussians, unit)
     rows = apart[:_SHOWN]
     for number, submap in enumerate(rows):
         height = (SIZE[1] - _BAR - _LEGEND) // len(rows)
         box = (width, _BAR + number * height, _ASIDE, height)
-        _draw(picture, box, submap, trajectory, None)
+        _draw(picture, box, submap, trajectory, None, unit)
         label = f"apart: frames {submap.frames[0]}-{submap.frames[-1]}, {len(submap.keyframes)} keyframes"
         _put(picture, label, (width + 12, box[1] + 18), 0.45)
     if len(apart) > _SHOWN:
@@ -61,6 +68,7 @@ def _draw(
     submap: Submap,
     trajectory: Trajectory,
     gaussians: Gaussians | None,
+    unit: str,
 ) -> None:
     """One submap, seen from above, into the box x, y, width, height."""
     T = trajectory.T_world_cam if gaussians is not None else None
@@ -104,7 +112,7 @@ def _draw(
         cv2.circle(picture, _fixed(place), 3 << 3, _KEYFRAME, -1, cv2.LINE_AA, shift=3)
     for place, text, down in ((places[0], "start", -8), (places[-1], "end", 18)):
         _put(picture, text, (int(place[0]) + 8, int(place[1]) + down), 0.5)
-    _ruler(picture, box, scale)
+    _ruler(picture, box, scale, unit)
 
 
 def _plan(
@@ -128,13 +136,13 @@ def _plan(
             picture[v[order] + dv, u[order] + du] = faint
 
 
-def _ruler(picture: NDArray[np.uint8], box: tuple[int, int, int, int], scale: float) -> None:
-    """A length in metres, at the lower left of the box."""
+def _ruler(picture: NDArray[np.uint8], box: tuple[int, int, int, int], scale: float, unit: str) -> None:
+    """A length, at the lower left of the box."""
     x0, y0, _, height = box
     metres = max((m for m in _RULERS_M if m * scale < 220), default=_RULERS_M[0])
     y, x = y0 + height - 12, x0 + 16
     cv2.line(picture, (x, y), (x + round(metres * scale), y), _TEXT, 2, cv2.LINE_AA)
-    _put(picture, f"{metres:g} m", (x, y - 8), 0.5)
+    _put(picture, f"{metres:g} {unit}", (x, y - 8), 0.5)
 
 
 def _legend(picture: NDArray[np.uint8], submaps: Sequence[Submap], trajectory: Trajectory) -> None:

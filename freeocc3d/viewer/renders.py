@@ -22,10 +22,16 @@ _COLUMNS = "photograph", "rendered", "measured depth", "rendered depth"
 
 
 def render_picture(
-    path: Path, gaussians: Gaussians, views: Sequence[tuple[int, View]], rasterizer: Rasterizer, capture: Path
+    path: Path,
+    gaussians: Gaussians,
+    views: Sequence[tuple[int, View]],
+    rasterizer: Rasterizer,
+    capture: Path,
+    metric: bool = True,
 ) -> None:
-    """Write a PNG with a row for each view, which comes with its frame's number. Raises OSError."""
-    rows = [_row(gaussians, frame, view, rasterizer) for frame, view in views]
+    """Write a PNG with a row for each view, which comes with its frame's number. metric: whether lengths are metres.
+    Raises OSError."""
+    rows = [_row(gaussians, frame, view, rasterizer, metric) for frame, view in views]
     width = len(_COLUMNS) * (_WIDTH + _GAP) + _GAP
     heading = np.full((_BAR, width, 3), BACKGROUND, np.uint8)
     _put(heading, f"{capture.name}: {len(gaussians):,} Gaussians rendered as keyframes saw them", (16, 36), 0.62)
@@ -36,7 +42,7 @@ def render_picture(
     path.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1].tobytes())
 
 
-def _row(gaussians: Gaussians, frame: int, view: View, rasterizer: Rasterizer) -> NDArray[np.uint8]:
+def _row(gaussians: Gaussians, frame: int, view: View, rasterizer: Rasterizer, metric: bool) -> NDArray[np.uint8]:
     rendered = render(gaussians, view, rasterizer)
     photograph = view.color.cpu().numpy()
     image = np.rint(255 * rendered.image.clamp(0, 1).cpu().numpy()).astype(np.uint8)
@@ -56,7 +62,8 @@ def _row(gaussians: Gaussians, frame: int, view: View, rasterizer: Rasterizer) -
     if found.psnr_measured is not None:
         facts.append(f"{found.psnr_measured:.1f} dB where depth is measured")
     if found.depth_l1_m is not None:
-        facts.append(f"depth off by {100 * found.depth_l1_m:.1f} cm, shown from {low:.1f} to {high:.1f} m")
+        off = f"{100 * found.depth_l1_m:.1f} cm" if metric else f"{found.depth_l1_m:.3f}"
+        facts.append(f"depth off by {off}, shown from {low:.1f} to {high:.1f}{' m' if metric else ''}")
     _put(row, ", ".join(facts), (_GAP, height + 20), 0.45)
     return row
 

@@ -1,0 +1,116 @@
+"""What the readers of reconstructions share: images with poses and lenses, and depth where there is some."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import CaptureError, FrameError
+from ..geometry import invert, project, transform
+from ..types import Frame
+from .base import NOMINAL_DEPTH, Capture, Options
+from .calibration import given, seen_at
+from .images import metres, read_color, read_depth
+from .rectified import Lens, Rectified
+
+UNITS_PER_METRE = 1000.0
+"""Of stored depth, unless ``capture.depth_scale`` says otherwise."""
+
+_SAMPLES = 20_000
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """An image's file, its depth's if there is one, the lens, and (4, 4) T_world_cam."""
+
+    image: Path
+    depth: Path | None
+    lens: Lens
+    T_world_cam: NDArray[np.float64]
+
+
+class PosedImages(Capture):
+    """Images as those of pinhole cameras: lens distortion is taken out, and they are reduced to ``capture.max_size``.
+    Cameras may differ from image to image."""
+
+    def __init__(self, path: Path, options: Options, posed: Sequence[PosedImage], units_in_metres: float | None):
+        """units_in_metres: of the poses; None = unknown, so that they are left as they are."""
+        super().__init__(path, options)
+        if len(posed) < 2:
+            raise CaptureError(f"{path} holds {len(posed)} images with poses: a scan needs many.")
+        self.has_depth = options.depth and any(view.depth is not None for view in posed)
+        self.timestamps = np.arange(len(posed), dtype=np.float64)
+        scale = 1.0 if units_in_metres is None else units_in_metres
+        self._posed = [replace(view, T_world_cam=_scaled(view.T_world_cam, scale)) for view in posed]
+        self._rectified = functools.lru_cache(maxsize=4)(lambda lens: Rectified(lens, options.max_size))
+        if stated := given(options):
+            cameras = {lens.camera for lens in (view.lens for view in posed)}
+            lenses = {camera: Lens(stated.camera((camera.width, camera.height))) for camera in cameras}
+            self._posed = [replace(view, lens=lenses[view.lens.camera]) for view in self._posed]
+
+    def __getitem__(self, index: int) -> Frame:
+        if not 0 <= index < len(self):
+            raise IndexError(f"Frame {index} of {len(self)} images.")
+        view = self._posed[index]
+        color = read_color(view.image)
+        lens = view.lens
+        size = color.shape[1], color.shape[0]
+        if size != (lens.camera.width, lens.camera.height):  # the same images, stored smaller or larger
+            try:
+                lens = replace(lens, camera=seen_at(lens.camera, size))
+            except CaptureError as error:
+                raise FrameError(
+                    f"{view.image} has {size[0]} x {size[1]} pixels, its camera {lens.camera.width} x "
+                    f"{lens.camera.height}."
+                ) from error
+        rectified = self._rectified(lens)
+        depth_m = np.zeros(rectified.size[::-1], np.float32)
+        if self.has_depth and view.depth is not None:
+            units = self.options.depth_scale or UNITS_PER_METRE
+            depth_m = rectified.depth(metres(read_depth(view.depth), units, self.options.max_depth))
+        return Frame(index, float(self.timestamps[index]), rectified.color(color), depth_m, rectified.intrinsics)
+
+    def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
+        path = self._posed[index].depth
+        if path is None or not self.has_depth:
+            return None
+        return read_depth(path), self.options.depth_scale or UNITS_PER_METRE
+
+    def name(self, index: int) -> str:
+        return self._posed[index].image.name
+
+    def pose(self, index: int) -> NDArray[np.float64]:
+        return self._posed[index].T_world_cam
+
+
+def nominal_scale(posed: Sequence[PosedImage], points: NDArray[np.float64]) -> float | None:
+    """What brings the median depth of (P, 3) points, where images show them, to ``NOMINAL_DEPTH``; None without any."""
+    points = points[:: max(1, len(points) // _SAMPLES)]
+    depths = []
+    for view in posed:
+        camera = view.lens.camera
+        pixels, depth = project(transform(invert(view.T_world_cam), points), camera)
+        seen = (pixels >= 0).all(axis=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+        if seen.any():
+            depths.append(float(np.median(depth[seen])))
+    return NOMINAL_DEPTH / float(np.median(depths)) if depths else None
+
+
+def inside(folder: Path, name: str, stated_by: Path) -> Path:
+    """A file that another one names, within the folder. Raises CaptureError for one that is outside."""
+    path = Path(os.path.normpath(folder / name))
+    if not path.is_relative_to(os.path.normpath(folder)):
+        raise CaptureError(f"{stated_by} names {name}, which lies outside of {folder}: correct it.")
+    return path
+
+
+def _scaled(T_world_cam: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+    T = T_world_cam.copy()
+    T[:3, 3] *= scale
+    return T
