@@ -1,0 +1,105 @@
+"""Poses and points from verified matches, by COLMAP's incremental or global mapper, and a last adjustment of all.
+
+Sources: J. Schönberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016; L. Pan et al., Global
+Structure-from-Motion Revisited (GLOMAP), ECCV 2024; both as pycolmap has them.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pycolmap
+
+_GROWTH = 1.4  # of a model between two adjustments of all of it
+_LEAST_IMAGES = 3
+_MOST_MODELS = 8
+_ITERATIONS = 40
+_CLEARLY_BETTER = 0.97  # of the squared error, with distortion
+
+_DISTORTED = "RADIAL"
+
+
+def incremental(
+    database: Path, folder: Path, fixed: bool, registered: Callable[[], None], start: Path | None = None
+) -> list[pycolmap.Reconstruction]:
+    """Models, the largest first. fixed: intrinsics stay.  registered: called for each image that gets a pose.
+
+    start: a saved model that is to be continued.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors = False
+    options.random_seed = 0
+    options.min_model_size = _LEAST_IMAGES
+    options.max_num_models = _MOST_MODELS
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
+    if fixed:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    found = pycolmap.incremental_mapping(
+        database, folder, _fresh(folder / "models"), options, start or "", registered, registered
+    )
+    return _largest_first(found)
+
+
+def global_(database: Path, folder: Path, fixed: bool) -> list[pycolmap.Reconstruction]:
+    """Models, the largest first: all images at once, which is faster and needs more matches."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = 0
+    options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False
+    if fixed:
+        options.mapper.bundle_adjustment.refine_focal_length = False
+        options.mapper.bundle_adjustment.refine_extra_params = False
+    return _largest_first(pycolmap.global_mapping(database, folder, _fresh(folder / "models"), options))
+
+
+def silence() -> None:
+    """COLMAP prints nothing: what went wrong is told in errors and warnings."""
+    pycolmap.logging.alsologtostderr = pycolmap.logging.logtostderr = False
+    pycolmap.logging.minloglevel = pycolmap.logging.stderrthreshold = pycolmap.logging.Level.FATAL.value
+
+
+def _fresh(folder: Path) -> Path:
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
+
+
+def _largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    return sorted(found.values(), key=lambda model: -model.num_reg_images())
+
+
+def adjusted(model: pycolmap.Reconstruction, fixed: bool, distorts: bool) -> pycolmap.Reconstruction:
+    """The model after an adjustment of everything with a robust loss; with distortion where ``distorts`` says so, or
+    where that lowers the error clearly. It is changed in place, and not what is returned."""
+    if fixed or distorts:
+        _adjust(model, fixed)
+        return model
+    bent = pycolmap.Reconstruction(model)
+    for camera in bent.cameras.values():
+        _distort(camera)
+    straight_error, bent_error = _adjust(model, fixed), _adjust(bent, fixed)
+    return bent if bent_error < _CLEARLY_BETTER * straight_error else model
+
+
+def _adjust(model: pycolmap.Reconstruction, fixed: bool) -> float:
+    """Mean squared reprojection error afterwards, pixels."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = options.refine_extra_params = not fixed
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.max_num_iterations = _ITERATIONS
+    options.ceres.solver_options.function_tolerance = 1e-6
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    return float(model.compute_mean_reprojection_error()) ** 2
+
+
+def _distort(camera: pycolmap.Camera) -> None:
+    """Give a pinhole camera the parameters of a lens, which are 0 at first."""
+    bent = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, _DISTORTED, camera.mean_focal_length(), camera.width, camera.height
+    )
+    bent.principal_point_x, bent.principal_point_y = camera.principal_point_x, camera.principal_point_y
+    camera.model, camera.params = bent.model, bent.params
