@@ -78,7 +78,8 @@ def write_detector(path: Path, size: tuple[int, int] = (120, 160), described: st
     patch = np.eye(81, dtype=np.float32).reshape(81, 1, 9, 9)
     constants = {
         "laplacian": laplacian, "patch": patch, "flat": np.array([-1], np.int64), "k": np.array([50], np.int64),
-        "rows": np.array([81, -1], np.int64), "width": np.array(width, np.int64), "margin": np.array([0, 0, 1, 1, 0, 0, 1, 1], np.int64),
+        "rows": np.array([81, -1], np.int64), "width": np.array(width, np.int64),
+        "margin": np.array([0, 0, 1, 1, 0, 0, 1, 1], np.int64),
     }  # fmt: skip
     nodes = [
         helper.make_node("Pad", ["image", "margin"], ["padded"], mode="edge"),

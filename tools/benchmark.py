@@ -33,6 +33,7 @@ import encoders
 import held_out
 import kernels
 import language
+import mono
 import rendering
 import variants
 import voxels
@@ -69,6 +70,8 @@ LAYER_1 = {
     "glued": "layer 1 on two captures as if they were one, which must stay two submaps",
     "lengths": "layer 1 on the first 250, 500 and 1000 frames: seconds, and bytes of a keyframe",
 }
+
+MONO = {"mono": "poses from colour alone: placed images, ATE and seconds, beside pycolmap's pipeline at its defaults"}
 
 WORDS = {"absent_words": "names of things that are not there: how often a region is returned all the same"}
 
@@ -326,6 +329,7 @@ INSIDE = {
     "words": lambda capture: absent_words.measure_words(capture),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
     "lifting": lambda: language.measure_lifting(),
+    "mono": lambda capture: mono.measure_mono(capture),
     "fusion": lambda map_path: language.measure_fusion(Path(map_path)),
 }
 """What is measured in a process of its own."""
@@ -401,16 +405,22 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
     measured = {name: _tried(name, lambda name=name: kernel(name, asked_map)) for name in KERNELS if name in names}
     layer_1 = measure_layer_1([capture.resolve() for capture in captures], names)
     asked = [_absent_words(capture.resolve()) for capture in captures if "absent_words" in names]
+    colour = [_mono(capture.resolve()) for capture in captures if "mono" in names]
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
     return {
         "machine": machine, "frames": frames, "rows": rows, "kernels": measured, "layer_1": layer_1, "layer_3": layer_3,
-        "words": asked,
+        "words": asked, "mono": colour,
     }  # fmt: skip
 
 
 def _absent_words(capture: Path) -> Figures:
     name = Job(capture, None, capture).name
     return {"capture": name, **_tried(f"{name}: absent words", lambda: _inside("words", capture=str(capture)))}
+
+
+def _mono(capture: Path) -> Figures:
+    name = Job(capture, None, capture).name
+    return {"capture": name, **_tried(f"{name}: mono", lambda: _inside("mono", capture=str(capture)))}
 
 
 def measure_layer_1(captures: list[Path], names: list[str]) -> Figures:
@@ -515,6 +525,7 @@ def markdown(results: Figures) -> str:
             *lines,
             *_layer_1_lines(results.get("layer_1") or {}),
             *_word_lines(results.get("words") or []),
+            *mono.mono_lines(results.get("mono") or []),
             *language.fusion_lines(results.get("layer_3") or {}),
             *_pose_lines(results["rows"]),
             *_fit_lines(results["rows"]),
@@ -650,7 +661,7 @@ def arguments() -> argparse.Namespace:
     given = parser.parse_args()
     captures, names = SUITES[given.suite]
     given.captures = given.captures or [DATA / name for name in captures]
-    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *LAYER_3, *WORDS]
+    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *LAYER_3, *WORDS, *MONO]
     given.variants = given.variants or list(names or known)
     if unknown := [name for name in given.variants if name not in known]:
         parser.error(f"unknown variants {', '.join(unknown)}: --list names all")
@@ -674,7 +685,7 @@ def main() -> None:
             print(f"{name:<38} {variant.title}" + (f": not available, {variant.lacking}" if variant.lacking else ""))
         for name, title in PEERS.items():
             print(f"{name:<38} {title}")
-        for name, title in (LAYER_1 | LAYER_3 | WORDS).items():
+        for name, title in (LAYER_1 | LAYER_3 | WORDS | MONO).items():
             print(f"{name:<38} {title}")
         print(f"{', '.join(KERNELS):<38} speed of the projection, of voxels, queries, rendering and encoders")
         return
