@@ -15,7 +15,7 @@ from photographs import Photographs, turning, walk
 from freeocc3d.errors import ConfigError, TrackingError
 from freeocc3d.geometry import umeyama
 from freeocc3d.progress import Progress
-from freeocc3d.tracking import colmap, colmap_model, structure
+from freeocc3d.tracking import colmap, colmap_model, mapping, structure
 from freeocc3d.tracking.colmap import ColmapTracker, Options
 from freeocc3d.tracking.lens import LensCamera
 from freeocc3d.tracking.sfm import Reconstruction
@@ -137,6 +137,15 @@ def test_an_interrupted_run_goes_on(stage: str, tmp_path: Path, monkeypatch: pyt
     again = Listener()
     structure.reconstruct(Counted(images, camera), range(len(images)), tmp_path, Recipe(), again)
     assert again.stages == []
+
+
+def test_images_that_a_model_lacks_are_tried_again(room: tuple[Reconstruction, Path], tmp_path: Path) -> None:
+    _, folder = room
+    model = mapping.incremental(folder / "database.db", tmp_path, False, lambda: None)[0]
+    for frame_id in (3, 9):
+        pycolmap.ObservationManager(model).deregister_frame(frame_id)
+    assert model.num_reg_images() == 14
+    assert mapping.continued(folder / "database.db", tmp_path, False, model).num_reg_images() == 16
 
 
 def test_two_scenes_become_one_map_and_frames_apart(tmp_path: Path) -> None:

@@ -54,6 +54,14 @@ def global_(database: Path, folder: Path, fixed: bool) -> list[pycolmap.Reconstr
     return _largest_first(pycolmap.global_mapping(database, folder, _fresh(folder / "models"), options))
 
 
+def continued(database: Path, folder: Path, fixed: bool, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """The model with the images that it lacks, where they can be placed now that all of it is there."""
+    begun = _fresh(folder / "begun")
+    model.write(begun)
+    more = incremental(database, folder, fixed, lambda: None, begun)
+    return more[0] if more and more[0].num_reg_images() > model.num_reg_images() else model
+
+
 def silence() -> None:
     """COLMAP prints nothing: what went wrong is told in errors and warnings."""
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value

@@ -208,4 +208,7 @@ def _mapped(folder: Path, images: int, recipe: Recipe, progress: Progress) -> li
         models = mapping.global_(folder / _DATABASE, folder, fixed)
     else:
         models = mapping.incremental(folder / _DATABASE, folder, fixed, advance)
+    somewhere = {image_id for model in models for image_id in model.reg_image_ids()}
+    if models and len(somewhere) < images:
+        models[0] = mapping.continued(folder / _DATABASE, folder, fixed, models[0])
     return models
