@@ -13,6 +13,8 @@ from pathlib import Path
 import pycolmap
 
 _GROWTH = 1.4  # of a model between two adjustments of all of it
+_REFINEMENTS = 2, 1  # of a model, and of what is around a new image: ``adjusted`` refines the whole in the end
+_TOLERANCES = 1e-5, 1e-4
 _LEAST_IMAGES = 3
 _MOST_MODELS = 8
 _ITERATIONS = 40
@@ -34,6 +36,8 @@ def incremental(
     options.min_model_size = _LEAST_IMAGES
     options.max_num_models = _MOST_MODELS
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
+    options.ba_global_max_refinements, options.ba_local_max_refinements = _REFINEMENTS
+    options.ba_global_function_tolerance, options.ba_local_function_tolerance = _TOLERANCES
     if fixed:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
