@@ -54,7 +54,9 @@ def test_a_map_of_class_images_is_not_asked_in_vain() -> None:
     assert row["all_absent"] > 1000
     assert row["absent_answered"] <= 0.05
     assert row["present_found"] > 0.9
-    table = benchmark.markdown({"rows": [], "kernels": {}, "words": [row, {"capture": "x", "error": "no names"}]})
+    table = benchmark.markdown(
+        {"rows": [], "kernels": {}, "each": {"absent_words": [row, {"capture": "x", "error": "no names"}]}}
+    )
     assert "| bedroom, `labels`: 200 absent names that return a region | 0.0% | ≤ 5 % |" in table
     assert "not available, no names" in table
 

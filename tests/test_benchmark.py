@@ -14,6 +14,7 @@ sys.path.insert(0, str(TOOLS))
 
 import benchmark  # noqa: E402
 import language  # noqa: E402
+import mono  # noqa: E402
 import variants  # noqa: E402
 
 
@@ -58,6 +59,20 @@ def test_lifting_has_a_row_for_each_grid() -> None:
         "4.0 GB/s: 0.50 of a copy's 8.0",
         "2.0 GB/s: 0.25 of a copy's 8.0",
     ]
+
+
+def test_poses_from_colour_have_a_line_for_each_pipeline() -> None:
+    one = {"placed": 1.0, "ate_rmse_m": 0.0123, "seconds": {"features": 3.0, "mapping": 4.0}, "cpu_seconds": 9.0}
+    lines = mono.mono_lines(
+        [
+            {"capture": "a", "frames": 9, "ours": one, "pycolmap": {**one, "ate_rmse_m": None}},
+            {"capture": "b", "error": "x"},
+        ]
+    )
+    assert lines[3] == "| a | ours, 9 images | 100.0 | 1.23 | 3 | – | 4 | – | 7 | 9 |"
+    assert lines[4] == "| a | pycolmap, 9 images | 100.0 | – | 3 | – | 4 | – | 7 | 9 |"
+    assert lines[5].startswith("| b | not available, x | –")
+    assert mono.mono_lines([]) == []
 
 
 def test_what_moved_is_told_by_figure() -> None:

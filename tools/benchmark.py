@@ -24,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ import exporters
 import held_out
 import kernels
 import language
+import mono
 import rendering
 import variants
 import voxels
@@ -70,9 +72,6 @@ LAYER_1 = {
     "glued": "layer 1 on two captures as if they were one, which must stay two submaps",
     "lengths": "layer 1 on the first 250, 500 and 1000 frames: seconds, and bytes of a keyframe",
 }
-
-WORDS = {"absent_words": "names of things that are not there: how often a region is returned all the same"}
-EXPORTS = {"exports": "every exporter at 4 cm: seconds, memory, bytes; the plan for robots beside the truth's"}
 
 SUITES = {
     "quick": (("house/bedroom",), (OURS, "rgbd_true_poses", "rgbd_true_poses_closed_set", *PEERS, *KERNELS, "lengths")),
@@ -312,6 +311,51 @@ def fusion(job: Job) -> Figures:
 # Processes
 
 
+def _asked_lines(table: list[tuple[str, str, str]]) -> list[str]:
+    """A table of what was measured and what is asked for; nothing of nothing."""
+    lines = [f"| {' | '.join(line)} |" for line in table]
+    return ["", "| what | measured | asked |", "|---|---|---|", *lines] if lines else []
+
+
+def _export_lines(rows: list[Figures]) -> list[str]:
+    """A table for each capture."""
+    lines = []
+    for row in rows:
+        if "error" in row:
+            lines.append(f"\nexports of {row['capture']}: not available, {row['error']}")
+        else:
+            lines += [f"\n{row['capture']}:", *_asked_lines(exporters.exports_lines(row))]
+    return lines
+
+
+@dataclass(frozen=True)
+class Each:
+    """What is measured of each capture in a process of its own.  measure: of the capture's path.  lines: of the report
+    about all captures' figures."""
+
+    title: str
+    measure: Callable[[str], Figures]
+    lines: Callable[[list[Figures]], list[str]]
+
+
+EACH = {
+    "absent_words": Each(
+        "names of things that are not there: how often a region is returned all the same",
+        absent_words.measure_words,
+        lambda rows: _asked_lines(absent_words.words_lines(rows)),
+    ),
+    "exports": Each(
+        "every exporter at 4 cm: seconds, memory, bytes; the plan for robots beside the truth's",
+        exporters.measure_exports,
+        _export_lines,
+    ),
+    "mono": Each(
+        "poses from colour alone: placed images, ATE and seconds, beside pycolmap's pipeline at its defaults",
+        mono.measure_mono,
+        mono.mono_lines,
+    ),
+}
+
 INSIDE = {
     "score_map": score_map,
     "dense_slam": dense_slam,
@@ -325,11 +369,10 @@ INSIDE = {
     "voxels": lambda: voxels.measure_voxels(),
     "rasterizer": lambda: rendering.measure_rasterizer(),
     "encoders": lambda: encoders.measure_encoders(),
-    "words": lambda capture: absent_words.measure_words(capture),
-    "exports": lambda capture: exporters.measure_exports(capture),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
     "lifting": lambda: language.measure_lifting(),
     "fusion": lambda map_path: language.measure_fusion(Path(map_path)),
+    **{name: part.measure for name, part in EACH.items()},
 }
 """What is measured in a process of its own."""
 
@@ -403,12 +446,11 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
             asked_map = job.folder / OURS
     measured = {name: _tried(name, lambda name=name: kernel(name, asked_map)) for name in KERNELS if name in names}
     layer_1 = measure_layer_1([capture.resolve() for capture in captures], names)
-    asked = [_of_capture(capture, "words") for capture in captures if "absent_words" in names]
-    written = [_of_capture(capture, "exports") for capture in captures if "exports" in names]
+    each = {name: [_of_capture(capture, name) for capture in captures] for name in EACH if name in names}
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
     return {
         "machine": machine, "frames": frames, "rows": rows, "kernels": measured, "layer_1": layer_1, "layer_3": layer_3,
-        "words": asked, "exports": written,
+        "each": each,
     }  # fmt: skip
 
 
@@ -517,8 +559,7 @@ def markdown(results: Figures) -> str:
         [
             *lines,
             *_layer_1_lines(results.get("layer_1") or {}),
-            *_asked_lines(absent_words.words_lines(results.get("words") or [])),
-            *_export_lines(results.get("exports") or []),
+            *[line for name, found in (results.get("each") or {}).items() for line in EACH[name].lines(found)],
             *language.fusion_lines(results.get("layer_3") or {}),
             *_pose_lines(results["rows"]),
             *_fit_lines(results["rows"]),
@@ -534,23 +575,6 @@ def _layer_1_lines(figures: Figures) -> list[str]:
             table = getattr(_stress(), table_of)(rows)
             lines += ["", *(f"| {' | '.join(line)} |" for line in (table[0], ["---"] * len(table[0]), *table[1:]))]
     return lines
-
-
-def _export_lines(rows: list[Figures]) -> list[str]:
-    """A table of "exports" for each capture."""
-    lines = []
-    for row in rows:
-        if "error" in row:
-            lines.append(f"\nexports of {row['capture']}: not available, {row['error']}")
-        else:
-            lines += [f"\n{row['capture']}:", *_asked_lines(exporters.exports_lines(row))]
-    return lines
-
-
-def _asked_lines(table: list[tuple[str, str, str]]) -> list[str]:
-    """A table of what was measured and what is asked for; nothing of nothing."""
-    lines = [f"| {' | '.join(line)} |" for line in table]
-    return ["", "| what | measured | asked |", "|---|---|---|", *lines] if lines else []
 
 
 def _pose_lines(rows: list[Figures]) -> list[str]:
@@ -663,7 +687,7 @@ def arguments() -> argparse.Namespace:
     given = parser.parse_args()
     captures, names = SUITES[given.suite]
     given.captures = given.captures or [DATA / name for name in captures]
-    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *LAYER_3, *WORDS, *EXPORTS]
+    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *LAYER_3, *EACH]
     given.variants = given.variants or list(names or known)
     if unknown := [name for name in given.variants if name not in known]:
         parser.error(f"unknown variants {', '.join(unknown)}: --list names all")
@@ -687,7 +711,7 @@ def main() -> None:
             print(f"{name:<38} {variant.title}" + (f": not available, {variant.lacking}" if variant.lacking else ""))
         for name, title in PEERS.items():
             print(f"{name:<38} {title}")
-        for name, title in (LAYER_1 | LAYER_3 | WORDS | EXPORTS).items():
+        for name, title in (LAYER_1 | LAYER_3 | {name: part.title for name, part in EACH.items()}).items():
             print(f"{name:<38} {title}")
         print(f"{', '.join(KERNELS):<38} speed of the projection, of voxels, queries, rendering and encoders")
         return

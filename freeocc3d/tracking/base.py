@@ -26,7 +26,8 @@ class Options:
     """Layer 1."""
 
     backend: str = "rgbd"
-    """Where poses come from: "rgbd" estimates them, "known" takes the capture's own, "file" those of another system."""
+    """Where poses come from: "rgbd" estimates them from colour and depth, "colmap" from colour alone, "known" takes the
+    capture's own, "file" those of another system."""
 
 
 @dataclass(frozen=True)

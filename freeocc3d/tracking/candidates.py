@@ -1,0 +1,80 @@
+"""Which images of a scan are compared: those that follow each other, and those that look alike.
+
+An image is described by its features' residuals to words that are learnt from the scan; similarity is the cosine.
+
+Source: H. Jégou et al., Aggregating Local Descriptors into a Compact Image Representation, CVPR 2010 (VLAD).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+OF_IMAGE = 1000
+"""Features of an image that are enough to describe it."""
+
+_WORDS, _SAMPLE, _ROUNDS = 64, 20_000, 8
+_NEAR = 5  # successors in a video are among the images most like each
+
+
+def similarity(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """(N, N) cosine of N images' descriptors of descriptors, each (F, D) of unit length."""
+    rng = np.random.default_rng(0)
+    sampled = [d[rng.permutation(len(d))[: max(_SAMPLE // len(descriptors), 1)]] for d in descriptors]
+    words = _words(np.concatenate(sampled), rng)
+    vectors = np.stack([_vlad(d, words) for d in descriptors])
+    return np.asarray(vectors @ vectors.T, np.float32)
+
+
+def _words(sample: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """(W, D) centres of clusters."""
+    words = sample[rng.permutation(len(sample))[:_WORDS]].copy()
+    for _ in range(_ROUNDS):
+        nearest = _assigned(sample, words)
+        order = np.argsort(nearest, kind="stable")
+        used, first, count = np.unique(nearest[order], return_index=True, return_counts=True)
+        words[used] = np.add.reduceat(sample[order], first, axis=0) / count[:, None]
+    return words
+
+
+def _assigned(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
+    return np.asarray(np.argmax(descriptors @ words.T - 0.5 * (words**2).sum(axis=1), axis=1), np.int64)
+
+
+def _vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(W·D,) sums of residuals to the words, each and all of unit length."""
+    sums = np.zeros_like(words)
+    if len(descriptors):
+        nearest = _assigned(descriptors, words)
+        np.add.at(sums, nearest, descriptors - words[nearest])
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+    return np.asarray(sums.ravel() / max(float(np.linalg.norm(sums)), 1e-9), np.float32)
+
+
+def in_order(alike: NDArray[np.float32]) -> bool:
+    """Whether images that follow each other look alike, as those of a video, given all similarities (N, N)."""
+    if len(alike) <= 2 * _NEAR:
+        return False
+    others = np.where(np.eye(len(alike), dtype=bool), -np.inf, alike)
+    successor = np.diagonal(others, 1)
+    rank = (others[:-1] > successor[:, None]).sum(axis=1)
+    return bool(np.median(rank) < _NEAR)
+
+
+def pairs(alike: NDArray[np.float32], follow: int, retrieved: int) -> NDArray[np.int64]:
+    """(P, 2) ascending pairs (i < j) of N images: each with the next ``follow`` ones and with as many as ``retrieved``
+    of those most like it, the nearest first.
+
+    alike: (N, N). ``follow`` 0 for images in no order. With N - 1 ``retrieved`` every pair is there.
+    """
+    n = len(alike)
+    rows = np.arange(n)
+    gap = np.abs(rows[:, None] - rows)
+    wanted = (gap > 0) & (gap <= follow)
+    elsewhere = np.where((gap == 0) | wanted, -np.inf, alike)
+    best = np.argsort(-elsewhere, axis=1, kind="stable")[:, : min(retrieved, n - 1)]
+    wanted[rows[:, None], best] |= np.isfinite(np.take_along_axis(elsewhere, best, axis=1))
+    found = np.argwhere(np.triu(wanted | wanted.T, 1))
+    return found[np.argsort(found[:, 1] - found[:, 0], kind="stable")]

@@ -1,0 +1,117 @@
+"""Estimates poses from colour alone: structure from motion over the whole scan, or an existing COLMAP model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture.base import Capture
+from ..errors import ConfigError
+from ..progress import Progress
+from ..registry import require_positive
+from ..types import Frame, Trajectory
+from .base import Tracked
+from .colmap_model import read_model
+from .given import GivenTracker
+from .sfm import Reconstruction
+from .structure import Recipe, reconstruct
+
+REQUIRES: tuple[str, ...] = ("pycolmap",)
+
+_CHOICES = {
+    "order": ("auto", "video", "photos"),
+    "mapping": ("incremental", "global"),
+    "intrinsics": ("refine", "fixed"),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which frames, how they are matched and mapped, the camera, and an existing model."""
+
+    frames: int = 300
+    """Frames that are reconstructed at most: of more, the sharpest ones with the same way of image motion between."""
+    order: str = "auto"
+    """"video": each frame shows much of the one before; "photos": images in no order; "auto": as the images say."""
+    features: str = "sift"
+    """"sift", or the path of an ONNX network that finds keypoints and descriptors (SuperPoint, DISK, ALIKED)."""
+    mapping: str = "incremental"
+    """"incremental" adds image by image; "global" places all at once: faster, but needs each seen in many others."""
+    intrinsics: str = "refine"
+    """"refine": those of the capture are a start; "fixed": they are kept as they are."""
+    model: str | None = None
+    """Folder of a COLMAP model (cameras, images, points3D) of the capture's images that is taken instead."""
+    keyframe_overlap: float = 0.85
+    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "frames", "keyframe_overlap")
+        for name, known in _CHOICES.items():
+            if getattr(self, name) not in known:
+                raise ConfigError(f"'{name}' must be {' or '.join(known)}, got '{getattr(self, name)}'.")
+
+
+def load(options: Options, capture: Capture) -> ColmapTracker:
+    """The tracker; the capture's depth and poses are not read. Raises ConfigError."""
+    if options.intrinsics == "fixed" and not capture.intrinsics_known and options.model is None:
+        raise ConfigError(
+            f"tracking.colmap.intrinsics=fixed needs the camera of {capture.path}: give capture.intrinsics, or refine."
+        )
+    return ColmapTracker(options, capture)
+
+
+class ColmapTracker(GivenTracker):
+    """Poses stand when ``prepare`` is done; frames that were not chosen are "unused", those of smaller models "apart".
+    Frames are given as a pinhole camera would have taken them."""
+
+    world: ClassVar[str] = "OpenCV camera axes of the model's world, in units of half the median depth of its points"
+    offline = True
+
+    def __init__(self, options: Options, capture: Capture):
+        super().__init__(np.full((len(capture), 4, 4), np.nan), options.keyframe_overlap)
+        self.options, self.capture = options, capture
+        self.reconstruction: Reconstruction | None = None
+        self._dense: Any = None
+
+    def prepare(self, folder: Path, frames: range, progress: Progress) -> None:
+        found = self._reconstructed(folder, frames, progress)
+        for text in found.warnings:
+            progress.warn(text)
+        self.reconstruction, self.T_world_cam = found, found.T_world_cam
+        if not self.capture.has_depth:
+            from .stereo import StereoDepth  # type: ignore[import-not-found]
+
+            self._dense = StereoDepth(folder)
+            self._dense.compute(self.capture, found, progress)
+
+    def _reconstructed(self, folder: Path, frames: range, progress: Progress) -> Reconstruction:
+        options = self.options
+        if options.model is not None:
+            return read_model(Path(options.model).expanduser(), self.capture).normalised()
+        recipe = Recipe(options.frames, options.order, options.features, options.mapping, options.intrinsics)
+        return reconstruct(self.capture, frames, folder, recipe, progress)
+
+    def completed(self, frame: Frame) -> Frame:
+        """Undistorted, with depth by stereo where the capture brings none."""
+        assert self.reconstruction is not None, "prepare comes first"
+        lens = self.reconstruction.camera
+        frame = replace(frame, color=lens.undistorted(frame.color), intrinsics=lens.pinhole())
+        found = None if self._dense is None else self._dense.depth(frame.index)
+        return frame if found is None else replace(frame, depth_m=found[0])
+
+    def track(self, frame: Frame) -> Tracked:
+        assert self.reconstruction is not None, "prepare comes first"
+        if not self.reconstruction.chosen[frame.index]:
+            return Tracked("unused", None, 0.0)
+        return super().track(frame)
+
+    def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
+        found = super().trajectory(timestamps)
+        if self.reconstruction is None or not self.reconstruction.apart.any():
+            return found
+        status = np.where(self.reconstruction.apart & (found.status == "lost"), "apart", found.status)
+        return replace(found, status=status)

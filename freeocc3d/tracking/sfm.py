@@ -1,0 +1,86 @@
+"""What structure from motion finds of a scan, as plain data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import read_arrays
+from ..types import Intrinsics
+from .lens import LensCamera
+
+NOMINAL_DEPTH_M = 2.0
+"""Median depth of a scene whose scale is unknown: that of a room, so that what is meant in metres stays sensible."""
+
+_EXPECTED = {
+    "T_world_cam": ("f", 3), "camera": ("f", 1), "points": ("f", 2), "seen_frame": ("i", 1), "seen_point": ("i", 1),
+    "metric": ("b", 0), "apart": ("b", 1), "chosen": ("b", 1), "warnings": ("U", 1),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Poses and sparse points of a scan by structure from motion, or read from a model.
+
+    T_world_cam: (N, 4, 4) float64, row n = frame n of the capture, NaN where it has no pose.
+    camera: of all frames.  points: (P, 3) float32 world.
+    seen_frame, seen_point: (O,) int32, point ``seen_point[i]`` is seen in frame ``seen_frame[i]``.
+    metric: whether the world's unit is the metre.
+    apart: (N,) whether the frame is in another model than this, which nothing ties to it.
+    chosen: (N,) whether the frame was used at all.  warnings: what the user should know.
+    """
+
+    T_world_cam: NDArray[np.float64]
+    camera: LensCamera
+    points: NDArray[np.float32]
+    seen_frame: NDArray[np.int32]
+    seen_point: NDArray[np.int32]
+    metric: bool
+    apart: NDArray[np.bool_]
+    chosen: NDArray[np.bool_]
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def has_pose(self) -> NDArray[np.bool_]:
+        """(N,) which frames have one."""
+        return np.asarray(np.isfinite(self.T_world_cam).all(axis=(1, 2)))
+
+    def depths(self) -> NDArray[np.float64]:
+        """(O,) of each observation: the point's z in the frame's camera."""
+        T = self.T_world_cam[self.seen_frame]
+        moved = self.points[self.seen_point].astype(np.float64) - T[:, :3, 3]
+        return np.asarray((moved * T[:, :3, 2]).sum(axis=1))
+
+    def scaled(self, scale: float) -> Reconstruction:
+        """The same in units of which ``scale`` make one of the present."""
+        T_world_cam = self.T_world_cam.copy()
+        T_world_cam[:, :3, 3] *= scale
+        return replace(self, T_world_cam=T_world_cam, points=self.points * np.float32(scale))
+
+    def normalised(self) -> Reconstruction:
+        """With the median depth ``NOMINAL_DEPTH_M``, unless the scale is known."""
+        return self if self.metric else self.scaled(NOMINAL_DEPTH_M / float(np.median(self.depths())))
+
+    def save(self, path: Path) -> None:
+        """As an .npz file that is whole or not there."""
+        camera = self.camera.intrinsics
+        numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *self.camera.distortion)
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _EXPECTED if name not in ("camera", "warnings")}
+        arrays["warnings"] = np.array(self.warnings, "U")
+
+        temporary = path.with_name(f"tmp.{path.name}")
+        np.savez(temporary, **arrays, camera=np.array(numbers))
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Reconstruction:
+        """The inverse of ``save``. Raises MapError for a damaged file."""
+        arrays = read_arrays(path, _EXPECTED)
+        width, height, fx, fy, cx, cy, *distortion = arrays.pop("camera").tolist()
+        lens = LensCamera(Intrinsics(int(width), int(height), fx, fy, cx, cy), tuple(distortion))
+        metric, warnings = bool(arrays.pop("metric")), tuple(arrays.pop("warnings").tolist())
+        return cls(camera=lens, metric=metric, warnings=warnings, **arrays)
