@@ -60,7 +60,9 @@ def load(options: Options, capture: Capture) -> FileTracker:
     points = None if options.points is None else _read_points(_beside(options.points, capture))
     scale = _scale(T_world_cam, capture, options)
     T_world_cam[:, :3, 3] *= scale
-    return FileTracker(T_world_cam, options.keyframe_overlap, None if points is None else points * np.float32(scale))
+    return FileTracker(
+        T_world_cam, options.keyframe_overlap, capture, None if points is None else points * np.float32(scale)
+    )
 
 
 class FileTracker(GivenTracker):
@@ -70,12 +72,18 @@ class FileTracker(GivenTracker):
     world: ClassVar[str] = "world frame of the trajectory file, scaled to metres"
 
     def __init__(
-        self, T_world_cam: NDArray[np.float64], keyframe_overlap: float, points: NDArray[np.float32] | None = None
+        self,
+        T_world_cam: NDArray[np.float64],
+        keyframe_overlap: float,
+        capture: Capture,
+        points: NDArray[np.float32] | None = None,
     ):
-        super().__init__(T_world_cam, keyframe_overlap)
+        super().__init__(T_world_cam, keyframe_overlap, capture)
         self._points = points
+        self.offline = self.offline and points is None
 
     def completed(self, frame: Frame) -> Frame:
+        frame = super().completed(frame)
         T_world_cam = self.T_world_cam[frame.index]
         if self._points is None or not np.isfinite(T_world_cam).all():
             return frame

@@ -44,7 +44,9 @@ def neighbours(
     centres, forward = T_world_cam[:, :3, 3], T_world_cam[:, :3, 2]
     depths = np.einsum("oc,oc->o", points[seen_point] - centres[seen_frame], forward[seen_frame])
     depths = np.where(np.isfinite(depths) & (depths > 0), depths, np.nan)
-    overall = np.nanpercentile(depths, (_OUTLIERS, 100 - _OUTLIERS)) if np.isfinite(depths).any() else np.full(2, np.nan)
+    overall = (
+        np.nanpercentile(depths, (_OUTLIERS, 100 - _OUTLIERS)) if np.isfinite(depths).any() else np.full(2, np.nan)
+    )
     near, far = np.full(frames, overall[0]), np.full(frames, overall[1])
     partners = []
     by_frame = np.argsort(seen_frame, kind="stable")

@@ -27,7 +27,7 @@ def jumps(grey: Tensor, least: float, most: float, contrast: float) -> tuple[Ten
     ``least`` where they differ by much more than ``contrast``."""
     down = F.pad((grey[1:] - grey[:-1]).abs(), (0, 0, 1, 0))
     right = F.pad((grey[:, 1:] - grey[:, :-1]).abs(), (1, 0))
-    return tuple(least + (most - least) * torch.exp(-change / contrast) for change in (down, right))  # type: ignore[return-value]
+    return tuple(least + (most - least) * torch.exp(-change / contrast) for change in (down, right))
 
 
 def _swept(costs: Tensor, step: float, jump: Tensor, diagonal: bool) -> Tensor:

@@ -53,9 +53,7 @@ def find_planes(
     return planes
 
 
-def _best_plane(
-    points: NDArray[np.float64], sigma_m: NDArray[np.float64], rng: np.random.Generator
-) -> Plane | None:
+def _best_plane(points: NDArray[np.float64], sigma_m: NDArray[np.float64], rng: np.random.Generator) -> Plane | None:
     chosen = rng.permutation(len(points))[:_SAMPLE]
     tried, within = points[chosen], _WITHIN * sigma_m[chosen]
     corners = tried[_triples(tried, rng)]  # (T, 3, 3)
