@@ -70,6 +70,8 @@ LAYER_1 = {
     "lengths": "layer 1 on the first 250, 500 and 1000 frames: seconds, and bytes of a keyframe",
 }
 
+STEREO = {"stereo_depth": "depth by multi-view stereo from colour at true poses, against the capture's depth"}
+
 WORDS = {"absent_words": "names of things that are not there: how often a region is returned all the same"}
 
 SUITES = {
@@ -290,6 +292,12 @@ def kernel(name: str, asked_map: Path | None) -> Figures:
     return {"cold_seconds": statistics.median(cold), **_inside("query", map_path=str(asked_map))}
 
 
+def _stereo() -> Any:
+    import stereo
+
+    return stereo
+
+
 def _stress() -> Any:
     import stress
 
@@ -323,6 +331,7 @@ INSIDE = {
     "voxels": lambda: voxels.measure_voxels(),
     "rasterizer": lambda: rendering.measure_rasterizer(),
     "encoders": lambda: encoders.measure_encoders(),
+    "stereo": lambda capture: _stereo().measure_stereo(capture),
     "words": lambda capture: absent_words.measure_words(capture),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
     "lifting": lambda: language.measure_lifting(),
@@ -401,16 +410,22 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
     measured = {name: _tried(name, lambda name=name: kernel(name, asked_map)) for name in KERNELS if name in names}
     layer_1 = measure_layer_1([capture.resolve() for capture in captures], names)
     asked = [_absent_words(capture.resolve()) for capture in captures if "absent_words" in names]
+    depths = [_stereo_depth(capture.resolve()) for capture in captures if "stereo_depth" in names]
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
     return {
         "machine": machine, "frames": frames, "rows": rows, "kernels": measured, "layer_1": layer_1, "layer_3": layer_3,
-        "words": asked,
+        "words": asked, "stereo": depths,
     }  # fmt: skip
 
 
 def _absent_words(capture: Path) -> Figures:
     name = Job(capture, None, capture).name
     return {"capture": name, **_tried(f"{name}: absent words", lambda: _inside("words", capture=str(capture)))}
+
+
+def _stereo_depth(capture: Path) -> Figures:
+    name = Job(capture, None, capture).name
+    return {"capture": name, **_tried(f"{name}: stereo depth", lambda: _inside("stereo", capture=str(capture)))}
 
 
 def measure_layer_1(captures: list[Path], names: list[str]) -> Figures:
@@ -514,6 +529,7 @@ def markdown(results: Figures) -> str:
         [
             *lines,
             *_layer_1_lines(results.get("layer_1") or {}),
+            *_stereo().stereo_lines(results.get("stereo") or []),
             *_word_lines(results.get("words") or []),
             *language.fusion_lines(results.get("layer_3") or {}),
             *_pose_lines(results["rows"]),
@@ -650,7 +666,7 @@ def arguments() -> argparse.Namespace:
     given = parser.parse_args()
     captures, names = SUITES[given.suite]
     given.captures = given.captures or [DATA / name for name in captures]
-    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *LAYER_3, *WORDS]
+    known = [*variants.names(), *PEERS, *KERNELS, *LAYER_1, *LAYER_3, *STEREO, *WORDS]
     given.variants = given.variants or list(names or known)
     if unknown := [name for name in given.variants if name not in known]:
         parser.error(f"unknown variants {', '.join(unknown)}: --list names all")
@@ -674,7 +690,7 @@ def main() -> None:
             print(f"{name:<38} {variant.title}" + (f": not available, {variant.lacking}" if variant.lacking else ""))
         for name, title in PEERS.items():
             print(f"{name:<38} {title}")
-        for name, title in (LAYER_1 | LAYER_3 | WORDS).items():
+        for name, title in (LAYER_1 | LAYER_3 | STEREO | WORDS).items():
             print(f"{name:<38} {title}")
         print(f"{', '.join(KERNELS):<38} speed of the projection, of voxels, queries, rendering and encoders")
         return

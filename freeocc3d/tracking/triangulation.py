@@ -18,7 +18,7 @@ from . import features
 _STEPS = (1, 2, 3, 5, 8, 12)  # frames ahead
 _NEAR = 6  # frames of another time whose cameras look the same way from close by
 _LOOK = 0.8  # cosine between optical axes
-_LEAST_ANGLE = np.radians(1.0)
+_LEAST_ANGLE = np.radians(2.0)
 _AGREES = 2.0 / 500.0  # of a ray's length: how far two rays of one point may pass each other
 
 
