@@ -143,7 +143,7 @@ def test_a_camera_that_only_turns_measures_nothing(tmp_path: Path) -> None:
         _tracker(Colour(), tmp_path, range(8), turned)
 
 
-@pytest.mark.parametrize("given", [{"size": 10}, {"planes": -1}, {"neighbours": 0}, {"tolerance": 0.0}])
+@pytest.mark.parametrize("given", [{"size": 10}, {"planes": -1}, {"neighbours": 0}, {"vaguest": 0.0}])
 def test_options_out_of_range(given) -> None:
     with pytest.raises(ConfigError):
         stereo.Options(**given)

@@ -39,6 +39,8 @@ _STORED: dict[str, dict[str, tuple[str, int]]] = {
     "guess": {"inverse": ("f", 2)},
     **{stage: {"inverse": ("f", 2), "sigma": ("f", 2)} for stage in ("measured", "completed", "depth")},
 }
+_SAME_DEPTH = 0.01  # relative: up to it views agree, whatever their standard deviations
+_LOOKING_THROUGH = 0.25  # views that contradict, over those that agree
 _SAME_SURFACE = 0.02  # relative: beyond it, depths of adjacent pixels belong to different things
 
 
@@ -52,10 +54,10 @@ class Options:
     """Views that each frame is compared with."""
     planes: int = 12
     """Planes looked for around each frame, on which surfaces without texture are put; 0 = leave these empty."""
-    agreeing: int = 2
-    """Other views whose depth must confirm a pixel's."""
-    tolerance: float = 0.01
-    """Relative difference of depths up to which views agree, whatever their standard deviations."""
+    agreeing: int = 3
+    """Views whose depth must confirm a pixel's, of twice as many as each frame is compared with."""
+    vaguest: float = 0.02
+    """Standard deviation over depth beyond which a pixel is left empty."""
     network: str | None = None
     """ONNX network that guesses (inverse) depth from one image, fitted to each frame's stereo depth; it fills what
     stereo leaves empty."""
@@ -63,7 +65,7 @@ class Options:
     """Where stereo is computed: "cpu", or a CUDA device of torch's."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "neighbours", "agreeing", "tolerance")
+        require_positive(self, "neighbours", "agreeing", "vaguest")
         if self.size < 64:
             raise ConfigError(f"'size' must be at least 64 pixels, got {self.size}.")
         if self.planes < 0:
@@ -125,7 +127,7 @@ class StereoDepth:
         posed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
         broken = self._decode(capture, posed, T, progress, prepared)
         T[broken] = np.nan
-        chosen = neighbours(T, scan.points, scan.seen_frame, scan.seen_point, self.options.neighbours)
+        chosen = neighbours(T, scan.points, scan.seen_frame, scan.seen_point, 2 * self.options.neighbours)
         able = [frame for frame, partners in enumerate(chosen.partners) if len(partners)]
         if len(able) < 2:
             raise TrackingError(
@@ -197,11 +199,12 @@ class StereoDepth:
         return broken
 
     def _measure(self, frame: int, chosen: Chosen) -> DepthImage:
-        others = [self._view(other) for other in chosen.partners[frame]]
+        others = [self._view(other) for other in chosen.partners[frame][: self.options.neighbours]]
         return measured(self._view(frame), others, chosen.near[frame], chosen.far[frame], self.options.device)
 
     def _complete(self, frame: int, chosen: Chosen) -> DepthImage:
-        partners, options = chosen.partners[frame], self.options
+        options = self.options
+        partners = chosen.partners[frame][: options.neighbours]
         others = [self._view(other) for other in partners]
         around = [self._depth("measured", other) for other in partners if len(chosen.partners[other])]
         own = self._depth("measured", frame)
@@ -210,8 +213,9 @@ class StereoDepth:
     def _confirm(self, frame: int, chosen: Chosen) -> DepthImage:
         own, options = self._depth("completed", frame), self.options
         others = [self._depth("completed", i) for i in chosen.partners[frame] if len(chosen.partners[i])]
-        found = confirmed(own, others, options.tolerance, options.device)
-        keep = (found.agreeing >= max(1, min(options.agreeing, len(others)))) & (found.agreeing >= found.through)
+        found = confirmed(own, others, _SAME_DEPTH, options.device)
+        keep = found.agreeing >= max(1, min(options.agreeing, len(others)))
+        keep &= (found.through <= _LOOKING_THROUGH * found.agreeing) & (found.sigma < options.vaguest * found.inverse)
         inverse, sigma = (found.inverse * keep).cpu().numpy(), found.sigma.cpu().numpy()
         if options.network is not None:
             guess = self._load("guess", frame)["inverse"].astype(np.float32)
