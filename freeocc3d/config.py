@@ -31,6 +31,9 @@ SECTIONS: dict[str, tuple[str, str | None]] = {
 }
 """Section -> (module whose ``Options`` it configures, folder of its backends)."""
 
+NESTED: dict[str, dict[str, str]] = {"tracking": {"stereo": "tracking.stereo"}}
+"""Section -> what it holds besides its backends -> module whose ``Options`` that configures."""
+
 Config = dict[str, dict[str, Any]]
 
 
@@ -75,7 +78,7 @@ def resolve(values: Mapping[str, Any]) -> Config:
         if not isinstance(given, dict):
             raise ConfigError(f"Section '{section}' must hold 'key: value' lines, got {given!r}.")
         options = {option.name: option for option in registry.options_of(module)}
-        backends = registry.backends(folder) if folder else {}
+        backends = _subsections(section, folder)
         own = {key: value for key, value in given.items() if key not in backends}
         known = {**options, **{name: Option(name, "dict", {}, "") for name in backends}}
         for key in own:
@@ -113,12 +116,18 @@ def documented() -> str:
         lines += ["", f"{section}:"]
         for option in registry.options_of(module):
             lines += _documented(option, indent=2)
-        for name, backend in (registry.backends(folder) if folder else {}).items():
+        for name, backend in _subsections(section, folder).items():
             if backend.options:
                 lines.append(f"  {name}:  # {backend.summary}")
                 for option in backend.options:
                     lines += _documented(option, indent=4)
     return "\n".join(lines) + "\n"
+
+
+def _subsections(section: str, folder: str | None) -> dict[str, registry.Backend]:
+    """What has keys of its own in a section: its backends, and what is nested in it."""
+    nested = {name: registry.described(*module.rsplit(".", 1)) for name, module in NESTED.get(section, {}).items()}
+    return {**(registry.backends(folder) if folder else {}), **nested}
 
 
 def _documented(option: Option, indent: int) -> list[str]:

@@ -72,13 +72,9 @@ def backends(folder: str) -> dict[str, Backend]:
     """The backends of ``folder`` (a key of FOLDERS) by name, sorted; nothing is imported."""
     found = {}
     for path in sorted(PACKAGE.joinpath(*folder.split(".")).glob("*.py")):
-        tree = _tree(f"{folder}.{path.stem}")
-        if not any(_assigned(node, "REQUIRES") for node in tree.body):
-            continue
-        requires = next(ast.literal_eval(node.value) for node in tree.body if _assigned(node, "REQUIRES"))  # type: ignore[attr-defined]
-        summary = (ast.get_docstring(tree) or "").split("\n", 1)[0]
-        name = path.stem.rstrip("_")
-        found[name] = Backend(folder, name, summary, requires, _options(tree))
+        if any(_assigned(node, "REQUIRES") for node in _tree(f"{folder}.{path.stem}").body):
+            backend = described(folder, path.stem)
+            found[backend.name] = backend
     return found
 
 
@@ -101,6 +97,14 @@ def folder_of(kind: str) -> str:
         kinds = [f"{title.split()[-1]}s" for title in FOLDERS.values()]
         raise ConfigError(f"Unknown kind '{kind}'{nearest(kind, kinds)}; there are: {', '.join(kinds)}.")
     return names[kind]
+
+
+def described(folder: str, stem: str) -> Backend:
+    """What the file ``stem`` of ``folder`` says of itself; nothing is imported."""
+    tree = _tree(f"{folder}.{stem}")
+    requires = next((ast.literal_eval(node.value) for node in tree.body if _assigned(node, "REQUIRES")), ())  # type: ignore[attr-defined]
+    summary = (ast.get_docstring(tree) or "").split("\n", 1)[0]
+    return Backend(folder, stem.rstrip("_"), summary, requires, _options(tree))
 
 
 def load(folder: str, name: str) -> types.ModuleType:

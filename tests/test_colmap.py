@@ -1,7 +1,5 @@
 """Poses by structure from motion: of the rendered room, of scans that cannot be reconstructed, and from a model."""
 
-import sys
-import types
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,7 @@ from photographs import Photographs, turning, walk
 from freeocc3d.errors import ConfigError, TrackingError
 from freeocc3d.geometry import umeyama
 from freeocc3d.progress import Progress
-from freeocc3d.tracking import colmap, colmap_model, mapping, structure
+from freeocc3d.tracking import colmap, colmap_model, given, mapping, stereo, structure
 from freeocc3d.tracking.colmap import ColmapTracker, Options
 from freeocc3d.tracking.lens import LensCamera
 from freeocc3d.tracking.sfm import Reconstruction
@@ -162,7 +160,7 @@ def test_scans_that_give_no_poses_are_told_apart(tmp_path: Path) -> None:
     still = [np.clip(images[0] + rng.normal(0, 3, images[0].shape), 0, 255).astype(np.uint8) for _ in range(8)]
     blurred = [cv2.GaussianBlur(image, (0, 0), 12) for image in images[:8]]
     turned, turned_camera = turning()
-    for number, (given, by, sentence) in enumerate(
+    for number, (taken, by, sentence) in enumerate(
         [
             (images[:3], camera, "3 usable images"),
             (still, camera, "stands still"),
@@ -174,16 +172,16 @@ def test_scans_that_give_no_poses_are_told_apart(tmp_path: Path) -> None:
         folder = tmp_path / str(number)
         folder.mkdir()
         with pytest.raises(TrackingError, match=sentence):
-            reconstructed([np.ascontiguousarray(image) for image in given], by, folder)
+            reconstructed([np.ascontiguousarray(image) for image in taken], by, folder)
 
 
 class StereoStub:
     """Depth of the nominal 2 metres for every frame with a pose."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, options: stereo.Options):
         self.folder = folder
 
-    def compute(self, capture: Any, found: Reconstruction, progress: Progress) -> None:
+    def compute(self, capture: Any, found: Reconstruction, frames: range, progress: Progress, prepared: Any) -> None:
         self.found, self.shape = found, capture[0].color.shape[:2]
 
     def depth(self, index: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -195,12 +193,11 @@ class StereoStub:
 def tracked(found: Reconstruction, folder: Path, monkeypatch: pytest.MonkeyPatch, **options: Any) -> ColmapTracker:
     """A tracker of the walk whose reconstruction is saved already, with stereo stubbed."""
     found.save(folder / "reconstruction.npz")
-    stub = types.ModuleType("freeocc3d.tracking.stereo")
-    stub.StereoDepth = StereoStub  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "freeocc3d.tracking.stereo", stub)
+    monkeypatch.setattr(given, "StereoDepth", StereoStub)
     images, _, camera = walk()
     tracker = colmap.load(Options(**options), Photographs(images, camera))
     assert tracker.offline
+    tracker.stereo = stereo.Options()
     tracker.prepare(folder, range(len(images)), Progress())
     return tracker
 
@@ -216,16 +213,16 @@ def test_the_tracker_gives_poses_depth_and_what_became_of_frames(
     altered = replace(found, T_world_cam=T, apart=apart, chosen=chosen)
     tracker = tracked(altered, tmp_path, monkeypatch)
     for index in range(8):
-        frame = tracker.completed(tracker.capture[index])
+        frame = tracker.completed(tracker._capture[index])
         assert frame.intrinsics == found.camera.pinhole()
         assert frame.depth_m[0, 0] == 2.0
         tracker.track(frame)
     state = tracker.state()
     later = tracked(altered, tmp_path, monkeypatch)
-    later.restore(state, [later.completed(later.capture[int(i)]) for i in state["keyframe_index"]])
+    later.restore(state, [later.completed(later._capture[int(i)]) for i in state["keyframe_index"]])
     for index in range(8, 16):
-        later.track(later.completed(later.capture[index]))
-    trajectory = later.trajectory(later.capture.timestamps)
+        later.track(later.completed(later._capture[index]))
+    trajectory = later.trajectory(later._capture.timestamps)
     assert trajectory.status[0] == "keyframe"
     assert trajectory.status[3] == "unused"
     assert trajectory.status[10:].tolist() == ["lost"] * 2 + ["apart"] * 4
@@ -238,9 +235,9 @@ def test_frames_are_undistorted(
     found, _ = room
     bent = replace(found, camera=LensCamera(found.camera.intrinsics, (-0.2, 0.0, 0.0, 0.0)))
     tracker = tracked(bent, tmp_path, monkeypatch)
-    frame = tracker.completed(tracker.capture[0])
+    frame = tracker.completed(tracker._capture[0])
     assert frame.intrinsics == bent.camera.pinhole() != bent.camera.intrinsics
-    np.testing.assert_array_equal(frame.color, bent.camera.undistorted(tracker.capture[0].color))
+    np.testing.assert_array_equal(frame.color, bent.camera.undistorted(tracker._capture[0].color))
 
 
 def test_options_are_checked() -> None:

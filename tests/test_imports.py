@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1] / "freeocc3d"
 
 FLOORS = (
     ("errors", "types"),
-    ("geometry", "hashing", "lattice", "registry", "progress", "files", "arrays"),
+    ("geometry", "hashing", "lattice", "registry", "progress", "files", "arrays", "onnx_model"),
     ("config", "keyframes"),
     ("capture",),
     ("tracking",),

@@ -45,11 +45,13 @@ def test_exports_of_a_map_are_measured_in_processes_of_their_own(tmp_path, monke
         assert row["peak_memory_bytes"] > 5e7
     if figures["octomap"]:
         assert figures["octomap"]["same"]
-    lines = benchmark.markdown({"rows": [], "kernels": {}, "exports": [{"capture": "room", **figures}]})
+    lines = benchmark.markdown({"rows": [], "kernels": {}, "each": {"exports": [{"capture": "room", **figures}]}})
     assert "|   octomap .bt | " in lines
     assert "| 10 s, 2 GB |" in lines
 
 
 def test_exports_that_were_not_measured_are_told() -> None:
-    lines = benchmark.markdown({"rows": [], "kernels": {}, "exports": [{"capture": "a", "error": "no poses"}]})
+    lines = benchmark.markdown(
+        {"rows": [], "kernels": {}, "each": {"exports": [{"capture": "a", "error": "no poses"}]}}
+    )
     assert lines.splitlines()[-1] == "exports of a: not available, no poses"

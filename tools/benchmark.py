@@ -37,6 +37,7 @@ import kernels
 import language
 import mono
 import rendering
+import stereo
 import variants
 import voxels
 
@@ -353,6 +354,11 @@ EACH = {
         "poses from colour alone: placed images, ATE and seconds, beside pycolmap's pipeline at its defaults",
         mono.measure_mono,
         mono.mono_lines,
+    ),
+    "stereo_depth": Each(
+        "depth by multi-view stereo from colour at true poses, against the capture's depth",
+        stereo.measure_stereo,
+        stereo.stereo_lines,
     ),
 }
 

@@ -22,8 +22,8 @@ from typing import Any
 import yaml
 
 from ..errors import ModelError
+from ..onnx_model import load_session
 from ..registry import nearest
-from .onnx_model import load_session
 
 MANIFESTS = ("manifest.yaml", "manifest.json")
 FORMAT = 1

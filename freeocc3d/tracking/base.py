@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from ..progress import Progress
 from ..types import Frame, Submap, Trajectory
 from .pose_graph import Edge, edges_to_arrays
 from .records import Records
+
+if TYPE_CHECKING:
+    from . import stereo
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,8 @@ class Tracker(ABC):
     """Whether its poses are in metres; where not, their unit is unknown, and so is the scale of what is mapped."""
     offline: bool = False
     """Whether ``prepare`` works through the whole scan before the first frame is tracked."""
+    stereo: stereo.Options
+    """How depth is measured where the capture has none; set before ``prepare``."""
 
     def __init__(self) -> None:
         self.records = Records()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from .base import Tracked
 from .colmap_model import read_model
 from .given import GivenTracker
 from .sfm import Reconstruction
+from .stereo import Scan
 from .structure import Recipe, reconstruct
 
 REQUIRES: tuple[str, ...] = ("pycolmap",)
@@ -69,39 +70,35 @@ class ColmapTracker(GivenTracker):
     Frames are given as a pinhole camera would have taken them."""
 
     world: ClassVar[str] = "OpenCV camera axes of the model's world, in units of half the median depth of its points"
-    offline = True
+    estimates_camera = True
 
     def __init__(self, options: Options, capture: Capture):
-        super().__init__(np.full((len(capture), 4, 4), np.nan), options.keyframe_overlap)
-        self.options, self.capture = options, capture
+        super().__init__(np.full((len(capture), 4, 4), np.nan), options.keyframe_overlap, capture)
+        self.options = options
+        self.offline, self.metric = True, capture.options.scale is not None
         self.reconstruction: Reconstruction | None = None
-        self._dense: Any = None
 
-    def prepare(self, folder: Path, frames: range, progress: Progress) -> None:
+    def scan(self, folder: Path, frames: range, progress: Progress) -> Scan:
         found = self._reconstructed(folder, frames, progress)
         for text in found.warnings:
             progress.warn(text)
         self.reconstruction, self.T_world_cam = found, found.T_world_cam
-        if not self.capture.has_depth:
-            from .stereo import StereoDepth  # type: ignore[import-not-found]
-
-            self._dense = StereoDepth(folder)
-            self._dense.compute(self.capture, found, progress)
+        return found
 
     def _reconstructed(self, folder: Path, frames: range, progress: Progress) -> Reconstruction:
-        options = self.options
+        options, scale = self.options, self._capture.options.scale
         if options.model is not None:
-            return read_model(Path(options.model).expanduser(), self.capture).normalised()
-        recipe = Recipe(options.frames, options.order, options.features, options.mapping, options.intrinsics)
-        return reconstruct(self.capture, frames, folder, recipe, progress)
+            found = read_model(Path(options.model).expanduser(), self._capture).normalised()
+        else:
+            recipe = Recipe(options.frames, options.order, options.features, options.mapping, options.intrinsics)
+            found = reconstruct(self._capture, frames, folder, recipe, progress)
+        return found if scale is None else found.scaled(scale)
 
-    def completed(self, frame: Frame) -> Frame:
-        """Undistorted, with depth by stereo where the capture brings none."""
+    def as_pinhole(self, frame: Frame) -> Frame:
+        """Undistorted."""
         assert self.reconstruction is not None, "prepare comes first"
         lens = self.reconstruction.camera
-        frame = replace(frame, color=lens.undistorted(frame.color), intrinsics=lens.pinhole())
-        found = None if self._dense is None else self._dense.depth(frame.index)
-        return frame if found is None else replace(frame, depth_m=found[0])
+        return replace(frame, color=lens.undistorted(frame.color), intrinsics=lens.pinhole())
 
     def track(self, frame: Frame) -> Tracked:
         assert self.reconstruction is not None, "prepare comes first"

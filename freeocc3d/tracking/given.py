@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..capture.base import Capture
 from ..errors import TrackingError
 from ..geometry import invert, nearest_rigid
+from ..progress import Progress
 from ..types import Frame
 from .base import Tracked, Tracker
 from .overlap import DepthView, mutual_overlap, sample_points
 from .records import Records
+from .stereo import Scan, StereoDepth
+from .triangulation import triangulated
 
 _FARTHEST = 2000.0
 _LEAST_COVERED = 0.05  # share of the pixels with a depth, or a frame shows nothing
@@ -20,13 +26,35 @@ _LEAST_COVERED = 0.05  # share of the pixels with a depth, or a frame shows noth
 
 class GivenTracker(Tracker):
     """Takes (N, 4, 4) poses of a capture's frames as they are; a frame whose pose is NaN is lost, and one that shares
-    too little with its keyframe becomes a keyframe."""
+    too little with its keyframe becomes a keyframe. Where the capture has no depth, multi-view stereo measures it."""
 
-    def __init__(self, T_world_cam: NDArray[np.float64], keyframe_overlap: float):
+    def __init__(self, T_world_cam: NDArray[np.float64], keyframe_overlap: float, capture: Capture):
         super().__init__()
         self.T_world_cam = T_world_cam
         self.keyframe_overlap = keyframe_overlap
+        self.offline = not capture.has_depth
+        self._capture = capture
         self._keyframe: DepthView | None = None
+        self._depth: StereoDepth | None = None
+
+    def prepare(self, folder: Path, frames: range, progress: Progress) -> None:
+        scan = self.scan(folder, frames, progress)
+        if not self._capture.has_depth:
+            self._depth = StereoDepth(folder / "depth", self.stereo)
+            self._depth.compute(self._capture, scan, frames, progress, self.as_pinhole)
+
+    def scan(self, folder: Path, frames: range, progress: Progress) -> Scan:
+        """The poses with points that the frames see, for stereo."""
+        return triangulated(self._capture, self.T_world_cam, frames, progress)
+
+    def as_pinhole(self, frame: Frame) -> Frame:
+        """The frame as a pinhole camera would have taken it, should the tracker know the camera better."""
+        return frame
+
+    def completed(self, frame: Frame) -> Frame:
+        frame = self.as_pinhole(frame)
+        found = None if self._depth is None else self._depth.depth(frame.index)
+        return frame if found is None else replace(frame, depth_m=found[0])
 
     def track(self, frame: Frame) -> Tracked:
         given = self.T_world_cam[frame.index]

@@ -32,7 +32,8 @@ def load(options: Options, capture: Capture) -> KnownTracker:
     if all(pose is None for pose in stated):
         raise TrackingError(f"{capture.path} brings no poses: use tracking.backend=rgbd, which estimates them.")
     none = np.full((4, 4), np.nan)
-    tracker = KnownTracker(np.stack([none if pose is None else pose for pose in stated]), options.keyframe_overlap)
+    given = np.stack([none if pose is None else pose for pose in stated])
+    tracker = KnownTracker(given, options.keyframe_overlap, capture)
     tracker.metric = capture.metric_poses
     return tracker
 

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import read_arrays
+from ..capture.base import NOMINAL_DEPTH
 from ..types import Intrinsics
 from .lens import LensCamera
-
-NOMINAL_DEPTH_M = 2.0
-"""Median depth of a scene whose scale is unknown: that of a room, so that what is meant in metres stays sensible."""
 
 _EXPECTED = {
     "T_world_cam": ("f", 3), "camera": ("f", 1), "points": ("f", 2), "seen_frame": ("i", 1), "seen_point": ("i", 1),
@@ -62,8 +60,8 @@ class Reconstruction:
         return replace(self, T_world_cam=T_world_cam, points=self.points * np.float32(scale))
 
     def normalised(self) -> Reconstruction:
-        """With the median depth ``NOMINAL_DEPTH_M``, unless the scale is known."""
-        return self if self.metric else self.scaled(NOMINAL_DEPTH_M / float(np.median(self.depths())))
+        """With the median depth ``NOMINAL_DEPTH``, unless the scale is known."""
+        return self if self.metric else self.scaled(NOMINAL_DEPTH / float(np.median(self.depths())))
 
     def save(self, path: Path) -> None:
         """As an .npz file that is whole or not there."""

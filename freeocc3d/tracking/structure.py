@@ -55,7 +55,7 @@ class Recipe:
 def reconstruct(
     capture: Capture, frames: Sequence[int], folder: Path, recipe: Recipe, progress: Progress
 ) -> Reconstruction:
-    """Poses and points of the capture's frames, in a unit in which the median depth is ``sfm.NOMINAL_DEPTH_M``.
+    """Poses and points of the capture's frames, in a unit in which the median depth is ``NOMINAL_DEPTH``.
 
     folder: takes what lets an interrupted call go on. Raises TrackingError for a scan that gives none, ModelError.
     """

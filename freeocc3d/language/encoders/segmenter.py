@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from ...capture.base import Capture
 from ...errors import ConfigError, FrameError
+from ...onnx_model import load_session
 from ...registry import nearest
 from ...types import Frame
 from .. import vocabulary
 from ..class_names import read_mapping, read_names
 from ..name_embeddings import NameEmbeddings
-from ..onnx_model import load_session
 from .base import Encoder
 from .labels import LabelWords
 

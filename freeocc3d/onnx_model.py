@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from ..errors import ConfigError, ModelError
+from .errors import ConfigError, ModelError
 
 
 def load_session(path: Path, device: str = "cpu") -> Any:

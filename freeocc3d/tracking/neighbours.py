@@ -1,0 +1,73 @@
+"""Which views of a scan measure a view's depth best: those that see the same points from a few degrees beside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+_BEST_DEG, _NARROW_DEG, _WIDE_DEG = 8.0, 3.0, 8.0
+_LEAST_WEIGHT = 3.0  # as many points, seen under the best angle
+_MARGIN = 0.7, 1.6  # around the nearest and farthest points, for what lies between has no texture
+_OUTLIERS = 2.0  # per cent of the points at either end
+_LEAST_POINTS = 20
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """partners: per frame, indices of the views to compare it with, the best first; empty where it has none.
+    near, far: (N,) metres between which its pixels' depths lie."""
+
+    partners: list[NDArray[np.int64]]
+    near: NDArray[np.float64]
+    far: NDArray[np.float64]
+
+
+def neighbours(
+    T_world_cam: NDArray[np.float64],
+    points: NDArray[np.float32],
+    seen_frame: NDArray[np.int32],
+    seen_point: NDArray[np.int32],
+    count: int,
+) -> Chosen:
+    """Up to ``count`` partners of each frame.
+
+    T_world_cam: (N, 4, 4), NaN where unknown.  points: (P, 3) world.  seen_frame, seen_point: (O,) a point is seen in a
+    frame. A point that two frames share counts by the angle between its rays and by how alike its distances are.
+    Source: J. Schönberger et al., Pixelwise View Selection for Unstructured Multi-View Stereo, ECCV 2016.
+    """
+    frames = len(T_world_cam)
+    order = np.argsort(seen_point, kind="stable")
+    by_point = seen_frame[order]
+    starts = np.searchsorted(seen_point[order], np.arange(len(points) + 1))
+    centres, forward = T_world_cam[:, :3, 3], T_world_cam[:, :3, 2]
+    depths = np.einsum("oc,oc->o", points[seen_point] - centres[seen_frame], forward[seen_frame])
+    depths = np.where(np.isfinite(depths) & (depths > 0), depths, np.nan)
+    overall = (
+        np.nanpercentile(depths, (_OUTLIERS, 100 - _OUTLIERS)) if np.isfinite(depths).any() else np.full(2, np.nan)
+    )
+    near, far = np.full(frames, overall[0]), np.full(frames, overall[1])
+    partners = []
+    by_frame = np.argsort(seen_frame, kind="stable")
+    bounds = np.searchsorted(seen_frame[by_frame], np.arange(frames + 1))
+    for frame in range(frames):
+        rows = by_frame[bounds[frame] : bounds[frame + 1]]
+        rows = rows[np.isfinite(depths[rows])]
+        if len(rows) >= _LEAST_POINTS:
+            near[frame], far[frame] = np.percentile(depths[rows], (_OUTLIERS, 100 - _OUTLIERS))
+        seen = seen_point[rows]
+        lengths = starts[seen + 1] - starts[seen]
+        point = np.repeat(seen, lengths)
+        first = np.repeat(starts[seen], lengths)
+        other = by_point[first + np.arange(len(point)) - np.repeat(np.cumsum(lengths) - lengths, lengths)]
+        to_here, to_other = points[point] - centres[frame], points[point] - centres[other]
+        here, there = np.linalg.norm(to_here, axis=1), np.linalg.norm(to_other, axis=1)
+        angle = np.degrees(np.arccos(np.clip(np.einsum("pc,pc->p", to_here, to_other) / (here * there), -1.0, 1.0)))
+        width = np.where(angle < _BEST_DEG, _NARROW_DEG, _WIDE_DEG)
+        weight = np.exp(-0.5 * ((angle - _BEST_DEG) / width) ** 2) * np.minimum(here / there, there / here)
+        weight = np.where((other != frame) & np.isfinite(weight), weight, 0.0)
+        score = np.bincount(other, weight, frames)
+        ranked = np.argsort(-score, kind="stable")[:count]
+        partners.append(ranked[score[ranked] >= _LEAST_WEIGHT])
+    return Chosen(partners, near * _MARGIN[0], far * _MARGIN[1])

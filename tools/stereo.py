@@ -1,0 +1,111 @@
+"""Multi-view stereo on a capture's colour at its true poses, against its depth."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from freeocc3d.capture import open_capture, used_frames
+from freeocc3d.capture.base import Capture, Options
+from freeocc3d.capture.registration import Grid
+from freeocc3d.progress import Progress
+from freeocc3d.tracking import calibration, known, stereo
+from freeocc3d.tracking.triangulation import triangulated
+from freeocc3d.types import Frame
+
+Figures = dict[str, Any]
+
+ASKED = "<= 1.5 % (rendered), <= 3 % (kitchen), >= 40 % kept"
+_CLOSE = 0.01  # metres from frame to frame: below it every fifth frame is used, above it every third
+_AROUND = 10  # frames on either side of these that stereo is given
+
+
+def measure_stereo(capture: str, frames: int | None = None) -> Figures:
+    """Median relative error, share of the pixels with a true depth that are kept, and seconds a frame.
+
+    frames: how many are compared, spread over the scan; None = all.
+    """
+    opened = open_capture(capture)
+    stride = 5 if _spacing(opened) < _CLOSE else 3
+    opened = open_capture(capture, Options(stride=stride))
+    used = list(used_frames(opened))
+    ratio = calibration.color_focal(opened, used_frames(opened))
+
+    def colour(frame: Frame) -> Frame:
+        camera = frame.intrinsics
+        return replace(frame, intrinsics=replace(camera, fx=camera.fx * ratio, fy=camera.fy * ratio))
+
+    compared = used if frames is None else used[:: max(1, len(used) // frames)][:frames]
+    T_world_cam = known.load(known.Options(), opened).T_world_cam
+    with tempfile.TemporaryDirectory() as folder:
+        depth = stereo.StereoDepth(Path(folder), stereo.Options())
+        started, cpu = time.perf_counter(), time.process_time()
+        scan = triangulated(opened, T_world_cam, used, Progress(), colour)
+        depth.compute(opened, scan, _with_others(compared, used), Progress(), colour)
+        done = len(_with_others(compared, used))
+        seconds, cpu = (time.perf_counter() - started) / done, (time.process_time() - cpu) / done
+        errors, in_sigmas, true = [], [], 0
+        for index in compared:
+            frame = opened[index]
+            truth = (
+                Grid(frame.intrinsics, colour(frame).intrinsics).depth(frame.depth_m) if ratio != 1 else frame.depth_m
+            )
+            true += np.count_nonzero(truth)
+            found = depth.depth(index)
+            if found is not None:
+                both = (truth > 0) & (found[0] > 0)
+                off = np.abs(found[0] - truth)[both]
+                errors.append(off / truth[both])
+                in_sigmas.append(off / found[1][both])
+    return {**_figures(errors, in_sigmas, true), "frames": done, "compared": len(compared),
+            "seconds_per_frame": seconds, "processor_seconds_per_frame": cpu}  # fmt: skip
+
+
+def _figures(errors: list[NDArray[Any]], in_sigmas: list[NDArray[Any]], true: int) -> Figures:
+    relative, sigmas = np.concatenate([np.zeros(0), *errors]), np.concatenate([np.zeros(0), *in_sigmas])
+    return {
+        "median_relative_error": float(np.median(relative)) if len(relative) else None,
+        "kept": len(relative) / max(true, 1),
+        "within_5_percent": float((relative < 0.05).mean()) if len(relative) else None,
+        "errors_within_a_sigma": float((sigmas < 1.0).mean()) if len(sigmas) else None,
+    }
+
+
+def _with_others(compared: Sequence[int], used: Sequence[int]) -> list[int]:
+    """The compared frames and those around them, which have to confirm their depth."""
+    rows = {row for index in compared for row in range(used.index(index) - _AROUND, used.index(index) + _AROUND + 1)}
+    return [used[row] for row in sorted(rows) if 0 <= row < len(used)]
+
+
+def _spacing(capture: Capture) -> float:
+    """Median way between one frame and the next, metres."""
+    poses = [capture.pose(index) for index in range(min(len(capture), 200))]
+    places = np.array([pose[:3, 3] for pose in poses if pose is not None])
+    return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+
+
+def stereo_lines(rows: list[Figures]) -> list[str]:
+    """Table of ``measure_stereo`` of several captures, each with its name as "capture"."""
+    if not rows:
+        return []
+    lines = [
+        f"\nDepth from colour alone at true poses (asked: {ASKED})\n",
+        "| capture | median relative error % | kept % | within 5 % | errors within a sigma % | s/frame | CPU s/frame |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        if "error" in row:
+            lines.append(f"| {row['capture']} | not available: {row['error']} | | | | | |")
+            continue
+        shares = ("median_relative_error", "kept", "within_5_percent", "errors_within_a_sigma")
+        cells = ["-" if row[name] is None else f"{100 * row[name]:.1f}" for name in shares]
+        cells += [f"{row[name]:.2f}" for name in ("seconds_per_frame", "processor_seconds_per_frame")]
+        lines.append(f"| {' | '.join((row['capture'], *cells))} |")
+    return lines
