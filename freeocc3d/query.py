@@ -9,7 +9,6 @@ match, too. Matching voxels that touch form a region.
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from .errors import ConfigError, FreeOccError, MapError
 from .language import matching
 from .language.codec import Features, cosines, known
 from .occupancy.connected import connected
+from .regions import Region, best_regions
 from .registry import require_positive
 from .types import Occupancy
 
@@ -35,9 +35,6 @@ _SCORES = ("cosine", "softmax", "relevancy")
 _EVEN = 0.5  # a probability
 _ROWS = 16384  # voxels worked on at once, so that float32 copies of all features never exist
 _MANY_ROWS = 1 << 18  # by compiled code, whose threads are worth starting for many only
-_DOUBT_M3 = 0.001
-"""Volume of non-matching matter that is added to each region when it is scored: a speck of a voxel or two does not
-outrank a large object, and the size of the voxels has no part in it."""
 
 
 @dataclass(frozen=True)
@@ -64,32 +61,6 @@ class Options:
             raise ConfigError(f"'grow' must be greater than 0 and at most 1, got {self.grow:g}.")
         if self.scores not in _SCORES:
             raise ConfigError(f"'scores' must be one of {', '.join(_SCORES)}, got '{self.scores}'.")
-
-
-@dataclass(frozen=True)
-class Region:
-    """A connected set of matching voxels.
-
-    score: 0…1, by which regions are ranked: the mean score of its voxels times V / (V + 1 litre), V being its volume,
-    as if a litre that does not match belonged to it.  confidence: 0…1, mean softmax probability of the word against
-    the contrast words, at the encoder's temperature.  centroid: (3,) mean of the voxels' centres, map frame, metres.
-    box_min, box_max: (3,) corners of the axis-aligned box around the voxels, faces included, metres.  rows: (n,) rows
-    of ``Occupancy.occupied_voxels()``.  label: the word that it was found by.
-    """
-
-    score: float
-    confidence: float
-    centroid: NDArray[np.float64]
-    box_min: NDArray[np.float64]
-    box_max: NDArray[np.float64]
-    volume_m3: float
-    rows: NDArray[np.int64]
-    label: str = ""
-
-    @property
-    def voxels(self) -> int:
-        """Number of voxels."""
-        return len(self.rows)
 
 
 @dataclass(frozen=True)
@@ -177,9 +148,13 @@ def query(
             meant = cosines(features[rows], text.features[w : w + 1])[:, 0]
             allowed = meant >= cosines(features[rows], excluded.features).max(axis=1)
             rows, confidence = rows[allowed], confidence[allowed]
-        kept = matching.grown(scores[rows] >= threshold, functools.partial(connected, voxels[rows], edges[rows]))
-        rows, confidence = rows[kept], confidence[kept]
-        regions = _regions(occupancy, voxels, edges, rows, scores[rows], confidence, options, word)
+        seeds = scores[rows] >= threshold
+        component = connected(voxels[rows], edges[rows]) if seeds.any() else np.zeros(len(rows), np.int32)
+        kept = matching.grown(seeds, component)
+        rows, component, confidence = rows[kept], component[kept], confidence[kept]
+        regions = best_regions(
+            occupancy, rows, component, scores[rows], confidence, options.min_voxels, options.top_k, word
+        )
         note = _note(word, part, text_encoder, scores, threshold, bool(regions))
         results.append(QueryResult(word, part, note, regions, np.ascontiguousarray(scores)))
     return results
@@ -265,59 +240,6 @@ def _probability(
     largest, odds = _beside(features, scores, others, text_encoder.temperature)
     made = matching.softmax(odds) if way == "softmax" else matching.relevancy(largest, text_encoder.temperature)
     return np.where(known(features), made, np.float32(0))
-
-
-def _regions(
-    occupancy: Occupancy,
-    voxels: NDArray[np.int32],
-    edges: NDArray[np.int32],
-    rows: NDArray[np.int64],
-    scores: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    options: Options,
-    label: str,
-) -> list[Region]:
-    """The best regions among matching voxels, given by their rows with their scores and confidences."""
-    if len(rows) == 0:
-        return []
-    component = connected(voxels[rows], edges[rows])
-    size = np.bincount(component)
-    own_volume = (edges[rows] * occupancy.finest) ** 3
-    volume = np.bincount(component, own_volume)
-    score = np.bincount(component, scores * own_volume) / (volume + _DOUBT_M3)
-    large = np.flatnonzero(size >= options.min_voxels)
-    chosen = large if len(large) else np.arange(len(size))
-    chosen = chosen[np.argsort(-score[chosen], kind="stable")][: options.top_k]
-    order, end = np.argsort(component, kind="stable"), np.cumsum(size)
-    members = [order[end[c] - size[c] : end[c]] for c in chosen]
-    return [
-        _region(occupancy, voxels, edges, rows[own], score[c], confidence[own], label)
-        for c, own in zip(chosen, members, strict=True)
-    ]
-
-
-def _region(
-    occupancy: Occupancy,
-    voxels: NDArray[np.int32],
-    edges: NDArray[np.int32],
-    rows: NDArray[np.int64],
-    score: float,
-    confidence: NDArray[np.float32],
-    label: str,
-) -> Region:
-    own, edge = voxels[rows], edges[rows]
-    size = occupancy.finest
-    volume = (edge * size) ** 3
-    return Region(
-        score=float(score),
-        confidence=float(np.average(confidence, weights=volume)),
-        centroid=np.average(occupancy.centers(own, edge), axis=0, weights=volume),
-        box_min=occupancy.origin + own.min(axis=0) * size,
-        box_max=occupancy.origin + (own + edge[:, None]).max(axis=0) * size,
-        volume_m3=float(volume.sum()),
-        rows=rows,
-        label=label,
-    )
 
 
 def _note(

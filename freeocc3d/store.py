@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from .keyframes import Keyframes
     from .language.encoders.base import TextEncoder
     from .places import OrientedBox
-    from .query import QueryResult, Region
+    from .query import QueryResult
     from .region_views import View
+    from .regions import Region
     from .relations import Where
 
 FORMAT_VERSION = 3

@@ -17,7 +17,8 @@ from freeocc3d import query as asking
 from freeocc3d.errors import ConfigError, FreeOccError, MapError
 from freeocc3d.language.encoders.base import TextEncoder, TextFeatures
 from freeocc3d.language.encoders.labels import LabelWords
-from freeocc3d.query import Options, connected, query, similarity, to_json, to_text
+from freeocc3d.occupancy.connected import connected
+from freeocc3d.query import Options, query, similarity, to_json, to_text
 from freeocc3d.types import BLOCK, FREE, OCCUPIED, Occupancy
 
 SIZE = 0.1
@@ -377,3 +378,11 @@ def test_what_a_model_named_in_the_scene_competes_where_any_word_has_a_meaning()
     closed = LabelWords(CLASSES)
     for named in ((), ["wall"]):
         assert query(room, closed, ["wall"], None, named)[0].matched
+
+
+def test_occupied_voxels_are_kept_and_cannot_be_changed() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(CUP=1)))
+    assert room.occupied_voxels() is room.occupied_voxels()
+    with pytest.raises(ValueError, match="read-only"):
+        room.occupied_voxels()[0] = 5
+    assert len(room.replace(state=np.zeros_like(room.state)).occupied_voxels()) == 0

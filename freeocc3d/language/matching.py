@@ -11,7 +11,6 @@ Source of the relevancy: J. Kerr et al., LERF: Language Embedded Radiance Fields
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,11 +75,7 @@ def relevancy(largest: NDArray[np.float32], temperature: float) -> NDArray[np.fl
     return np.asarray(1 / (1 + np.exp(np.minimum(largest / np.float32(temperature), 80))), np.float32)
 
 
-def grown(seeds: NDArray[np.bool_], connected: Callable[[], NDArray[np.int32]]) -> NDArray[np.bool_]:
-    """(V,) which voxels hang together with a seed, given what gives the component of each: regions begin where a word
-    fits well, and end where it fits no more (hysteresis; J. Canny, A Computational Approach to Edge Detection, PAMI
-    1986)."""
-    if seeds.all() or not seeds.any():
-        return seeds
-    component = connected()
+def grown(seeds: NDArray[np.bool_], component: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(V,) which voxels hang together with a seed, given the component of each: regions begin where a word fits well,
+    and end where it fits no more (hysteresis; J. Canny, A Computational Approach to Edge Detection, PAMI 1986)."""
     return np.asarray(np.bincount(component, seeds)[component] > 0)

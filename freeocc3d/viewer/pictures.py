@@ -13,7 +13,8 @@ from ..errors import ExportError
 from ..files import write_whole
 from ..occupancy.faces import exposed_faces
 from ..palette import HIGHLIGHTS, class_colors, height_colors, highlighted
-from ..query import QueryResult, Region
+from ..query import QueryResult
+from ..regions import Region
 from ..store import Map
 from ..types import Occupancy
 from .scene import BACKGROUND, CUT, VIEWS, Scene, cut_height, render, shaded, upright
