@@ -33,6 +33,7 @@ import encoders
 import held_out
 import kernels
 import language
+import present_words
 import rendering
 import variants
 import voxels
@@ -70,7 +71,10 @@ LAYER_1 = {
     "lengths": "layer 1 on the first 250, 500 and 1000 frames: seconds, and bytes of a keyframe",
 }
 
-WORDS = {"absent_words": "names of things that are not there: how often a region is returned all the same"}
+WORDS = {
+    "absent_words": "names of things that are not there: how often a region is returned all the same",
+    "present_words": "names of the classes that are there: how much of each is found, and how soon",
+}
 
 SUITES = {
     "quick": (("house/bedroom",), (OURS, "rgbd_true_poses", "rgbd_true_poses_closed_set", *PEERS, *KERNELS, "lengths")),
@@ -323,7 +327,8 @@ INSIDE = {
     "voxels": lambda: voxels.measure_voxels(),
     "rasterizer": lambda: rendering.measure_rasterizer(),
     "encoders": lambda: encoders.measure_encoders(),
-    "words": lambda capture: absent_words.measure_words(capture),
+    "absent_words": lambda capture: absent_words.measure_words(capture),
+    "present_words": lambda capture: present_words.measure_present(capture),
     "query": lambda map_path: kernels.measure_query(Path(map_path)),
     "lifting": lambda: language.measure_lifting(),
     "fusion": lambda map_path: language.measure_fusion(Path(map_path)),
@@ -400,17 +405,17 @@ def run(captures: list[Path], names: list[str], frames: int | None, folder: Path
             asked_map = job.folder / OURS
     measured = {name: _tried(name, lambda name=name: kernel(name, asked_map)) for name in KERNELS if name in names}
     layer_1 = measure_layer_1([capture.resolve() for capture in captures], names)
-    asked = [_absent_words(capture.resolve()) for capture in captures if "absent_words" in names]
+    asked = {name: [_words(name, capture.resolve()) for capture in captures] for name in WORDS if name in names}
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
     return {
         "machine": machine, "frames": frames, "rows": rows, "kernels": measured, "layer_1": layer_1, "layer_3": layer_3,
-        "words": asked,
+        "words": asked.get("absent_words", []), "present_words": asked.get("present_words", []),
     }  # fmt: skip
 
 
-def _absent_words(capture: Path) -> Figures:
+def _words(part: str, capture: Path) -> Figures:
     name = Job(capture, None, capture).name
-    return {"capture": name, **_tried(f"{name}: absent words", lambda: _inside("words", capture=str(capture)))}
+    return {"capture": name, **_tried(f"{name}: {part}", lambda: _inside(part, capture=str(capture)))}
 
 
 def measure_layer_1(captures: list[Path], names: list[str]) -> Figures:
@@ -514,7 +519,8 @@ def markdown(results: Figures) -> str:
         [
             *lines,
             *_layer_1_lines(results.get("layer_1") or {}),
-            *_word_lines(results.get("words") or []),
+            *_word_lines(absent_words.words_lines(results.get("words") or [])),
+            *_word_lines(present_words.present_lines(results.get("present_words") or [])),
             *language.fusion_lines(results.get("layer_3") or {}),
             *_pose_lines(results["rows"]),
             *_fit_lines(results["rows"]),
@@ -532,12 +538,10 @@ def _layer_1_lines(figures: Figures) -> list[str]:
     return lines
 
 
-def _word_lines(rows: list[Figures]) -> list[str]:
-    """A table of "absent_words"."""
-    table = absent_words.words_lines(rows)
-    return ["", "| what | measured | asked |", "|---|---|---|", *(f"| {' | '.join(line)} |" for line in table)] * bool(
-        rows
-    )
+def _word_lines(table: list[tuple[str, str, str]]) -> list[str]:
+    """A table of "absent_words" or "present_words"."""
+    titles = ["", "| what | measured | asked |", "|---|---|---|"]
+    return [*titles, *(f"| {' | '.join(line)} |" for line in table)] if table else []
 
 
 def _pose_lines(rows: list[Figures]) -> list[str]:
