@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from . import __version__
 from .errors import ConfigError, FreeOccError, MapError
+from .instances import told_apart
 from .language import matching
 from .language.codec import Features, cosines, known
 from .occupancy.connected import connected
@@ -52,11 +53,16 @@ class Options:
     """At most so many regions a word."""
     min_voxels: int = 2
     """Smaller regions are left out, unless all are smaller."""
+    narrow: float = 0.5
+    """Things that touch are told apart where their region, seen from above, narrows to less than this share of the
+    narrower one, and to four voxels or less; 0 = regions stay whole."""
 
     def __post_init__(self) -> None:
         require_positive(self, "top_k", "min_voxels")
         if self.threshold is not None and not -1 <= self.threshold <= 1:
             raise ConfigError(f"'threshold' must lie between 0 and 1, got {self.threshold:g}.")
+        if not 0 <= self.narrow <= 1:
+            raise ConfigError(f"'narrow' must lie between 0 and 1, got {self.narrow:g}.")
         if not 0 < self.grow <= 1:
             raise ConfigError(f"'grow' must be greater than 0 and at most 1, got {self.grow:g}.")
         if self.scores not in _SCORES:
@@ -91,12 +97,13 @@ def query(
     options: Options | None = None,
     contrast: Sequence[str] = (),
     negative: Sequence[str] = (),
+    up: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 1.0),
 ) -> list[QueryResult]:
     """Ask for several words; one that nothing matches gives no regions.
 
     contrast: words for what else is there, besides those that the encoder names itself.  negative: words for what is
     not meant: a voxel whose plain cosine with one of them is higher than with the word does not match, though the word
-    should include it, as "table" includes a coffee table.
+    should include it, as "table" includes a coffee table.  up: (3,) unit vector, map frame.
     Raises FreeOccError for an empty, endless or excluded word or a negative one without a meaning, MapError if the
     map's features are not the encoder's.
     """
@@ -152,6 +159,7 @@ def query(
         component = connected(voxels[rows], edges[rows]) if seeds.any() else np.zeros(len(rows), np.int32)
         kept = matching.grown(seeds, component)
         rows, component, confidence = rows[kept], component[kept], confidence[kept]
+        component = told_apart(occupancy, rows, component, scores[rows], np.asarray(up), options.narrow)
         regions = best_regions(
             occupancy, rows, component, scores[rows], confidence, options.min_voxels, options.top_k, word
         )

@@ -207,7 +207,7 @@ class Map:
 
         checked = registry.build_options(query, options)
         named = self.scene_words if self.text_encoder.open_vocabulary else []
-        ask = functools.partial(query.query, self.occupancy, self.text_encoder)
+        ask = functools.partial(query.query, self.occupancy, self.text_encoder, up=self.up)
         if where is None:
             return ask(words, checked, [*named, *contrast], negative)
         every = replace(checked, top_k=max(len(self.occupancy.colors), 1))

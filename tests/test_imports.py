@@ -18,7 +18,7 @@ FLOORS = (
     ("gaussians",),
     ("language",),
     ("occupancy",),
-    ("regions",),
+    ("instances", "regions"),
     ("query",),
     ("places", "region_views", "relations", "standing"),
     ("store", "palette"),
@@ -37,7 +37,7 @@ LAYERS = ("capture", "tracking", "gaussians", "language", "occupancy")
 HEAVY = {"open3d", "torch", "pyvista", "vtk", "numba", "pycolmap", "scipy", "cv2", "onnxruntime"}
 """Packages whose import takes a good part of a second."""
 
-FAST = ("store", "query", "regions", "places", "relations", "cli", "registry", "config", "__init__")
+FAST = ("store", "query", "regions", "instances", "places", "relations", "cli", "registry", "config", "__init__")
 """Modules that have to be imported in no time, for a query starts with them."""
 
 
