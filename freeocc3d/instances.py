@@ -64,23 +64,25 @@ def _footprint(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """(n, 2) cell of each voxel seen from above, and (X, Y) best score in each cell, 0 outside. A cell is as large as
     the largest of the voxels."""
-    edges = occupancy.occupied_edges()[rows]
-    centers = occupancy.centers(occupancy.occupied_voxels()[rows], edges)
-    cell_m = float(edges.max() * occupancy.finest)
+    order = np.argsort(scores, kind="stable")  # of what falls into one cell the last is kept
+    edges = occupancy.occupied_edges()[rows[order]]
     first = np.eye(3)[np.argmin(np.abs(up))]  # the axis of the lattice that is most nearly level
     first = first - (first @ up) * up
     first /= np.linalg.norm(first)
-    level = np.stack((first, np.cross(up, first)), axis=1)
-    spread = (centers[:, None] + _QUARTERS * (edges * occupancy.finest)[:, None, None]) @ level
-    # a level lattice's centres come to lie in the cells' middles
-    origin = centers[0] @ level - 0.5 * cell_m
-    cells = np.floor((spread - origin) / cell_m + 1e-6).astype(np.int64)
-    corner = cells.reshape(-1, 2).min(axis=0)
-    footprint = np.zeros(cells.reshape(-1, 2).max(axis=0) - corner + 1, np.float32)
-    at = cells - corner
-    np.maximum.at(footprint, (at[..., 0].ravel(), at[..., 1].ravel()), np.repeat(scores, 8))
-    middle = np.floor((centers @ level - origin) / cell_m + 1e-6).astype(np.int64) - corner
-    return middle, footprint
+    level = np.stack((first, np.cross(up, first)), axis=1) / edges.max()
+    middle = (occupancy.occupied_voxels()[rows[order]] + 0.5 * edges[:, None]) @ level
+    middle += 0.5 - middle[0] + 1e-6  # a level lattice's centres come to lie in the cells' middles
+    offsets = np.unique((_QUARTERS @ level).round(9), axis=0)  # half of them where the lattice is level
+    low = np.floor(middle.min(axis=0) - 1)
+    shape = (np.floor(middle.max(axis=0) + 1) - low + 1).astype(np.int64)
+    footprint = np.zeros(shape, np.float32)
+    for offset in offsets:
+        at = np.floor(middle + edges[:, None] * offset - low).astype(np.int64)
+        here = footprint[at[:, 0], at[:, 1]]
+        footprint[at[:, 0], at[:, 1]] = np.maximum(here, scores[order])
+    cells = np.empty((len(rows), 2), np.int64)
+    cells[order] = np.floor(middle - low)
+    return cells, footprint
 
 
 def parts_of(footprint: NDArray[np.float32], narrow: float) -> NDArray[np.int32] | None:
@@ -95,26 +97,30 @@ def parts_of(footprint: NDArray[np.float32], narrow: float) -> NDArray[np.int32]
     from scipy import ndimage
 
     lowest = min(narrow * highest, _NECK)
-    levels = highest * _STEP ** -np.arange(np.ceil(np.log(highest / lowest) / np.log(_STEP)) + 1)
-    peaks: list[tuple[int, ...]] = []  # a thing's highest cell
-    owner = np.full(height.shape, -1, np.int32)
-    for level in np.append(levels[levels > lowest], lowest):
-        basin, count = ndimage.label(height >= level, _TOUCHING)
+    levels = highest * _STEP ** -np.arange(np.ceil(np.log(highest / lowest) / np.log(_STEP)))
+    ascending = np.argsort(height, axis=None)
+    peaks = np.zeros(0, np.int64)  # flat index of the highest cell of each thing, highest first
+    owner = np.full(height.size, -1)  # the thing around whose peak a cell lies, by its peak
+    for level in np.append(levels, lowest):
+        basin = ndimage.label(height >= level, _TOUCHING)[0].ravel()
         if level >= _WIDE:
-            new = np.setdiff1d(np.arange(1, count + 1), [basin[peak] for peak in peaks])
-            peaks += [tuple(map(int, at)) for at in ndimage.maximum_position(height, basin, new)]
-        alive = _persistent(peaks, [int(basin[peak]) for peak in peaks], height, level, narrow)
-        owner[~np.isin(owner, alive)] = -1
-        own_basin = np.array([basin[peaks[k]] for k in alive])
-        alone = np.bincount(own_basin, minlength=count + 1) == 1
-        for k, own in zip(alive, own_basin, strict=True):
-            if alone[own]:
-                owner[(basin == own) & (owner < 0)] = k
-        peaks, owner = [peaks[k] for k in alive], _renumbered(owner, alive)
+            top = np.zeros(basin.max() + 1, np.int64)
+            above = ascending[np.searchsorted(height.flat[ascending], level) :]
+            top[basin[above]] = above  # of each basin the last is kept, which is its highest cell
+            peaks = np.append(peaks, np.setdiff1d(top[1:], top[basin[peaks]]))
+        peaks = _persistent(peaks, basin, height.ravel(), level, narrow)
+        gone = (owner >= 0) & ~np.isin(owner, peaks)
+        owner[gone] = -1
+        thing = np.full(basin.max() + 1, -1)
+        thing[basin[peaks]] = np.where(np.bincount(basin[peaks])[basin[peaks]] == 1, peaks, -1)
+        owner = np.where(owner < 0, thing[basin], owner)
     if len(peaks) < 2:
         return None
-    nearest: Any = ndimage.distance_transform_edt(owner < 0, return_distances=False, return_indices=True)
-    return np.asarray(owner[tuple(nearest)])
+    number = np.searchsorted(np.sort(peaks), owner).reshape(height.shape)
+    nearest: Any = ndimage.distance_transform_edt(
+        owner.reshape(height.shape) < 0, return_distances=False, return_indices=True
+    )
+    return np.asarray(number[tuple(nearest)], np.int32)
 
 
 def _height(footprint: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -126,24 +132,17 @@ def _height(footprint: NDArray[np.float32]) -> NDArray[np.float64]:
     small = np.bincount(hole.ravel()) <= _SMALL_HOLE * np.count_nonzero(seen)
     small[0] = False  # what is no hole
     solid = seen | small[hole]
-    fits = np.where(footprint > 0, footprint / footprint.max(), 1.0)
+    fits = np.where(seen, footprint / footprint.max(), 1.0)
     to_rim = ndimage.distance_transform_edt(np.pad(solid, 1))[1:-1, 1:-1]
     return np.asarray(np.where(solid, (to_rim - 0.5) * fits, 0.0))
 
 
 def _persistent(
-    peaks: list[tuple[int, ...]], basins: list[int], height: NDArray[np.float64], level: float, narrow: float
-) -> list[int]:
-    """Which peaks are still things of their own at a level: the highest of their basin, or high above it."""
-    kept: list[int] = []
-    for k in sorted(range(len(peaks)), key=lambda k: -height[peaks[k]]):
-        joined = basins[k] in [basins[other] for other in kept]
-        if not joined or level <= min(narrow * height[peaks[k]], _NECK):
-            kept.append(k)
-    return kept
-
-
-def _renumbered(owner: NDArray[np.int32], alive: list[int]) -> NDArray[np.int32]:
-    number = np.full(max(alive, default=-1) + 2, -1, np.int32)
-    number[alive] = np.arange(len(alive))
-    return number[owner]  # -1 takes the last, which is -1
+    peaks: NDArray[np.int64], basin: NDArray[np.int32], height: NDArray[np.float64], level: float, narrow: float
+) -> NDArray[np.int64]:
+    """The peaks that are still things of their own at a level: the highest of their basin, or high above it."""
+    peaks = peaks[np.argsort(-height[peaks], kind="stable")]
+    first = np.unique(basin[peaks], return_index=True)[1]
+    kept = level <= np.minimum(narrow * height[peaks], _NECK)
+    kept[first] = True
+    return peaks[kept]
