@@ -131,7 +131,6 @@ def query(
     competes: NDArray[np.bool_] = np.asarray((text.features @ others.features.T < text_encoder.same_word) & expressed)
     cosine = similarity(features, text)
     says = known(features)
-    voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
     plain = options.scores == "cosine"
     default = text_encoder.threshold if plain else _EVEN
     threshold = default if options.threshold is None else options.threshold
@@ -155,17 +154,32 @@ def query(
             meant = cosines(features[rows], text.features[w : w + 1])[:, 0]
             allowed = meant >= cosines(features[rows], excluded.features).max(axis=1)
             rows, confidence = rows[allowed], confidence[allowed]
-        seeds = scores[rows] >= threshold
-        component = connected(voxels[rows], edges[rows]) if seeds.any() else np.zeros(len(rows), np.int32)
-        kept = matching.grown(seeds, component)
-        rows, component, confidence = rows[kept], component[kept], confidence[kept]
-        component = told_apart(occupancy, rows, component, scores[rows], np.asarray(up), options.narrow)
-        regions = best_regions(
-            occupancy, rows, component, scores[rows], confidence, options.min_voxels, options.top_k, word
-        )
+        regions = found_regions(occupancy, rows, scores[rows], confidence, threshold, options, up, word)
         note = _note(word, part, text_encoder, scores, threshold, bool(regions))
         results.append(QueryResult(word, part, note, regions, np.ascontiguousarray(scores)))
     return results
+
+
+def found_regions(
+    occupancy: Occupancy,
+    rows: NDArray[np.int64],
+    scores: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    threshold: float,
+    options: Options,
+    up: Sequence[float] | NDArray[np.float64],
+    label: str,
+) -> list[Region]:
+    """The regions of candidates, (n,) rows of occupied voxels with (n,) scores and confidences: what hangs together
+    with a voxel that reaches the threshold, things that touch apart."""
+    seeds = scores >= threshold
+    if not seeds.any():
+        return []
+    component = connected(occupancy.occupied_voxels()[rows], occupancy.occupied_edges()[rows])
+    kept = matching.grown(seeds, component)
+    rows, scores, confidence, component = rows[kept], scores[kept], confidence[kept], component[kept]
+    component = told_apart(occupancy, rows, component, scores, np.asarray(up), options.narrow)
+    return best_regions(occupancy, rows, component, scores, confidence, options.min_voxels, options.top_k, label)
 
 
 def similarity(features: Features, text: TextFeatures) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from .keyframes import Keyframes
     from .language.encoders.base import TextEncoder
     from .places import OrientedBox
-    from .query import QueryResult
+    from .query import Options, QueryResult
     from .region_views import View
     from .regions import Region
     from .relations import Where
@@ -203,17 +203,56 @@ class Map:
     ) -> list[QueryResult]:
         """``query`` for several words. contrast: words for what else is there, besides the encoder's own.  negative:
         words for what is not meant.  where: conditions on the regions' places; see ``relations.Where``."""
+        return self._placed(lambda asked: self._words(words, asked, contrast, negative), where, options)
+
+    def query_classes(self, names: list[str], where: Where | None = None, **options: Any) -> list[QueryResult]:
+        """The voxels whose nearest name of ``vocabulary`` is each of these; see ``classes``. Of the options ``top_k``
+        and ``narrow`` count."""
+        from .classes import query_classes
+
+        ask = functools.partial(query_classes, self.occupancy, self.text_encoder, self.vocabulary, names, up=self.up)
+        return self._placed(ask, where, options)
+
+    def query_image(
+        self,
+        image: str | Path | NDArray[np.uint8],
+        box: tuple[int, int, int, int] | None = None,
+        where: Where | None = None,
+        **options: Any,
+    ) -> QueryResult:
+        """Where it looks as in a picture, a file or (H, W, 3) RGB, or in a box x0 y0 x1 y1 of its pixels; see
+        ``patches``."""
+        from . import patches
+
+        encoder = patches.image_encoder(self.manifest["encoder"]["name"], self.path / CONFIG)
+        feature = patches.patch_feature(encoder, image, box)
+        name = "the picture" if isinstance(image, np.ndarray) else Path(image).name
+        found = self._placed(
+            lambda asked: [patches.query_feature(self.occupancy, feature, name, asked, self.up)], where, options
+        )
+        return found[0]
+
+    def _words(
+        self, words: list[str], options: Options, contrast: Sequence[str] = (), negative: Sequence[str] = ()
+    ) -> list[QueryResult]:
+        from . import query
+
+        named = self.scene_words if self.text_encoder.open_vocabulary else []
+        others = [*named, *contrast]
+        return query.query(self.occupancy, self.text_encoder, words, options, others, negative, self.up)
+
+    def _placed(
+        self, ask: Callable[[Options], list[QueryResult]], where: Where | None, options: dict[str, Any]
+    ) -> list[QueryResult]:
+        """What a question finds, in the places that are asked for."""
         from . import query, relations
 
-        checked = registry.build_options(query, options)
-        named = self.scene_words if self.text_encoder.open_vocabulary else []
-        ask = functools.partial(query.query, self.occupancy, self.text_encoder, up=self.up)
+        checked: Options = registry.build_options(query, options)
         if where is None:
-            return ask(words, checked, [*named, *contrast], negative)
+            return ask(checked)
         every = replace(checked, top_k=max(len(self.occupancy.colors), 1))
-        found = ask(words, every, [*named, *contrast], negative)
-        references = ask(where.words, every, named) if where.words else []
-        return relations.only_where(self.occupancy, self.up, found, references, where, checked.top_k)
+        references = self._words(where.words, every) if where.words else []
+        return relations.only_where(self.occupancy, self.up, ask(every), references, where, checked.top_k)
 
     def box_of(self, region: Region) -> OrientedBox:
         """The upright box of least level area around a region, turned as the region is."""
