@@ -179,7 +179,12 @@ def query(
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Keep the map that --refine makes.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Ask a map where something is."""
+    """Ask a map where something is.
+
+    score, by which regions are ranked, 0…1: how well the voxels fit the word, as if a litre that does not fit belonged
+    to the region. conf., 0…1: how probable the word is beside the other words that the map knows. A region may fit
+    badly and still be nothing else. Of a picture (--image) the confidence is the mean likeness.
+    """
     import tempfile
 
     from .relations import Where, near_word

@@ -51,8 +51,10 @@ class Options:
     """A region goes on over voxels that touch it down to this share of the threshold; 1 = it does not."""
     top_k: int = 20
     """At most so many regions a word."""
-    min_voxels: int = 2
-    """Smaller regions are left out, unless all are smaller."""
+    min_voxels: int = 4
+    """Smaller regions are left out, unless all are smaller: a patch of a surface is two voxels wide either way."""
+    min_share: float = 0.001
+    """Regions of less than this share of the volume of the word's largest one are left out: specks beside a thing."""
     narrow: float = 0.5
     """Things that touch are told apart where their region, seen from above, narrows to less than this share of the
     narrower one, and to four voxels or less; 0 = regions stay whole."""
@@ -61,8 +63,9 @@ class Options:
         require_positive(self, "top_k", "min_voxels")
         if self.threshold is not None and not -1 <= self.threshold <= 1:
             raise ConfigError(f"'threshold' must lie between 0 and 1, got {self.threshold:g}.")
-        if not 0 <= self.narrow <= 1:
-            raise ConfigError(f"'narrow' must lie between 0 and 1, got {self.narrow:g}.")
+        for name in ("narrow", "min_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"'{name}' must lie between 0 and 1, got {getattr(self, name):g}.")
         if not 0 < self.grow <= 1:
             raise ConfigError(f"'grow' must be greater than 0 and at most 1, got {self.grow:g}.")
         if self.scores not in _SCORES:
@@ -179,7 +182,8 @@ def found_regions(
     kept = matching.grown(seeds, component)
     rows, scores, confidence, component = rows[kept], scores[kept], confidence[kept], component[kept]
     component = told_apart(occupancy, rows, component, scores, np.asarray(up), options.narrow)
-    return best_regions(occupancy, rows, component, scores, confidence, options.min_voxels, options.top_k, label)
+    least = options.min_voxels, options.min_share
+    return best_regions(occupancy, rows, component, scores, confidence, *least, options.top_k, label)
 
 
 def similarity(features: Features, text: TextFeatures) -> NDArray[np.float32]:

@@ -16,11 +16,16 @@ outrank a large object, and the size of the voxels has no part in it."""
 
 @dataclass(frozen=True)
 class Region:
-    """A connected set of matching voxels.
+    """A connected set of matching voxels, or one of the things that it holds.
 
     score: 0…1, by which regions are ranked: the mean score of its voxels times V / (V + 1 litre), V being its volume,
-    as if a litre that does not match belonged to it.  confidence: 0…1, mean softmax probability of the word against
-    the contrast words, at the encoder's temperature.  centroid: (3,) mean of the voxels' centres, map frame, metres.
+    as if a litre that does not match belonged to it. A voxel's is its cosine with the word over the one that a perfect
+    example reaches, so that 1 is a large thing all of whose voxels say the word and no other. It says how well the word
+    fits, and compares within an encoder.
+    confidence: 0…1, how probable the word is beside what else the voxels could be: the mean, by volume, of their
+    softmax probabilities of the word against the contrast words, at the encoder's temperature (for a picture, which has
+    no contrast words, the mean score). A region may fit badly (low score) and still be nothing else (high confidence).
+    centroid: (3,) mean of the voxels' centres, map frame, metres.
     box_min, box_max: (3,) corners of the axis-aligned box around the voxels, faces included, metres.  rows: (n,) rows
     of ``Occupancy.occupied_voxels()``.  label: the word that it was found by.
     """
@@ -47,13 +52,15 @@ def best_regions(
     scores: NDArray[np.float32],
     confidence: NDArray[np.float32],
     min_voxels: int,
+    min_share: float,
     top_k: int,
     label: str = "",
 ) -> list[Region]:
     """The at most ``top_k`` best regions, best first, among matching voxels.
 
     rows: (n,) rows of occupied voxels, component: (n,) the region of each, of numbers that need not be successive,
-    scores, confidence: (n,). Regions of fewer than ``min_voxels`` voxels are left out, unless all are.
+    scores, confidence: (n,). Regions of fewer than ``min_voxels`` voxels are left out, unless all are, and those of
+    less than ``min_share`` of the largest one's volume.
     """
     if len(rows) == 0:
         return []
@@ -61,8 +68,9 @@ def best_regions(
     own_volume = (edges * occupancy.finest) ** 3
     size, volume = np.bincount(component), np.bincount(component, own_volume)
     score = np.bincount(component, scores * own_volume) / (volume + _DOUBT_M3)
-    large = np.flatnonzero(size >= min_voxels)
-    chosen = large if len(large) else np.flatnonzero(size)
+    there = (size > 0) & (volume >= min_share * volume.max())
+    large = there & (size >= min_voxels)
+    chosen = np.flatnonzero(large if large.any() else there)
     chosen = chosen[np.argsort(-score[chosen], kind="stable")][:top_k]
 
     rank = np.full(len(size), len(chosen))

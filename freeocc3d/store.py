@@ -206,9 +206,9 @@ class Map:
         return self._placed(lambda asked: self._words(words, asked, contrast, negative), where, options)
 
     def query_classes(self, names: list[str], where: Where | None = None, **options: Any) -> list[QueryResult]:
-        """The voxels whose nearest name of ``vocabulary`` is each of these; see ``classes``. Of the options ``top_k``
+        """The voxels whose nearest name of ``vocabulary`` is each of these; see that module. Of the options ``top_k``
         and ``narrow`` count."""
-        from .classes import query_classes
+        from .query_classes import query_classes
 
         ask = functools.partial(query_classes, self.occupancy, self.text_encoder, self.vocabulary, names, up=self.up)
         return self._placed(ask, where, options)

@@ -20,7 +20,7 @@ FLOORS = (
     ("occupancy",),
     ("instances", "regions"),
     ("query",),
-    ("classes", "patches", "places", "region_views", "relations", "standing"),
+    ("patches", "places", "query_classes", "region_views", "relations", "standing"),
     ("store", "palette"),
     ("export", "viewer", "work", "details"),
     ("evaluation",),

@@ -146,7 +146,7 @@ def test_a_speck_does_not_outrank_a_large_object_that_is_less_similar() -> None:
     room = occupancy(
         box((0, 0, 0), (4, 4, 4), feature(CUP=0.8, SOFA=0.4)) | box((20, 0, 0), (20 + 1, 1, 2), feature(CUP=1))
     )
-    result = query(room, WORDS, ["cup"])[0]
+    result = query(room, WORDS, ["cup"], Options(min_voxels=2))[0]
     large, speck = result.regions
     assert (large.voxels, speck.voxels) == (64, 2)
     assert result.scores[speck.rows].mean() > result.scores[large.rows].mean()
@@ -235,7 +235,19 @@ def test_features_of_another_encoder_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"top_k": 0}, {"min_voxels": 0}, {"threshold": 1.5}, {"grow": 0.0}, {"grow": 1.5}, {"scores": "best"}]
+    "bad",
+    [
+        {"top_k": 0},
+        {"min_voxels": 0},
+        {"threshold": 1.5},
+        {"grow": 0.0},
+        {"grow": 1.5},
+        {"scores": "best"},
+        {"min_share": 2.0},
+        {"narrow": float("nan")},
+        {"threshold": float("nan")},
+        {"grow": float("nan")},
+    ],
 )
 def test_options_out_of_range_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
@@ -386,3 +398,12 @@ def test_occupied_voxels_are_kept_and_cannot_be_changed() -> None:
     with pytest.raises(ValueError, match="read-only"):
         room.occupied_voxels()[0] = 5
     assert len(room.replace(state=np.zeros_like(room.state)).occupied_voxels()) == 0
+
+
+def test_what_is_tiny_beside_the_largest_region_is_a_speck_whatever_the_voxels() -> None:
+    patch = box((20, 0, 0), (22, 2, 1), feature(CUP=1))
+    room = occupancy(box((0, 0, 0), (17, 17, 17), feature(CUP=1)) | patch)
+    assert [r.voxels for r in query(room, WORDS, ["cup"])[0].regions] == [17**3]
+    assert [r.voxels for r in query(room, WORDS, ["cup"], Options(min_share=0.0))[0].regions] == [17**3, 4]
+    small = occupancy(box((0, 0, 0), (10, 10, 10), feature(CUP=1)) | patch)
+    assert [r.voxels for r in query(small, WORDS, ["cup"])[0].regions] == [1000, 4]

@@ -39,7 +39,7 @@ def query_classes(
             raise FreeOccError(f"The map has no class '{name}'{nearest(name.lower(), number)}: --classes lists them.")
     text = text_encoder.encode_words(list(vocabulary))
     of_voxel = nearest_word(occupancy.features, text)
-    options = replace(options or Options(), min_voxels=1)
+    options = replace(options or Options(), min_voxels=1, min_share=0.0)
     results = []
     for name in names:
         k = number[name.lower()]
