@@ -24,7 +24,7 @@ _WIDE = 2.0
 """Cells that a thing reaches to either side of its middle at least, by which it is told from ragged rims."""
 _NECK = 1.5
 """Cells that a neck reaches to either side at most: a door between two rooms is none."""
-_STEP = 2**0.25
+_STEP = 2**0.125
 """From one level to the next lower one: that much of a ratio may be missed."""
 _SMALL_HOLE = 0.25
 """Of a footprint: what stands on a table hides a part of it; the inside of a room is none of its walls."""
@@ -91,26 +91,26 @@ def parts_of(footprint: NDArray[np.float32], narrow: float) -> NDArray[np.int32]
     footprint: (X, Y) scores, positive in the region, 0 outside; holes that are small beside it count as filled.
     """
     height = _height(footprint)
-    highest = float(height.max())
-    if highest < _WIDE:
+    if height.max() < _WIDE:
         return None
     from scipy import ndimage
 
-    lowest = min(narrow * highest, _NECK)
-    levels = highest * _STEP ** -np.arange(np.ceil(np.log(highest / lowest) / np.log(_STEP)))
-    ascending = np.argsort(height, axis=None)
-    peaks = np.zeros(0, np.int64)  # flat index of the highest cell of each thing, highest first
-    owner = np.full(height.size, -1)  # the thing around whose peak a cell lies, by its peak
-    for level in np.append(levels, lowest):
+    # what a neck separates lies apart already where everything is higher than a neck
+    basin = ndimage.label(height > _NECK, _TOUCHING)[0].ravel()
+    above = np.flatnonzero(basin)
+    above = above[np.argsort(height.flat[above], kind="stable")]
+    top = np.zeros(basin.max() + 1, np.int64)
+    top[basin[above]] = above  # of each basin the last is kept, which is its highest cell
+    peaks = top[1:][height.flat[top[1:]] >= _WIDE]
+    if len(peaks) < 2:
+        return None
+    owner = np.full(height.size, -1)  # the peak around which a cell lies, if none shares its basin
+    lowest = narrow * float(height.flat[peaks].min())
+    levels = _NECK * _STEP ** -np.arange(max(np.ceil(np.log(_NECK / lowest) / np.log(_STEP)), 0))
+    for level in (np.nextafter(_NECK, np.inf), *levels, min(lowest, _NECK)):
         basin = ndimage.label(height >= level, _TOUCHING)[0].ravel()
-        if level >= _WIDE:
-            top = np.zeros(basin.max() + 1, np.int64)
-            above = ascending[np.searchsorted(height.flat[ascending], level) :]
-            top[basin[above]] = above  # of each basin the last is kept, which is its highest cell
-            peaks = np.append(peaks, np.setdiff1d(top[1:], top[basin[peaks]]))
         peaks = _persistent(peaks, basin, height.ravel(), level, narrow)
-        gone = (owner >= 0) & ~np.isin(owner, peaks)
-        owner[gone] = -1
+        owner[~np.isin(owner, peaks)] = -1
         thing = np.full(basin.max() + 1, -1)
         thing[basin[peaks]] = np.where(np.bincount(basin[peaks])[basin[peaks]] == 1, peaks, -1)
         owner = np.where(owner < 0, thing[basin], owner)

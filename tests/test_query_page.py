@@ -98,3 +98,19 @@ def test_without_a_display_the_page_says_so(room: Map, tmp_path: Path, monkeypat
     text = (tmp_path / "q.html").read_text(encoding="utf-8")
     assert "The map is not drawn: Pictures need a display." in text
     assert not re.findall("<img", text)
+
+
+def test_an_empty_map_has_no_page(room: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    empty = Map(room.path, room.manifest)
+    occupancy = room.occupancy
+    nothing = occupancy.replace(
+        state=np.zeros_like(occupancy.state), features=occupancy.features[:0], colors=occupancy.colors[:0]
+    )
+    monkeypatch.setitem(empty.__dict__, "occupancy", nothing)
+    (result,) = empty.query_words(["red"])
+    assert result.note == "The map has no occupied voxels."
+    assert empty.query_classes(["red"])[0].regions == []
+    assert empty.query_image(np.full((8, 8, 3), 200, np.uint8)).note == "The map has no occupied voxels."
+    with pytest.raises(ExportError, match="has no occupied voxel to draw"):
+        page.query_page(empty, [result], tmp_path / "q.html")
+    assert list(tmp_path.iterdir()) == []
