@@ -57,11 +57,12 @@ def confidences(
 
         return np.asarray(scoring.confidences(scores, others, candidates, competes, np.float32(1 / temperature)))
     out = np.zeros(scores.shape, np.float32)
+    by_word = np.ascontiguousarray(others.T)  # as they mostly lie in memory
     for w, rivals in enumerate(competes):
         rows = np.flatnonzero(candidates[:, w])
-        margin = others[rows][:, rivals] - scores[rows, w, None]
-        best = margin.max(axis=1, initial=-1.0) <= 0
-        out[rows[best], w] = softmax(np.exp(margin[best] / np.float32(temperature)).sum(axis=1))
+        margin = by_word[np.ix_(rivals, rows)] - scores[rows, w]
+        best = margin.max(axis=0, initial=-1.0) <= 0
+        out[rows[best], w] = softmax(np.exp(margin[:, best] / np.float32(temperature)).sum(axis=0))
     return out
 
 
