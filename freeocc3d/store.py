@@ -25,6 +25,7 @@ from .arrays import read_arrays
 from .errors import MapError
 from .geometry import is_rigid, quats_to_rotations, rotations_to_quats
 from .language.codec import Codec, CodedFeatures
+from .manifest import MANIFEST, check_manifest
 from .types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, Trajectory
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 FORMAT_VERSION = 3
 _UNIFORM_VERSION = 2
 """Of maps whose voxels are all of one size, which earlier versions read as well."""
-MANIFEST, CONFIG, REPORT, TRAJECTORY = "map.yaml", "config.yaml", "report.json", "trajectory.txt"
+CONFIG, REPORT, TRAJECTORY = "config.yaml", "report.json", "trajectory.txt"
 PATH_PICTURE, RENDER_PICTURE = "trajectory.png", "gaussians.png"
 GAUSSIANS, OCCUPANCY, FEATURES, KEYFRAMES = "gaussians.ply", "occupancy.npz", "features.npz", "keyframes"
 
@@ -315,7 +316,7 @@ def load_map(path: str | Path) -> Map:
         )
     if version < _UNIFORM_VERSION:
         raise MapError(f"The map {path} has format {version}, of an earlier freeocc3d: map the capture again.")
-    _check_manifest(manifest, path)
+    check_manifest(manifest, path)
     loaded = Map(path, manifest)
     for name in manifest["files"]:
         loaded._require(name)
@@ -392,45 +393,10 @@ def _place(timestamps: NDArray[np.float64], times: NDArray[np.float64], T: NDArr
     return out
 
 
-def _check_manifest(manifest: dict[str, Any], path: Path) -> None:
-    needed = {
-        "voxel_size_m": float, "origin": list, "up": list, "encoder": dict, "keyframes": list, "files": dict,
-        "counts": dict, "capture": dict, "T_world_map": list, "freeocc3d": str,
-    }  # fmt: skip
-    for key, kind in needed.items():
-        if not isinstance(manifest.get(key), kind):
-            raise MapError(f"{path / MANIFEST} is damaged: '{key}' is missing or not a {kind.__name__}.")
-    inner: dict[str, tuple[str, ...]] = {
-        "encoder": ("name", "state"),
-        "capture": ("path", "format"),
-        "counts": ("gaussians", "voxels", "frames", "frames_with_pose", "submaps"),
-    }
-    for key, names in inner.items():
-        if missing := [name for name in names if name not in manifest[key]]:
-            raise MapError(f"{path / MANIFEST} is damaged: '{key}' lacks {', '.join(missing)}.")
-    if (named := manifest.get("vocabulary")) is not None and not _is_vocabulary(named):
-        raise MapError(f"{path / MANIFEST} is damaged: 'vocabulary' does not hold names with their counts.")
-    for name in manifest["files"]:
-        inside = (path / str(name)).resolve().is_relative_to(path.resolve())
-        if not inside:
-            raise MapError(f"{path / MANIFEST} is damaged: '{name}' lies outside the map's folder.")
-
-
 def sizes(occupancy: Occupancy) -> dict[str, Any]:
     """What a manifest says of the voxels' sizes: their edges, metres."""
     several = {"finest_voxel_m": occupancy.finest} if occupancy.deepest else {}
     return {"voxel_size_m": occupancy.voxel_size, **several}
-
-
-def _is_vocabulary(named: Any) -> bool:
-    """Whether an entry of a manifest is what ``language.scene_vocabulary`` makes."""
-    if not isinstance(named, dict) or not isinstance(named.get("keyframes"), list):
-        return False
-    names = named.get("names")
-    return isinstance(names, dict) and all(
-        isinstance(name, str) and isinstance(entry, dict) and isinstance(entry.get("count"), int)
-        for name, entry in names.items()
-    )
 
 
 def counts(occupancy: Occupancy) -> dict[str, int]:

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1] / "freeocc3d"
 FLOORS = (
     ("errors", "types"),
     ("geometry", "hashing", "lattice", "registry", "progress", "files", "arrays"),
-    ("config", "keyframes"),
+    ("config", "keyframes", "manifest"),
     ("capture",),
     ("tracking",),
     ("gaussians",),
