@@ -170,3 +170,11 @@ def test_norms_that_are_kept_give_the_same_cosines(features: NDArray[np.float16]
     np.testing.assert_allclose(inverse[features.any(axis=1)], 1 / lengths, rtol=1e-5)
     assert not inverse[::5].any()
     np.testing.assert_allclose(codec.cosines(codes, text, inverse), codec.cosines(codes, text), atol=1e-6)
+
+
+@pytest.mark.parametrize(("rows", "words"), [(5000, 1), (5000, 300), (3, 7), (0, 5), (10, 0)])
+def test_products_in_tiles_are_products(rows: int, words: int) -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.random((rows, 48)).astype(np.float32), rng.random((48, words)).astype(np.float32)
+    np.testing.assert_allclose(codec_module._product(a, b), a @ b, rtol=1e-4)
+    assert codec_module._product(a[:, :0], b[:0]).shape == (rows, words)

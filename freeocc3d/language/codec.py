@@ -31,6 +31,7 @@ _MARGIN = 0.02
 """By which an 8-bit range is widened on either side: a normalised mean of features can lie outside of it."""
 _ROWS = 8192  # worked on at once, so that float32 copies of all rows never exist
 _MANY = 200_000  # rows from which scores are computed by compiled code
+_ONE_THREAD = 1 << 18  # multiplications of a matrix product that OpenBLAS does on one thread
 _SAMPLE = 20000  # rows that quantisers are fitted to
 
 
@@ -139,7 +140,7 @@ class Codec:
         inverse = self.inverse_norms(codes) if inverse is None else inverse
         scores = np.empty((len(text), len(codes)), np.float32).T  # a word's scores lie together
         for rows, length, out in zip(_chunks(codes), _chunks(inverse), _chunks(scores), strict=True):
-            np.multiply(self._levels(rows) @ linear + constant, length[:, None], out=out)
+            np.multiply(_product(self._levels(rows), linear) + constant, length[:, None], out=out)
         return scores
 
     def _levels(self, codes: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -223,6 +224,18 @@ def known(features: Features) -> NDArray[np.bool_]:
 def _compiled(count: int) -> bool:
     """Whether so many scores are left to numba, which takes longer to import than fewer to compute."""
     return count >= _MANY or f"{__package__}.scoring" in sys.modules
+
+
+def _product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(V, R) @ (R, W) in tiles that OpenBLAS does not share out among threads. To wait for these takes longer than so
+    small a product where other programs are running, as on a robot: 10 to 20 ms each time."""
+    tile = max(1, _ONE_THREAD // max(b.size, 1))
+    count = len(a) // tile
+    whole = count * tile
+    out = np.empty((len(a), b.shape[1]), np.float32)
+    np.matmul(a[:whole].reshape(count, tile, a.shape[1]), b, out=out[:whole].reshape(count, tile, b.shape[1]))
+    np.matmul(a[whole:], b, out=out[whole:])
+    return out
 
 
 def _directions(features: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
