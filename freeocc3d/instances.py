@@ -29,6 +29,8 @@ _STEP = 2**0.125
 _SMALL_HOLE = 0.25
 """Of a footprint: what stands on a table hides a part of it; the inside of a room is none of its walls."""
 _LEAST_VOXELS = 40  # two things that are wide enough
+_LEAST_SCORE = 1e-3
+_MOST_CELLS = 1 << 24  # of a footprint; a region that spreads farther stays whole
 _TOUCHING = np.ones((3, 3), int)
 _QUARTERS = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) / 2 - 0.25
 
@@ -43,7 +45,7 @@ def told_apart(
 ) -> NDArray[np.int32]:
     """(n,) numbers of parts of the components, of voxels given by (n,) rows.
 
-    scores: (n,) of the word, positive.  up: (3,) unit vector, map frame.  narrow: a neck's share of the width of the
+    scores: (n,) of the word.  up: (3,) unit vector, map frame.  narrow: a neck's share of the width of the
     narrower of the things beside it, at most; 0 cuts nothing.
     """
     part = component.astype(np.int32)
@@ -51,8 +53,8 @@ def told_apart(
     number = int(component.max(initial=0)) + 1
     for c in large:
         own = np.flatnonzero(component == c)
-        cell, footprint = _footprint(occupancy, rows[own], scores[own], up)
-        things = parts_of(footprint, narrow)
+        cell, footprint = _footprint(occupancy, rows[own], np.maximum(scores[own], _LEAST_SCORE), up)
+        things = None if footprint is None else parts_of(footprint, narrow)
         if things is not None:
             part[own] = number + things[tuple(cell.T)]
             number += int(things.max()) + 1
@@ -61,9 +63,9 @@ def told_apart(
 
 def _footprint(
     occupancy: Occupancy, rows: NDArray[np.int64], scores: NDArray[np.float32], up: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """(n, 2) cell of each voxel seen from above, and (X, Y) best score in each cell, 0 outside. A cell is as large as
-    the largest of the voxels."""
+) -> tuple[NDArray[np.int64], NDArray[np.float32] | None]:
+    """(n, 2) cell of each voxel seen from above, and (X, Y) best score in each cell, 0 outside, None for too many
+    cells. A cell is as large as the largest of the voxels."""
     order = np.argsort(scores, kind="stable")  # of what falls into one cell the last is kept
     edges = occupancy.occupied_edges()[rows[order]]
     first = np.eye(3)[np.argmin(np.abs(up))]  # the axis of the lattice that is most nearly level
@@ -75,13 +77,15 @@ def _footprint(
     offsets = np.unique((_QUARTERS @ level).round(2), axis=0)  # half of them where the lattice is about level
     low = np.floor(middle.min(axis=0) - 1)
     shape = (np.floor(middle.max(axis=0) + 1) - low + 1).astype(np.int64)
+    cells = np.empty((len(rows), 2), np.int64)
+    cells[order] = np.floor(middle - low)
+    if shape.prod() > _MOST_CELLS:
+        return cells, None
     footprint = np.zeros(shape, np.float32)
     for offset in offsets:
         at = np.floor(middle + edges[:, None] * offset - low).astype(np.int64)
         here = footprint[at[:, 0], at[:, 1]]
         footprint[at[:, 0], at[:, 1]] = np.maximum(here, scores[order])
-    cells = np.empty((len(rows), 2), np.int64)
-    cells[order] = np.floor(middle - low)
     return cells, footprint
 
 

@@ -181,3 +181,13 @@ def test_what_is_above_is_asked_not_the_lattice(turn: float) -> None:
 def test_a_share_of_a_width_lies_between_0_and_1() -> None:
     with pytest.raises(ConfigError, match="'narrow' must lie between 0 and 1, got 1"):
         Options(narrow=1.5)
+
+
+def test_what_spreads_too_far_stays_whole_and_no_score_is_too_low() -> None:
+    line = np.arange(5000)
+    made = occupancy_of(np.stack((line, line, 0 * line), axis=1)[::100])
+    far = made.replace(keys=made.keys * 40)
+    rows = np.arange(50)
+    for one, up in ((made, (0.0, 0.0, 1.0)), (far, (0.0, 0.0, 1.0))):
+        part = told_apart(one, rows, np.zeros(50, np.int32), np.full(50, -0.5, np.float32), np.array(up), 0.5)
+        assert len(np.unique(part)) == 1
