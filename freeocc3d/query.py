@@ -51,10 +51,11 @@ class Options:
     """A region goes on over voxels that touch it down to this share of the threshold; 1 = it does not."""
     top_k: int = 20
     """At most so many regions a word."""
-    min_voxels: int = 4
-    """Smaller regions are left out, unless all are smaller: a patch of a surface is two voxels wide either way."""
+    min_voxels: int = 2
+    """Smaller regions are left out, unless all are smaller."""
     min_share: float = 0.001
-    """Regions of less than this share of the volume of the word's largest one are left out: specks beside a thing."""
+    """Regions of less than this share of the volume of the word's largest one are left out, and those of one to three
+    voxels below 50 times the share: specks beside a thing. 0 = none is."""
     narrow: float = 0.5
     """Things that touch are told apart where their region, seen from above, narrows to less than this share of the
     narrower one, and to four voxels or less; 0 = regions stay whole."""

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from .types import Occupancy
 
+_PATCH, _FEW = 4, 50
+"""Voxels of the least patch of a surface, two by two; of how much larger a share what is smaller has to be."""
 _DOUBT_M3 = 0.001
 """Volume of non-matching matter that is added to each region when it is scored: a speck of a voxel or two does not
 outrank a large object, and the size of the voxels has no part in it."""
@@ -60,7 +62,7 @@ def best_regions(
 
     rows: (n,) rows of occupied voxels, component: (n,) the region of each, of numbers that need not be successive,
     scores, confidence: (n,). Regions of fewer than ``min_voxels`` voxels are left out, unless all are, and those of
-    less than ``min_share`` of the largest one's volume.
+    less than ``min_share`` of the largest one's volume, 50 times it for what is no patch of a surface.
     """
     if len(rows) == 0:
         return []
@@ -68,7 +70,8 @@ def best_regions(
     own_volume = (edges * occupancy.finest) ** 3
     size, volume = np.bincount(component), np.bincount(component, own_volume)
     score = np.bincount(component, scores * own_volume) / (volume + _DOUBT_M3)
-    there = (size > 0) & (volume >= min_share * volume.max())
+    least = np.where(size < _PATCH, min(_FEW * min_share, 1.0), min_share)
+    there = (size > 0) & (volume >= least * volume.max())
     large = there & (size >= min_voxels)
     chosen = np.flatnonzero(large if large.any() else there)
     chosen = chosen[np.argsort(-score[chosen], kind="stable")][:top_k]

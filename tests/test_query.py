@@ -146,7 +146,7 @@ def test_a_speck_does_not_outrank_a_large_object_that_is_less_similar() -> None:
     room = occupancy(
         box((0, 0, 0), (4, 4, 4), feature(CUP=0.8, SOFA=0.4)) | box((20, 0, 0), (20 + 1, 1, 2), feature(CUP=1))
     )
-    result = query(room, WORDS, ["cup"], Options(min_voxels=2))[0]
+    result = query(room, WORDS, ["cup"], Options(min_share=0.0))[0]
     large, speck = result.regions
     assert (large.voxels, speck.voxels) == (64, 2)
     assert result.scores[speck.rows].mean() > result.scores[large.rows].mean()
@@ -407,3 +407,12 @@ def test_what_is_tiny_beside_the_largest_region_is_a_speck_whatever_the_voxels()
     assert [r.voxels for r in query(room, WORDS, ["cup"], Options(min_share=0.0))[0].regions] == [17**3, 4]
     small = occupancy(box((0, 0, 0), (10, 10, 10), feature(CUP=1)) | patch)
     assert [r.voxels for r in query(small, WORDS, ["cup"])[0].regions] == [1000, 4]
+
+
+def test_what_is_no_patch_of_a_surface_is_a_speck_beside_a_thing_and_no_speck_beside_its_like() -> None:
+    few = box((20, 0, 0), (23, 1, 1), feature(CUP=1))
+    beside_a_thing = occupancy(box((0, 0, 0), (4, 4, 4), feature(CUP=1)) | few)
+    assert [r.voxels for r in query(beside_a_thing, WORDS, ["cup"])[0].regions] == [64]
+    assert [r.voxels for r in query(beside_a_thing, WORDS, ["cup"], Options(min_share=0.0))[0].regions] == [64, 3]
+    beside_its_like = occupancy(box((0, 0, 0), (5, 1, 1), feature(CUP=0.8, SOFA=0.6)) | few)
+    assert sorted(r.voxels for r in query(beside_its_like, WORDS, ["cup"])[0].regions) == [3, 5]
