@@ -145,6 +145,21 @@ def query(
     scores: Annotated[str | None, typer.Option("--scores", help="cosine, softmax or relevancy.")] = None,
     ply: Annotated[Path | None, typer.Option("--ply", help="Write the map as PLY, matches coloured.")] = None,
     picture: Annotated[Path | None, typer.Option("--picture", help="Write a picture, matches coloured (PNG).")] = None,
+    html: Annotated[
+        Path | None, typer.Option("--html", help="Write one page: regions, the map, and what the camera saw of them.")
+    ] = None,
+    class_names: Annotated[
+        list[str] | None,
+        typer.Option("--class", metavar="NAME", help="All voxels of a class of the map's vocabulary; repeatable."),
+    ] = None,
+    list_classes: Annotated[bool, typer.Option("--classes", help="List the map's vocabulary, and do no more.")] = False,
+    image: Annotated[
+        Path | None, typer.Option("--image", help="Look for what a picture shows, where the map's encoder can.")
+    ] = None,
+    image_box: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option("--box", metavar="X0 Y0 X1 Y1", help="With --image: only these pixels of it, the last included."),
+    ] = None,
     negative: Annotated[
         list[str] | None, typer.Option("--not", metavar="WORD", help="What is not meant; repeatable.")
     ] = None,
@@ -168,23 +183,41 @@ def query(
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Keep the map that --refine makes.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Ask a map where something is."""
+    """Ask a map where something is.
+
+    score, by which regions are ranked, 0…1: how well the voxels fit the word, as if a litre that does not fit belonged
+    to the region. conf., 0…1: how probable the word is beside the other words that the map knows. A region may fit
+    badly and still be nothing else. Of a picture (--image) the confidence is the mean likeness.
+    """
     import tempfile
 
     from .relations import Where, near_word
     from .store import load_map
 
-    words = words or []
-    if interactive == bool(words):
-        raise typer.BadParameter("give words to look for, or --interactive without any.")
-    if interactive and (ply or picture or refine_to is not None):
-        raise typer.BadParameter("--interactive answers in text or JSON: leave out --ply, --picture and --refine.")
+    words, class_names = words or [], class_names or []
+    questions = len(words) + len(class_names) + (image is not None)
+    if list_classes:
+        print("\n".join(load_map(map_path).vocabulary))
+        return
+    if interactive == bool(questions):
+        raise typer.BadParameter("give words to look for, --class or --image, or --interactive without any.")
+    if interactive and (ply or picture or html or refine_to is not None):
+        raise typer.BadParameter(
+            "--interactive answers in text or JSON: leave out --ply, --picture, --html and --refine."
+        )
+    if image_box is not None and image is None:
+        raise typer.BadParameter("--box is a part of a picture: give --image, too.")
+    if negative and questions > len(words):
+        raise typer.BadParameter("--not narrows what words mean: leave it out with --class and --image.")
     if output is not None and refine_to is None:
         raise typer.BadParameter("-o keeps the map that --refine makes: give --refine METRES.")
     if views and not as_json:
         raise typer.BadParameter("--views adds to the document of --json: give both.")
-    if refine_to is not None and len(words) > 1:
+    if refine_to is not None and questions > 1:
         raise typer.BadParameter("--refine looks around the best match of one word.")
+    for target in (ply, picture, html):
+        if target is not None:
+            refuse_existing(target, overwrite)
     options: dict[str, Any] = {}
     if top is not None:
         options["top_k"] = top
@@ -192,19 +225,24 @@ def query(
         options["threshold"] = threshold
     if scores is not None:
         options["scores"] = scores
-    options["negative"] = negative or []
     if any(condition is not None for condition in (within, near, on, pick)):
         word, metres = (None, Where.near_m) if near is None else near_word(near)
         options["where"] = Where(within, word, metres, on, pick)
     loaded = load_map(map_path)
     if interactive:
-        _answer_lines(loaded, options, as_json, views)
+        _answer_lines(loaded, {**options, "negative": negative or []}, as_json, views)
         return
-    results = loaded.query_words(words, **options)
+
+    def ask(scan_map: Any) -> list[Any]:
+        results = scan_map.query_words(words, negative=negative or [], **options) if words else []
+        results += scan_map.query_classes(class_names, **options) if class_names else []
+        return results if image is None else [*results, scan_map.query_image(image, image_box, **options)]
+
+    results = ask(loaded)
     with tempfile.TemporaryDirectory() as folder:  # for a map that nobody keeps
         if refine_to is not None and results[0].matched:
             loaded = _refined(loaded, results[0].regions[0], refine_to, output or Path(folder) / "refined", overwrite)
-            results = loaded.query_words(words, **options)
+            results = ask(loaded)
         if ply is not None:
             from .export.ply import write_query_ply
 
@@ -213,6 +251,10 @@ def query(
             from .viewer import pictures
 
             pictures.query_picture(loaded, results, picture, overwrite)
+        if html is not None:
+            from .viewer.page import query_page
+
+            query_page(loaded, results, html, overwrite)
         print(_answer(map_path, loaded, results, as_json, views))
 
 

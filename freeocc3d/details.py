@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from .places import oriented_boxes
-from .query import QueryResult, Region
+from .query import QueryResult
+from .regions import Region
 from .store import Map
 
 if TYPE_CHECKING:

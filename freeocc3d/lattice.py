@@ -15,6 +15,13 @@ def packed_voxels(index: NDArray[np.integer]) -> NDArray[np.int64]:
     return (i[:, 0] << 2 * AXIS_BITS) + (i[:, 1] << AXIS_BITS) + i[:, 2]
 
 
+def unpacked_voxels(packed: NDArray[np.int64]) -> NDArray[np.int32]:
+    """The inverse of ``packed_voxels``."""
+    mask = (1 << AXIS_BITS) - 1
+    index = np.stack((packed >> 2 * AXIS_BITS, (packed >> AXIS_BITS) & mask, packed & mask), axis=1)
+    return np.asarray(index - (1 << AXIS_BITS - 1), np.int32)
+
+
 def contains(ascending: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.bool_]:
     """(K,) whether each key is among the ascending ones."""
     if not len(ascending):

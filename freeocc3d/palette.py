@@ -7,7 +7,7 @@ import hashlib
 import numpy as np
 from numpy.typing import NDArray
 
-from .query import Region
+from .regions import Region
 from .types import Occupancy
 
 HIGHLIGHTS = np.array(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .geometry import invert, transform
-from .query import Region
+from .regions import Region
 from .types import Occupancy
 
 _CORNERS = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1)

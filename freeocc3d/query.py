@@ -9,7 +9,6 @@ match, too. Matching voxels that touch form a region.
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,9 +20,11 @@ from numpy.typing import NDArray
 
 from . import __version__
 from .errors import ConfigError, FreeOccError, MapError
+from .instances import told_apart
 from .language import matching
 from .language.codec import Features, cosines, known
 from .occupancy.connected import connected
+from .regions import Region, best_regions
 from .registry import require_positive
 from .types import Occupancy
 
@@ -35,9 +36,6 @@ _SCORES = ("cosine", "softmax", "relevancy")
 _EVEN = 0.5  # a probability
 _ROWS = 16384  # voxels worked on at once, so that float32 copies of all features never exist
 _MANY_ROWS = 1 << 18  # by compiled code, whose threads are worth starting for many only
-_DOUBT_M3 = 0.001
-"""Volume of non-matching matter that is added to each region when it is scored: a speck of a voxel or two does not
-outrank a large object, and the size of the voxels has no part in it."""
 
 
 @dataclass(frozen=True)
@@ -55,41 +53,24 @@ class Options:
     """At most so many regions a word."""
     min_voxels: int = 2
     """Smaller regions are left out, unless all are smaller."""
+    min_share: float = 0.001
+    """Regions of less than this share of the volume of the word's largest one are left out, and those of one to three
+    voxels below 50 times the share: specks beside a thing. 0 = none is."""
+    narrow: float = 0.5
+    """Things that touch are told apart where their region, seen from above, narrows to less than this share of the
+    narrower one, and to four voxels or less; 0 = regions stay whole."""
 
     def __post_init__(self) -> None:
         require_positive(self, "top_k", "min_voxels")
         if self.threshold is not None and not -1 <= self.threshold <= 1:
             raise ConfigError(f"'threshold' must lie between 0 and 1, got {self.threshold:g}.")
+        for name in ("narrow", "min_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"'{name}' must lie between 0 and 1, got {getattr(self, name):g}.")
         if not 0 < self.grow <= 1:
             raise ConfigError(f"'grow' must be greater than 0 and at most 1, got {self.grow:g}.")
         if self.scores not in _SCORES:
             raise ConfigError(f"'scores' must be one of {', '.join(_SCORES)}, got '{self.scores}'.")
-
-
-@dataclass(frozen=True)
-class Region:
-    """A connected set of matching voxels.
-
-    score: 0…1, by which regions are ranked: the mean score of its voxels times V / (V + 1 litre), V being its volume,
-    as if a litre that does not match belonged to it.  confidence: 0…1, mean softmax probability of the word against
-    the contrast words, at the encoder's temperature.  centroid: (3,) mean of the voxels' centres, map frame, metres.
-    box_min, box_max: (3,) corners of the axis-aligned box around the voxels, faces included, metres.  rows: (n,) rows
-    of ``Occupancy.occupied_voxels()``.  label: the word that it was found by.
-    """
-
-    score: float
-    confidence: float
-    centroid: NDArray[np.float64]
-    box_min: NDArray[np.float64]
-    box_max: NDArray[np.float64]
-    volume_m3: float
-    rows: NDArray[np.int64]
-    label: str = ""
-
-    @property
-    def voxels(self) -> int:
-        """Number of voxels."""
-        return len(self.rows)
 
 
 @dataclass(frozen=True)
@@ -120,12 +101,13 @@ def query(
     options: Options | None = None,
     contrast: Sequence[str] = (),
     negative: Sequence[str] = (),
+    up: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 1.0),
 ) -> list[QueryResult]:
     """Ask for several words; one that nothing matches gives no regions.
 
     contrast: words for what else is there, besides those that the encoder names itself.  negative: words for what is
     not meant: a voxel whose plain cosine with one of them is higher than with the word does not match, though the word
-    should include it, as "table" includes a coffee table.
+    should include it, as "table" includes a coffee table.  up: (3,) unit vector, map frame.
     Raises FreeOccError for an empty, endless or excluded word or a negative one without a meaning, MapError if the
     map's features are not the encoder's.
     """
@@ -153,7 +135,6 @@ def query(
     competes: NDArray[np.bool_] = np.asarray((text.features @ others.features.T < text_encoder.same_word) & expressed)
     cosine = similarity(features, text)
     says = known(features)
-    voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
     plain = options.scores == "cosine"
     default = text_encoder.threshold if plain else _EVEN
     threshold = default if options.threshold is None else options.threshold
@@ -177,12 +158,33 @@ def query(
             meant = cosines(features[rows], text.features[w : w + 1])[:, 0]
             allowed = meant >= cosines(features[rows], excluded.features).max(axis=1)
             rows, confidence = rows[allowed], confidence[allowed]
-        kept = matching.grown(scores[rows] >= threshold, functools.partial(connected, voxels[rows], edges[rows]))
-        rows, confidence = rows[kept], confidence[kept]
-        regions = _regions(occupancy, voxels, edges, rows, scores[rows], confidence, options, word)
+        regions = found_regions(occupancy, rows, scores[rows], confidence, threshold, options, up, word)
         note = _note(word, part, text_encoder, scores, threshold, bool(regions))
         results.append(QueryResult(word, part, note, regions, np.ascontiguousarray(scores)))
     return results
+
+
+def found_regions(
+    occupancy: Occupancy,
+    rows: NDArray[np.int64],
+    scores: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    threshold: float,
+    options: Options,
+    up: Sequence[float] | NDArray[np.float64],
+    label: str,
+) -> list[Region]:
+    """The regions of candidates, (n,) rows of occupied voxels with (n,) scores and confidences: what hangs together
+    with a voxel that reaches the threshold, things that touch apart."""
+    seeds = scores >= threshold
+    if not seeds.any():
+        return []
+    component = connected(occupancy.occupied_voxels()[rows], occupancy.occupied_edges()[rows])
+    kept = matching.grown(seeds, component)
+    rows, scores, confidence, component = rows[kept], scores[kept], confidence[kept], component[kept]
+    component = told_apart(occupancy, rows, component, scores, np.asarray(up), options.narrow)
+    least = options.min_voxels, options.min_share
+    return best_regions(occupancy, rows, component, scores, confidence, *least, options.top_k, label)
 
 
 def similarity(features: Features, text: TextFeatures) -> NDArray[np.float32]:
@@ -265,59 +267,6 @@ def _probability(
     largest, odds = _beside(features, scores, others, text_encoder.temperature)
     made = matching.softmax(odds) if way == "softmax" else matching.relevancy(largest, text_encoder.temperature)
     return np.where(known(features), made, np.float32(0))
-
-
-def _regions(
-    occupancy: Occupancy,
-    voxels: NDArray[np.int32],
-    edges: NDArray[np.int32],
-    rows: NDArray[np.int64],
-    scores: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    options: Options,
-    label: str,
-) -> list[Region]:
-    """The best regions among matching voxels, given by their rows with their scores and confidences."""
-    if len(rows) == 0:
-        return []
-    component = connected(voxels[rows], edges[rows])
-    size = np.bincount(component)
-    own_volume = (edges[rows] * occupancy.finest) ** 3
-    volume = np.bincount(component, own_volume)
-    score = np.bincount(component, scores * own_volume) / (volume + _DOUBT_M3)
-    large = np.flatnonzero(size >= options.min_voxels)
-    chosen = large if len(large) else np.arange(len(size))
-    chosen = chosen[np.argsort(-score[chosen], kind="stable")][: options.top_k]
-    order, end = np.argsort(component, kind="stable"), np.cumsum(size)
-    members = [order[end[c] - size[c] : end[c]] for c in chosen]
-    return [
-        _region(occupancy, voxels, edges, rows[own], score[c], confidence[own], label)
-        for c, own in zip(chosen, members, strict=True)
-    ]
-
-
-def _region(
-    occupancy: Occupancy,
-    voxels: NDArray[np.int32],
-    edges: NDArray[np.int32],
-    rows: NDArray[np.int64],
-    score: float,
-    confidence: NDArray[np.float32],
-    label: str,
-) -> Region:
-    own, edge = voxels[rows], edges[rows]
-    size = occupancy.finest
-    volume = (edge * size) ** 3
-    return Region(
-        score=float(score),
-        confidence=float(np.average(confidence, weights=volume)),
-        centroid=np.average(occupancy.centers(own, edge), axis=0, weights=volume),
-        box_min=occupancy.origin + own.min(axis=0) * size,
-        box_max=occupancy.origin + (own + edge[:, None]).max(axis=0) * size,
-        volume_m3=float(volume.sum()),
-        rows=rows,
-        label=label,
-    )
 
 
 def _note(

@@ -31,7 +31,7 @@ from .language import lift
 from .language.codec import Codec
 from .occupancy import build, carve, splat
 from .progress import Progress
-from .query import Region
+from .regions import Region
 from .store import Map, load_map
 from .types import BLOCK, Frame, Gaussians, Occupancy, PosedFrame, Trajectory
 from .work import WorkFolder

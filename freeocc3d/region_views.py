@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .geometry import invert, project, transform
 from .keyframes import Keyframes
-from .query import Region
+from .regions import Region
 from .types import Occupancy, Trajectory
 
 MOST = 3

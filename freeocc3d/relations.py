@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from .errors import ConfigError, MapError
 from .lattice import packed_voxels
-from .query import QueryResult, Region
+from .query import QueryResult
+from .regions import Region
 from .types import Occupancy
 
 PICKS = ("largest", "highest", "lowest", "best")

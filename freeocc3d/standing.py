@@ -12,9 +12,8 @@ from scipy.spatial import KDTree
 
 from .errors import MapError
 from .geometry import invert, transform
-from .occupancy.levels import uniform
 from .occupancy.resample import resampled
-from .query import Region
+from .regions import Region
 from .types import FREE, OCCUPIED, UNKNOWN, Occupancy
 
 _MOST_CELLS = 1 << 29
@@ -50,7 +49,11 @@ def standing_places(
     """
     robot = robot or Robot()
     plain = occupancy.replace(features=np.zeros((len(occupancy.colors), 0), np.float16))
-    one = uniform(plain) if occupancy.deepest else plain
+    one = plain
+    if occupancy.deepest:
+        from .occupancy.levels import uniform
+
+        one = uniform(plain)
     level, rows = resampled(one, T_gravity_map, np.array((0.0, 0.0, -0.5 * one.voxel_size)))
     if not len(level.voxels(OCCUPIED)):
         return [None] * len(regions)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -25,20 +25,22 @@ from .arrays import read_arrays
 from .errors import MapError
 from .geometry import is_rigid, quats_to_rotations, rotations_to_quats
 from .language.codec import Codec, CodedFeatures
+from .manifest import MANIFEST, check_manifest
 from .types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, Trajectory
 
 if TYPE_CHECKING:
     from .keyframes import Keyframes
     from .language.encoders.base import TextEncoder
     from .places import OrientedBox
-    from .query import QueryResult, Region
+    from .query import Options, QueryResult
     from .region_views import View
+    from .regions import Region
     from .relations import Where
 
 FORMAT_VERSION = 3
 _UNIFORM_VERSION = 2
 """Of maps whose voxels are all of one size, which earlier versions read as well."""
-MANIFEST, CONFIG, REPORT, TRAJECTORY = "map.yaml", "config.yaml", "report.json", "trajectory.txt"
+CONFIG, REPORT, TRAJECTORY = "config.yaml", "report.json", "trajectory.txt"
 PATH_PICTURE, RENDER_PICTURE = "trajectory.png", "gaussians.png"
 GAUSSIANS, OCCUPANCY, FEATURES, KEYFRAMES = "gaussians.ply", "occupancy.npz", "features.npz", "keyframes"
 
@@ -207,17 +209,56 @@ class Map:
     ) -> list[QueryResult]:
         """``query`` for several words. contrast: words for what else is there, besides the encoder's own.  negative:
         words for what is not meant.  where: conditions on the regions' places; see ``relations.Where``."""
+        return self._placed(lambda asked: self._words(words, asked, contrast, negative), where, options)
+
+    def query_classes(self, names: list[str], where: Where | None = None, **options: Any) -> list[QueryResult]:
+        """The voxels whose nearest name of ``vocabulary`` is each of these; see that module. Of the options ``top_k``
+        and ``narrow`` count."""
+        from .query_classes import query_classes
+
+        ask = functools.partial(query_classes, self.occupancy, self.text_encoder, self.vocabulary, names, up=self.up)
+        return self._placed(ask, where, options)
+
+    def query_image(
+        self,
+        image: str | Path | NDArray[np.uint8],
+        box: tuple[int, int, int, int] | None = None,
+        where: Where | None = None,
+        **options: Any,
+    ) -> QueryResult:
+        """Where it looks as in a picture, a file or (H, W, 3) RGB, or in a box x0 y0 x1 y1 of its pixels; see
+        ``patches``."""
+        from . import patches
+
+        encoder = patches.image_encoder(self.manifest["encoder"]["name"], self.path / CONFIG)
+        feature = patches.patch_feature(encoder, image, box)
+        name = "the picture" if isinstance(image, np.ndarray) else Path(image).name
+        found = self._placed(
+            lambda asked: [patches.query_feature(self.occupancy, feature, name, asked, self.up)], where, options
+        )
+        return found[0]
+
+    def _words(
+        self, words: list[str], options: Options, contrast: Sequence[str] = (), negative: Sequence[str] = ()
+    ) -> list[QueryResult]:
+        from . import query
+
+        named = self.scene_words if self.text_encoder.open_vocabulary else []
+        others = [*named, *contrast]
+        return query.query(self.occupancy, self.text_encoder, words, options, others, negative, self.up)
+
+    def _placed(
+        self, ask: Callable[[Options], list[QueryResult]], where: Where | None, options: dict[str, Any]
+    ) -> list[QueryResult]:
+        """What a question finds, in the places that are asked for."""
         from . import query, relations
 
-        checked = registry.build_options(query, options)
-        named = self.scene_words if self.text_encoder.open_vocabulary else []
-        ask = functools.partial(query.query, self.occupancy, self.text_encoder)
+        checked: Options = registry.build_options(query, options)
         if where is None:
-            return ask(words, checked, [*named, *contrast], negative)
+            return ask(checked)
         every = replace(checked, top_k=max(len(self.occupancy.colors), 1))
-        found = ask(words, every, [*named, *contrast], negative)
-        references = ask(where.words, every, named) if where.words else []
-        return relations.only_where(self.occupancy, self.up, found, references, where, checked.top_k)
+        references = self._words(where.words, every) if where.words else []
+        return relations.only_where(self.occupancy, self.up, ask(every), references, where, checked.top_k)
 
     def box_of(self, region: Region) -> OrientedBox:
         """The upright box of least level area around a region, turned as the region is."""
@@ -280,7 +321,7 @@ def load_map(path: str | Path) -> Map:
         )
     if version < _UNIFORM_VERSION:
         raise MapError(f"The map {path} has format {version}, of an earlier freeocc3d: map the capture again.")
-    _check_manifest(manifest, path)
+    check_manifest(manifest, path)
     loaded = Map(path, manifest)
     for name in manifest["files"]:
         loaded._require(name)
@@ -357,48 +398,10 @@ def _place(timestamps: NDArray[np.float64], times: NDArray[np.float64], T: NDArr
     return out
 
 
-def _check_manifest(manifest: dict[str, Any], path: Path) -> None:
-    needed = {
-        "voxel_size_m": float, "origin": list, "up": list, "encoder": dict, "keyframes": list, "files": dict,
-        "counts": dict, "capture": dict, "T_world_map": list, "freeocc3d": str,
-    }  # fmt: skip
-    for key, kind in needed.items():
-        if not isinstance(manifest.get(key), kind):
-            raise MapError(f"{path / MANIFEST} is damaged: '{key}' is missing or not a {kind.__name__}.")
-    inner: dict[str, tuple[str, ...]] = {
-        "encoder": ("name", "state"),
-        "capture": ("path", "format"),
-        "counts": ("gaussians", "voxels", "frames", "frames_with_pose", "submaps"),
-    }
-    for key, names in inner.items():
-        if missing := [name for name in names if name not in manifest[key]]:
-            raise MapError(f"{path / MANIFEST} is damaged: '{key}' lacks {', '.join(missing)}.")
-    if (named := manifest.get("vocabulary")) is not None and not _is_vocabulary(named):
-        raise MapError(f"{path / MANIFEST} is damaged: 'vocabulary' does not hold names with their counts.")
-    scale = manifest.get("scale", {"metric": True})
-    if not isinstance(scale, dict) or not isinstance(scale.get("metric"), bool):
-        raise MapError(f"{path / MANIFEST} is damaged: 'scale' does not say whether lengths are metres.")
-    for name in manifest["files"]:
-        inside = (path / str(name)).resolve().is_relative_to(path.resolve())
-        if not inside:
-            raise MapError(f"{path / MANIFEST} is damaged: '{name}' lies outside the map's folder.")
-
-
 def sizes(occupancy: Occupancy) -> dict[str, Any]:
     """What a manifest says of the voxels' sizes: their edges, metres."""
     several = {"finest_voxel_m": occupancy.finest} if occupancy.deepest else {}
     return {"voxel_size_m": occupancy.voxel_size, **several}
-
-
-def _is_vocabulary(named: Any) -> bool:
-    """Whether an entry of a manifest is what ``language.scene_vocabulary`` makes."""
-    if not isinstance(named, dict) or not isinstance(named.get("keyframes"), list):
-        return False
-    names = named.get("names")
-    return isinstance(names, dict) and all(
-        isinstance(name, str) and isinstance(entry, dict) and isinstance(entry.get("count"), int)
-        for name, entry in names.items()
-    )
 
 
 def counts(occupancy: Occupancy) -> dict[str, int]:

@@ -6,6 +6,7 @@ coordinates of frame b to frame a; voxel (i, j, k) covers ``origin + [i, i+1) * 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -222,12 +223,19 @@ class Occupancy:
         return np.left_shift(1, self.deepest - self.levels[block].astype(np.int32), dtype=np.int32)
 
     def occupied_voxels(self) -> NDArray[np.int32]:
-        """``voxels(OCCUPIED)``: the row order of ``features`` and ``colors``."""
-        return self.voxels(OCCUPIED)
+        """``voxels(OCCUPIED)``, kept and read-only: the row order of ``features`` and ``colors``."""
+        return self._occupied[0]
 
     def occupied_edges(self) -> NDArray[np.int32]:
-        """``edges(OCCUPIED)``."""
-        return self.edges(OCCUPIED)
+        """``edges(OCCUPIED)``, kept and read-only."""
+        return self._occupied[1]
+
+    @functools.cached_property
+    def _occupied(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        voxels, edges = self.voxels(OCCUPIED), self.edges(OCCUPIED)
+        voxels.setflags(write=False)
+        edges.setflags(write=False)
+        return voxels, edges
 
     def centers(self, voxels: NDArray[np.int32], edges: NDArray[np.int32] | None = None) -> NDArray[np.float64]:
         """(V, 3) world positions of the centres of voxels, given by corners and edges as above; edges are 1 by

@@ -113,6 +113,52 @@ def test_query_text_ply_and_picture(room, tmp_path) -> None:
     run("view", room, "--picture", tmp_path / "q.png", "--overwrite")
 
 
+def test_query_by_class_by_picture_and_as_a_page(room, tmp_path) -> None:
+    names = run("query", room, "--classes").stdout.split()
+    assert "yellow" in names
+    looks = sorted((room / "keyframes").glob("*.color.jpg"))[0]
+    asked = ["yellow", "--class", "yellow", "--image", looks, "--box", 0, 0, 20, 20]
+    done = run("query", room, *asked, "--json", "--html", tmp_path / "q.html", "--top", 3)
+    word, of_class, alike = json.loads(done.stdout)["results"]
+    assert (word["word"], of_class["word"], alike["word"]) == ("yellow", "yellow", looks.name)
+    assert of_class["regions"][0]["voxels"] >= word["regions"][0]["voxels"]
+    assert len(alike["regions"]) <= 3
+    assert (tmp_path / "q.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert "did you mean 'yellow'?): --classes" in refused("query", room, "--class", "yelow")
+    assert "does not lie in the picture" in refused("query", room, "--image", looks, "--box", 5, 0, 4, 9)
+    assert "is not a picture" in refused("query", room, "--image", room / "map.yaml")
+    for wrong in (
+        ["red", "--box", 0, 0, 1, 1],
+        ["--class", "red", "--not", "blue"],
+        ["--interactive", "--class", "red"],
+    ):
+        assert run("query", room, *wrong, code=2).stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--threshold", "nan"], "'threshold'"),
+        (["--within", 0, 0, 0, 1, 1, "inf"], "'within'"),
+        (["--near", "blue:nan"], "'near'"),
+        (["--refine", "nan"], "nan"),
+        (["--top", 0], "'top_k'"),
+    ],
+)
+def test_a_query_with_impossible_numbers_is_refused(room, arguments, said) -> None:
+    assert said in refused("query", room, "red", *arguments)
+
+
+@pytest.mark.parametrize("option", ["--ply", "--picture", "--html"])
+def test_a_query_tells_of_an_unusable_target_before_it_answers(room, tmp_path, option) -> None:
+    kept = tmp_path / "kept.png"
+    kept.write_bytes(b"mine")
+    assert "exists: choose another name, or replace it with --overwrite" in refused("query", room, "red", option, kept)
+    assert kept.read_bytes() == b"mine"
+    assert "there is no folder" in refused("query", room, "red", option, tmp_path / "none" / "q.png")
+    assert "is a folder" in refused("query", room, "red", option, tmp_path, "--overwrite")
+
+
 def test_info_json_has_the_documented_keys(room) -> None:
     facts = json.loads(run("info", room, "--json").stdout)
     assert set(facts) >= {

@@ -158,3 +158,23 @@ def test_the_size_of_chunks_does_not_show(monkeypatch: pytest.MonkeyPatch) -> No
     np.testing.assert_array_equal(chunked.offset, codec.offset)
     np.testing.assert_array_equal(chunked.encode(features), codes)
     np.testing.assert_array_equal(chunked.decode(codes), codec.decode(codes))
+
+
+@pytest.mark.parametrize("features", [membership_features(), random_features(dimension=512)])
+def test_norms_that_are_kept_give_the_same_cosines(features: NDArray[np.float16]) -> None:
+    features[::5] = 0
+    codec = Codec.fit(features)
+    codes, text = codec.encode(features), features[1:4].astype(np.float32)
+    inverse = codec.inverse_norms(codes)
+    lengths = np.linalg.norm((codec._levels(codes) * codec.scale + codec.offset)[features.any(axis=1)], axis=1)
+    np.testing.assert_allclose(inverse[features.any(axis=1)], 1 / lengths, rtol=1e-5)
+    assert not inverse[::5].any()
+    np.testing.assert_allclose(codec.cosines(codes, text, inverse), codec.cosines(codes, text), atol=1e-6)
+
+
+@pytest.mark.parametrize(("rows", "words"), [(5000, 1), (5000, 300), (3, 7), (0, 5), (10, 0)])
+def test_products_in_tiles_are_products(rows: int, words: int) -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.random((rows, 48)).astype(np.float32), rng.random((48, words)).astype(np.float32)
+    np.testing.assert_allclose(codec_module._product(a, b), a @ b, rtol=1e-4)
+    assert codec_module._product(a[:, :0], b[:0]).shape == (rows, words)

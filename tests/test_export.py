@@ -9,7 +9,7 @@ from scenes import occupancy_of
 from freeocc3d.errors import ConfigError, ExportError
 from freeocc3d.export import export_map, npz, ply
 from freeocc3d.palette import HIGHLIGHTS
-from freeocc3d.query import Region
+from freeocc3d.regions import Region
 
 OCCUPIED = [(-9, 2, 0), (-8, 2, 0), (5, -3, 7), (6, 7, 8), (6, 7, 9)]
 FREE = [(-9, 3, 0), (0, 0, 0), (6, 7, 10)]

@@ -10,7 +10,7 @@ from test_export_frames import map_of
 
 from freeocc3d.errors import ConfigError, ExportError
 from freeocc3d.export import export_map, geojson
-from freeocc3d.query import Region
+from freeocc3d.regions import Region
 
 
 def asked(scan_map):

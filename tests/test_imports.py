@@ -12,14 +12,15 @@ ROOT = Path(__file__).parents[1] / "freeocc3d"
 FLOORS = (
     ("errors", "types"),
     ("geometry", "hashing", "lattice", "registry", "progress", "files", "arrays", "onnx_model"),
-    ("config", "keyframes"),
+    ("config", "keyframes", "manifest"),
     ("capture",),
     ("tracking",),
     ("gaussians",),
     ("language",),
     ("occupancy",),
+    ("instances", "regions"),
     ("query",),
-    ("places", "region_views", "relations", "standing"),
+    ("patches", "places", "query_classes", "region_views", "relations", "standing"),
     ("store", "palette"),
     ("export", "viewer", "work", "details"),
     ("evaluation",),
@@ -36,7 +37,7 @@ LAYERS = ("capture", "tracking", "gaussians", "language", "occupancy")
 HEAVY = {"open3d", "torch", "pyvista", "vtk", "numba", "pycolmap", "scipy", "cv2", "onnxruntime"}
 """Packages whose import takes a good part of a second."""
 
-FAST = ("store", "query", "places", "relations", "cli", "registry", "config", "__init__")
+FAST = ("store", "query", "regions", "instances", "places", "relations", "cli", "registry", "config", "__init__")
 """Modules that have to be imported in no time, for a query starts with them."""
 
 
@@ -154,7 +155,7 @@ def test_only_public_names_cross_between_parts(module: str) -> None:
     [
         ("pipeline", {"cli", "__init__"}),
         ("cli", set()),
-        ("config", {"pipeline", "refine", "scale", "adaptive", "cli", "work", "evaluation"}),
+        ("config", {"pipeline", "refine", "scale", "adaptive", "cli", "work", "evaluation", "patches"}),
         (
             "store",
             {

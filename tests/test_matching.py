@@ -51,6 +51,6 @@ def test_confidences_are_softmax_where_nothing_scores_higher(words: int, monkeyp
 def test_only_what_hangs_together_with_a_seed_grows() -> None:
     voxels = np.array([(0, 0, 0), (1, 1, 1), (2, 2, 2), (9, 0, 0), (9, 0, 1)], np.int32)
     seeds = np.array([False, False, True, False, False])
-    assert matching.grown(seeds, lambda: connected(voxels)).tolist() == [True, True, True, False, False]
-    assert not matching.grown(np.zeros(5, bool), lambda: connected(voxels)).any()
-    assert matching.grown(np.ones(5, bool), lambda: connected(voxels)).all()
+    assert matching.grown(seeds, connected(voxels)).tolist() == [True, True, True, False, False]
+    assert not matching.grown(np.zeros(5, bool), connected(voxels)).any()
+    assert matching.grown(np.ones(5, bool), connected(voxels)).all()

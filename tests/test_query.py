@@ -17,7 +17,8 @@ from freeocc3d import query as asking
 from freeocc3d.errors import ConfigError, FreeOccError, MapError
 from freeocc3d.language.encoders.base import TextEncoder, TextFeatures
 from freeocc3d.language.encoders.labels import LabelWords
-from freeocc3d.query import Options, connected, query, similarity, to_json, to_text
+from freeocc3d.occupancy.connected import connected
+from freeocc3d.query import Options, query, similarity, to_json, to_text
 from freeocc3d.types import BLOCK, FREE, OCCUPIED, Occupancy
 
 SIZE = 0.1
@@ -145,7 +146,7 @@ def test_a_speck_does_not_outrank_a_large_object_that_is_less_similar() -> None:
     room = occupancy(
         box((0, 0, 0), (4, 4, 4), feature(CUP=0.8, SOFA=0.4)) | box((20, 0, 0), (20 + 1, 1, 2), feature(CUP=1))
     )
-    result = query(room, WORDS, ["cup"])[0]
+    result = query(room, WORDS, ["cup"], Options(min_share=0.0))[0]
     large, speck = result.regions
     assert (large.voxels, speck.voxels) == (64, 2)
     assert result.scores[speck.rows].mean() > result.scores[large.rows].mean()
@@ -234,7 +235,19 @@ def test_features_of_another_encoder_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"top_k": 0}, {"min_voxels": 0}, {"threshold": 1.5}, {"grow": 0.0}, {"grow": 1.5}, {"scores": "best"}]
+    "bad",
+    [
+        {"top_k": 0},
+        {"min_voxels": 0},
+        {"threshold": 1.5},
+        {"grow": 0.0},
+        {"grow": 1.5},
+        {"scores": "best"},
+        {"min_share": 2.0},
+        {"narrow": float("nan")},
+        {"threshold": float("nan")},
+        {"grow": float("nan")},
+    ],
 )
 def test_options_out_of_range_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
@@ -377,3 +390,29 @@ def test_what_a_model_named_in_the_scene_competes_where_any_word_has_a_meaning()
     closed = LabelWords(CLASSES)
     for named in ((), ["wall"]):
         assert query(room, closed, ["wall"], None, named)[0].matched
+
+
+def test_occupied_voxels_are_kept_and_cannot_be_changed() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(CUP=1)))
+    assert room.occupied_voxels() is room.occupied_voxels()
+    with pytest.raises(ValueError, match="read-only"):
+        room.occupied_voxels()[0] = 5
+    assert len(room.replace(state=np.zeros_like(room.state)).occupied_voxels()) == 0
+
+
+def test_what_is_tiny_beside_the_largest_region_is_a_speck_whatever_the_voxels() -> None:
+    patch = box((20, 0, 0), (22, 2, 1), feature(CUP=1))
+    room = occupancy(box((0, 0, 0), (17, 17, 17), feature(CUP=1)) | patch)
+    assert [r.voxels for r in query(room, WORDS, ["cup"])[0].regions] == [17**3]
+    assert [r.voxels for r in query(room, WORDS, ["cup"], Options(min_share=0.0))[0].regions] == [17**3, 4]
+    small = occupancy(box((0, 0, 0), (10, 10, 10), feature(CUP=1)) | patch)
+    assert [r.voxels for r in query(small, WORDS, ["cup"])[0].regions] == [1000, 4]
+
+
+def test_what_is_no_patch_of_a_surface_is_a_speck_beside_a_thing_and_no_speck_beside_its_like() -> None:
+    few = box((20, 0, 0), (23, 1, 1), feature(CUP=1))
+    beside_a_thing = occupancy(box((0, 0, 0), (4, 4, 4), feature(CUP=1)) | few)
+    assert [r.voxels for r in query(beside_a_thing, WORDS, ["cup"])[0].regions] == [64]
+    assert [r.voxels for r in query(beside_a_thing, WORDS, ["cup"], Options(min_share=0.0))[0].regions] == [64, 3]
+    beside_its_like = occupancy(box((0, 0, 0), (5, 1, 1), feature(CUP=0.8, SOFA=0.6)) | few)
+    assert sorted(r.voxels for r in query(beside_its_like, WORDS, ["cup"])[0].regions) == [3, 5]

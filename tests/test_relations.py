@@ -7,7 +7,8 @@ import pytest
 from test_query import SIZE, WORDS, box, feature, occupancy
 
 from freeocc3d.errors import ConfigError, FreeOccError, MapError
-from freeocc3d.query import Options, Region, query
+from freeocc3d.query import Options, query
+from freeocc3d.regions import Region
 from freeocc3d.relations import Where, _References, _Space, near_word, only_where
 from freeocc3d.types import BLOCK, OCCUPIED, Occupancy
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from freeocc3d.geometry import transform
-from freeocc3d.query import Region
+from freeocc3d.regions import Region
 from freeocc3d.standing import Robot, standing_places
 from freeocc3d.types import BLOCK, FREE, OCCUPIED, Occupancy
 

@@ -12,6 +12,7 @@ from freeocc3d import store
 from freeocc3d.errors import MapError
 from freeocc3d.gaussians.cloud import from_point_cloud, read_ply, to_point_cloud, write_ply
 from freeocc3d.keyframes import Keyframes
+from freeocc3d.relations import Where
 from freeocc3d.types import Trajectory
 
 
@@ -34,6 +35,28 @@ def test_a_loaded_map_answers_and_keeps_its_parts_together(saved) -> None:
     assert loaded.trajectory.has_pose.sum() == 8
     assert loaded.query("red").matched
     assert loaded.labels().max() <= len(loaded.vocabulary)
+
+
+def test_a_class_is_the_voxels_that_are_labelled_so(saved) -> None:
+    loaded = freeocc3d.load_map(saved)
+    labels, everything = loaded.labels(), len(loaded.occupancy.colors)
+    for k, result in enumerate(loaded.query_classes(loaded.vocabulary, top_k=everything), start=1):
+        rows = [row for region in result.regions for row in region.rows.tolist()]
+        assert sorted(rows) == np.flatnonzero(labels == k).tolist()
+    (first,) = loaded.query_classes(loaded.vocabulary[:1], where=Where(pick="largest"))
+    assert len(first.regions) <= 1
+
+
+def test_what_a_picture_of_the_room_shows_is_found_again(saved) -> None:
+    loaded = freeocc3d.load_map(saved)
+    asked = loaded.query("red")
+    view = loaded.views_of(asked.regions[0])[0]
+    row = loaded.trajectory.keyframes.tolist().index(view.frame)
+    x0, y0, x1, y1 = view.box
+    middle = (x0 + x1) // 2, (y0 + y1) // 2
+    found = loaded.query_image(loaded.keyframes[row].color, (*middle, *middle))
+    assert found.word == "the picture"
+    assert set(asked.regions[0].rows.tolist()) & set(found.regions[0].rows.tolist())
 
 
 def test_gaussians_survive_the_point_cloud_and_the_file_exactly(tmp_path) -> None:

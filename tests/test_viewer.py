@@ -9,7 +9,7 @@ from scenes import occupancy_of
 
 from freeocc3d.errors import ExportError
 from freeocc3d.palette import HIGHLIGHTS, class_colors
-from freeocc3d.query import Region
+from freeocc3d.regions import Region
 from freeocc3d.types import Trajectory
 from freeocc3d.viewer import pictures
 from freeocc3d.viewer.scene import cut_height

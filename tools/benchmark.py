@@ -36,6 +36,7 @@ import held_out
 import kernels
 import language
 import mono
+import present_words
 import rendering
 import stereo
 import variants
@@ -344,6 +345,11 @@ EACH = {
         "names of things that are not there: how often a region is returned all the same",
         absent_words.measure_words,
         lambda rows: _asked_lines(absent_words.words_lines(rows)),
+    ),
+    "present_words": Each(
+        "names of the classes that are there: how much of each is found, and how soon",
+        present_words.measure_present,
+        lambda rows: _asked_lines(present_words.present_lines(rows)),
     ),
     "exports": Each(
         "every exporter at 4 cm: seconds, memory, bytes; the plan for robots beside the truth's",

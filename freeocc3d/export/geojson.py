@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import ExportError
 from ..geometry import transform
-from ..query import Region
+from ..regions import Region
 from ..store import Map
 from .frames import check_upright, to_frame
 

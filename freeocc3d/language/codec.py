@@ -8,6 +8,7 @@ for Minimum Distortion, IRE Trans. Inf. Theory 6(1), 1960.
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ _MARGIN = 0.02
 """By which an 8-bit range is widened on either side: a normalised mean of features can lie outside of it."""
 _ROWS = 8192  # worked on at once, so that float32 copies of all rows never exist
 _MANY = 200_000  # rows from which scores are computed by compiled code
+_ONE_THREAD = 1 << 18  # multiplications of a matrix product that OpenBLAS does on one thread
 _SAMPLE = 20000  # rows that quantisers are fitted to
 
 
@@ -110,27 +112,35 @@ class Codec:
             out[:] = values / np.where(norms > 0, norms, 1)
         return features
 
-    def cosines(self, codes: NDArray[np.uint8], text: NDArray[np.floating]) -> NDArray[np.float32]:
+    def inverse_norms(self, codes: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """(V,) one over the norms of the rows of coordinates that codes stand for, 0 for zero features."""
+        inverse = np.zeros(len(codes), np.float32)
+        for rows, out in zip(_chunks(codes), _chunks(inverse), strict=True):
+            values = self._levels(rows)
+            values *= self.scale
+            values += self.offset
+            squared = np.einsum("vr,vr->v", values, values)
+            something = (rows[:, 0] > 0) & (squared > 0)  # the first is an 8-bit level
+            np.divide(1, np.sqrt(squared), out=out, where=something)
+        return inverse
+
+    def cosines(
+        self, codes: NDArray[np.uint8], text: NDArray[np.floating], inverse: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
         """(V, W) cosines of coded features with (W, D) unit text features, without decoding: with levels c and text t
-        in the codec's coordinates, the dot product is c (scale t) + offset t, and the squared norm a quadratic in c.
-        Zero features give zero."""
+        in the codec's coordinates, the dot product is c (scale t) + offset t. Zero features give zero. inverse: their
+        ``inverse_norms`` where these are known already."""
         t = (text.astype(np.float32) @ self.basis.T).astype(np.float32)
-        if len(codes) >= _MANY or f"{__package__}.scoring" in sys.modules:
-            from . import scoring  # numba takes longer to import than fewer scores to compute
+        if _compiled(len(codes)):
+            from . import scoring
 
             fours, twos = (int(np.count_nonzero(self.bits == bits)) * bits // 8 for bits in _BITS[1:])
             return np.asarray(scoring.cosines(codes, fours, twos, self.scale, self.offset, t))
-        linear = np.concatenate((t * self.scale, [2 * self.scale * self.offset])).T
-        constant, squared_offset = t @ self.offset, float(self.offset @ self.offset)
+        linear, constant = (t * self.scale).T, t @ self.offset
+        inverse = self.inverse_norms(codes) if inverse is None else inverse
         scores = np.empty((len(text), len(codes)), np.float32).T  # a word's scores lie together
-        for rows, out in zip(_chunks(codes), _chunks(scores), strict=True):
-            c = self._levels(rows)
-            products = c @ linear
-            np.multiply(c, c, out=c)
-            squared = c @ (self.scale**2) + products[:, -1] + squared_offset
-            something = (rows[:, 0] > 0) & (squared > 0)  # the first is an 8-bit level
-            inverse = np.where(something, 1 / np.sqrt(np.where(something, squared, 1.0)), 0.0).astype(np.float32)
-            np.multiply(products[:, :-1] + constant, inverse[:, None], out=out)
+        for rows, length, out in zip(_chunks(codes), _chunks(inverse), _chunks(scores), strict=True):
+            np.multiply(_product(self._levels(rows), linear) + constant, length[:, None], out=out)
         return scores
 
     def _levels(self, codes: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -176,6 +186,11 @@ class CodedFeatures:
     def __getitem__(self, rows: Any) -> CodedFeatures:
         return CodedFeatures(self.codec, self.codes[rows])
 
+    @functools.cached_property
+    def inverse_norms(self) -> NDArray[np.float32]:
+        """(V,) ``Codec.inverse_norms``, kept, for many words are asked of the same features."""
+        return self.codec.inverse_norms(self.codes)
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return self.codec.decode(self.codes).astype(dtype or np.float16, copy=False)
 
@@ -191,7 +206,8 @@ Features: TypeAlias = NDArray[np.floating] | CodedFeatures
 def cosines(features: Features, text: NDArray[np.floating]) -> NDArray[np.float32]:
     """(V, W) cosines of unit features, coded or not, with (W, D) unit text features; zero features give zero."""
     if isinstance(features, CodedFeatures):
-        return features.codec.cosines(features.codes, text)
+        inverse = None if _compiled(len(features)) else features.inverse_norms
+        return features.codec.cosines(features.codes, text, inverse)
     found = np.empty((len(text), len(features)), np.float32).T
     t = text.astype(np.float32).T
     for rows, out in zip(_chunks(features), _chunks(found), strict=True):
@@ -201,8 +217,25 @@ def cosines(features: Features, text: NDArray[np.floating]) -> NDArray[np.float3
 
 def known(features: Features) -> NDArray[np.bool_]:
     """(V,) whether anything is known of each feature: whether it is not zero."""
-    rows = features.codes if isinstance(features, CodedFeatures) else features
+    rows = features.codes[:, :1] if isinstance(features, CodedFeatures) else features  # its first level says it
     return np.asarray(rows.any(axis=1))
+
+
+def _compiled(count: int) -> bool:
+    """Whether so many scores are left to numba, which takes longer to import than fewer to compute."""
+    return count >= _MANY or f"{__package__}.scoring" in sys.modules
+
+
+def _product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(V, R) @ (R, W) in tiles that OpenBLAS does not share out among threads. To wait for these takes longer than so
+    small a product where other programs are running, as on a robot: 10 to 20 ms each time."""
+    tile = max(1, _ONE_THREAD // max(b.size, 1))
+    count = len(a) // tile
+    whole = count * tile
+    out = np.empty((len(a), b.shape[1]), np.float32)
+    np.matmul(a[:whole].reshape(count, tile, a.shape[1]), b, out=out[:whole].reshape(count, tile, b.shape[1]))
+    np.matmul(a[whole:], b, out=out[whole:])
+    return out
 
 
 def _directions(features: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:

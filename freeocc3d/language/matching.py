@@ -11,7 +11,6 @@ Source of the relevancy: J. Kerr et al., LERF: Language Embedded Radiance Fields
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,11 +57,12 @@ def confidences(
 
         return np.asarray(scoring.confidences(scores, others, candidates, competes, np.float32(1 / temperature)))
     out = np.zeros(scores.shape, np.float32)
+    by_word = np.ascontiguousarray(others.T)  # as they mostly lie in memory
     for w, rivals in enumerate(competes):
         rows = np.flatnonzero(candidates[:, w])
-        margin = others[rows][:, rivals] - scores[rows, w, None]
-        best = margin.max(axis=1, initial=-1.0) <= 0
-        out[rows[best], w] = softmax(np.exp(margin[best] / np.float32(temperature)).sum(axis=1))
+        margin = by_word[np.ix_(rivals, rows)] - scores[rows, w]
+        best = margin.max(axis=0, initial=-1.0) <= 0
+        out[rows[best], w] = softmax(np.exp(margin[:, best] / np.float32(temperature)).sum(axis=0))
     return out
 
 
@@ -76,11 +76,7 @@ def relevancy(largest: NDArray[np.float32], temperature: float) -> NDArray[np.fl
     return np.asarray(1 / (1 + np.exp(np.minimum(largest / np.float32(temperature), 80))), np.float32)
 
 
-def grown(seeds: NDArray[np.bool_], connected: Callable[[], NDArray[np.int32]]) -> NDArray[np.bool_]:
-    """(V,) which voxels hang together with a seed, given what gives the component of each: regions begin where a word
-    fits well, and end where it fits no more (hysteresis; J. Canny, A Computational Approach to Edge Detection, PAMI
-    1986)."""
-    if seeds.all() or not seeds.any():
-        return seeds
-    component = connected()
+def grown(seeds: NDArray[np.bool_], component: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(V,) which voxels hang together with a seed, given the component of each: regions begin where a word fits well,
+    and end where it fits no more (hysteresis; J. Canny, A Computational Approach to Edge Detection, PAMI 1986)."""
     return np.asarray(np.bincount(component, seeds)[component] > 0)

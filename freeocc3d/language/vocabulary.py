@@ -92,6 +92,7 @@ _PREPOSITIONS = {
 _LONGEST_PHRASE = 16
 
 
+@functools.lru_cache(maxsize=4096)
 def normal(phrase: str) -> str:
     """Lower case, no articles or punctuation, each word in the singular: "The Coffee-Tables" to "coffee table"."""
     words = re.findall(r"[^\W_]+", phrase.lower())
@@ -154,7 +155,7 @@ def parts_of(phrase: str) -> list[str]:
     return list(dict.fromkeys(part for part in (normal(" ".join(tokens)), *ends) if part))
 
 
-def _named(words: frozenset[str], known: list[str], kinds: list[set[str]]) -> list[int]:
+def _named(words: frozenset[str], known: list[str], kinds: list[frozenset[str]]) -> list[int]:
     """Rows of the names that are one of ``words``, or a kind of one."""
     keys = {key_of(word) for word in words}
     keys |= {key_of(name) for word in words for name in narrower(word)}
@@ -171,10 +172,11 @@ def key_of(name: str) -> str:
     return normal(name).replace(" ", "")
 
 
-def _tail_keys(name: str) -> set[str]:
+@functools.lru_cache(maxsize=4096)
+def _tail_keys(name: str) -> frozenset[str]:
     """Keys of what a name of several words is a kind of: of "small office chair", "office chair" and "chair"."""
     words = normal(name).split()
-    return {"".join(words[start:]) for start in range(1, len(words))}
+    return frozenset("".join(words[start:]) for start in range(1, len(words)))
 
 
 def _singular(word: str) -> str:

@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..hashing import put
+from ..lattice import packed_voxels, unpacked_voxels
 from ..types import BLOCK
 
 KEY_LIMIT = 1 << 20
@@ -16,17 +17,8 @@ KEY_LIMIT = 1 << 20
 kilometre from the origin it costs tenths of a millimetre."""
 
 
-def pack(keys: NDArray[np.integer]) -> NDArray[np.int64]:
-    """(B, 3) block indices to (B,) one integer each, in the order of (i, j, k)."""
-    k = np.asarray(keys, np.int64) + KEY_LIMIT
-    return (k[:, 0] << 42) | (k[:, 1] << 21) | k[:, 2]
-
-
-def unpack(packed: NDArray[np.int64]) -> NDArray[np.int32]:
-    """The inverse of ``pack``."""
-    mask = (1 << 21) - 1
-    keys = np.stack((packed >> 42, (packed >> 21) & mask, packed & mask), axis=1) - KEY_LIMIT
-    return keys.astype(np.int32)
+pack, unpack = packed_voxels, unpacked_voxels
+"""(B, 3) block indices to (B,) integers and back."""
 
 
 def union(*packed: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -13,7 +13,8 @@ from ..errors import ExportError
 from ..files import write_whole
 from ..occupancy.faces import exposed_faces
 from ..palette import HIGHLIGHTS, class_colors, height_colors, highlighted
-from ..query import QueryResult, Region
+from ..query import QueryResult
+from ..regions import Region
 from ..store import Map
 from ..types import Occupancy
 from .scene import BACKGROUND, CUT, VIEWS, Scene, cut_height, render, shaded, upright
@@ -47,11 +48,16 @@ def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: boo
         colors = height_colors(occupancy, scan_map.up)
     else:
         raise ExportError(f"A map can be coloured by rgb, class or height, not by '{by}'.")
-    _draw(scan_map, colors, [], _title(scan_map), legend, Path(path), overwrite)
+    _write(_drawn(scan_map, colors, [], _title(scan_map), legend), Path(path), overwrite)
 
 
 def query_picture(scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False) -> None:
     """Draw the map pale with what each word matched in a strong colour, boxed; PNG. Raises as ``map_picture``."""
+    _write(query_png(scan_map, results), Path(path), overwrite)
+
+
+def query_png(scan_map: Map, results: Sequence[QueryResult]) -> bytes:
+    """What ``query_picture`` writes."""
     _refuse_empty(scan_map)
     colors = highlighted(scan_map.occupancy.colors, [result.regions for result in results])
     legend = []
@@ -60,7 +66,7 @@ def query_picture(scan_map: Map, results: Sequence[QueryResult], path: str | Pat
         color = tuple(HIGHLIGHTS[number % len(HIGHLIGHTS)].tolist())
         legend.append((_found(result), color))
         boxes += [(region, color) for region in result.regions]
-    _draw(scan_map, colors, boxes, _title(scan_map), legend, Path(path), overwrite)
+    return _drawn(scan_map, colors, boxes, _title(scan_map), legend)
 
 
 def _found(result: QueryResult) -> str:
@@ -77,23 +83,25 @@ def _refuse_empty(scan_map: Map) -> None:
         raise ExportError(f"The map {scan_map.path} has no occupied voxel to draw.")
 
 
-def _draw(
+def _write(png: bytes, path: Path, overwrite: bool) -> None:
+    if path.suffix.lower() != ".png":
+        raise ExportError(f"Pictures are written as PNG: name it {path.with_suffix('.png')} in place of {path}.")
+    write_whole(path, lambda target: _write_bytes(target, png), overwrite)
+
+
+def _drawn(
     scan_map: Map,
     colors: NDArray[np.uint8],
     regions: list[tuple[Region, tuple[int, int, int]]],
     title: str,
     legend: list[tuple[str, tuple[int, int, int]]],
-    path: Path,
-    overwrite: bool,
-) -> None:
-    if path.suffix.lower() != ".png":
-        raise ExportError(f"Pictures are written as PNG: name it {path.with_suffix('.png')} in place of {path}.")
+) -> bytes:
+    """The picture as PNG."""
     scene = _scene(scan_map, colors, regions)
     width, height = SIZE[0] // 2, SIZE[1] - 2 * _BAR
     views = np.hstack([render(scene, view, (width, height)) for view in VIEWS])
     picture = _framed(views, title, legend)
-    encoded = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
-    write_whole(path, lambda target: _write_bytes(target, encoded), overwrite)
+    return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
 
 
 def _write_bytes(path: Path, data: bytes) -> None:

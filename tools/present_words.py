@@ -1,0 +1,191 @@
+#!/usr/bin/env python3
+"""Asks maps for what is there: how well the voxels of a class are found by its name, and how soon. Part of
+tools/benchmark.py.
+
+    python tools/present_words.py [CAPTURE ...] [--json]
+
+A capture is mapped with its class images and poses, and its Gaussians are projected on the truth's lattice, as
+``freeocc3d evaluate`` does: a half-voxel shift between two lattices would be taken for an error of the answer. Asked is
+for the name of each class of which the truth holds LEAST voxels; what all regions of the answer hold is compared with
+the voxels of the classes that the name means, over voxels that the truth knows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Figures = dict[str, Any]
+
+DATA = Path(os.environ.get("FREEOCC3D_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+LEAST = 30
+ENOUGH = 0.5
+ABSENT = ("bathtub", "bicycle")
+COLD_STARTS = 5
+
+
+def measure_present(capture: str) -> Figures:
+    """IoU of each class, absent words that return something, and seconds of queries."""
+    from freeocc3d.pipeline import reconstruct
+    from freeocc3d.progress import Progress
+
+    settings = {"language": {"encoder": "labels"}, "tracking": {"backend": "known"}, "fitting": {"passes": 0}}
+    with tempfile.TemporaryDirectory() as folder:
+        made = reconstruct(capture, Path(folder) / "map", settings, progress=Progress())
+        found = classes_found(made, Path(capture) / "ground_truth.npz")
+        command = [sys.executable, __file__, "--seconds", str(made.path)]  # nothing is imported there for other reasons
+        timed = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        return {**found, **timed}
+
+
+def classes_found(scan_map: Any, truth_path: Path) -> Figures:
+    """How well each class is found, in a map whose frame is the truth's.
+
+    iou: of the answer.  occupied: share of the class's voxels that the map holds occupied at all.  iou_occupied: of the
+    answer among voxels that both hold occupied: what is left to language.
+    """
+    from freeocc3d import config, query, registry
+    from freeocc3d.evaluation.ground_truth import load_ground_truth
+    from freeocc3d.occupancy import build, carve, splat
+    from freeocc3d.types import UNKNOWN, PosedFrame
+
+    truth = load_ground_truth(truth_path)
+    settings = config.load(scan_map.path / "config.yaml")
+    poses = scan_map.trajectory.T_world_keyframe
+    keyframes = (PosedFrame(f, T, row) for row, (f, T) in enumerate(zip(scan_map.keyframes, poses, strict=True)))
+    occupancy = build.build_occupancy(
+        scan_map.gaussians,
+        scan_map.gaussian_features,
+        keyframes,
+        registry.build_options(splat, {**settings["occupancy"], "voxel_size": truth.voxel_size}),
+        registry.build_options(carve, settings["carving"]),
+        origin=truth.origin,
+    )
+    voxels = occupancy.occupied_voxels()
+    inside = ((voxels >= 0) & (voxels < truth.shape)).all(axis=1)
+    true = np.full(len(voxels), UNKNOWN, np.uint8)
+    true[inside] = truth.labels[tuple(voxels[inside].T)]
+
+    count = np.bincount(truth.labels.ravel(), minlength=256)
+    names = [name for k, name in enumerate(truth.classes) if k and count[k] >= LEAST]
+    options = query.Options(top_k=max(len(voxels), 1))
+    rows: Figures = {}
+    for result in query.query(occupancy, scan_map.text_encoder, names, options):
+        meant = [k + 1 for k in scan_map.text_encoder.matching(result.word)[0]]
+        found = np.zeros(len(voxels), bool)
+        found[np.concatenate([np.zeros(0, np.int64), *(region.rows for region in result.regions)])] = True
+        found &= true != UNKNOWN
+        right, held = found & np.isin(true, meant), np.isin(true, meant)
+        rows[result.word] = {
+            "voxels": int(count[meant].sum()),
+            "regions": len(result.regions),
+            "iou": float(right.sum() / (found.sum() + count[meant].sum() - right.sum())),
+            "occupied": float(held.sum() / count[meant].sum()),
+            "iou_occupied": float(right.sum() / max(((found & (true != 0)) | held).sum(), 1)),
+        }
+    absent = [word for word in ABSENT if word not in truth.classes]
+    answered = [r.word for r in query.query(occupancy, scan_map.text_encoder, absent, options) if r.matched]
+    return {"classes": rows, "absent": absent, "absent_answered": answered}
+
+
+def seconds(map_path: Path) -> Figures:
+    """Of a process that answers one word, in text, in JSON and with all details; and of one word after the other, each
+    for the first time, in a loaded map: median, longest, and median of the processor's time, on which other programs
+    have no part."""
+    from freeocc3d.store import load_map
+
+    loaded = load_map(map_path)
+    words = loaded.text_encoder.contrast_words()
+    loaded.query_words(words[:1])
+    times, of_processor = [], []
+    for word in words[1:]:
+        mark, mark_of_processor = time.perf_counter(), time.process_time()
+        loaded.query(word)
+        times.append(time.perf_counter() - mark)
+        of_processor.append(time.process_time() - mark_of_processor)
+    cold = {}
+    for options in ((), ("--json",), ("--json", "--views")):
+        command = [sys.executable, "-m", "freeocc3d.cli", "query", str(map_path), words[0], *options]
+        runs = []
+        for _ in range(COLD_STARTS):
+            mark = time.perf_counter()
+            subprocess.run(command, check=True, capture_output=True)
+            runs.append(time.perf_counter() - mark)
+        cold[" ".join(options) or "text"] = statistics.median(runs)
+    return {
+        "cold_seconds": cold,
+        "loaded_seconds": statistics.median(times),
+        "loaded_most_seconds": max(times),
+        "loaded_processor_seconds": statistics.median(of_processor),
+    }
+
+
+def present_lines(rows: list[Figures]) -> list[tuple[str, str, str]]:
+    """Rows of a table: what, measured, asked."""
+    lines = []
+    for row in rows:
+        where = f"{row['capture']}, `labels`"
+        if "error" in row:
+            lines.append((where, f"not available, {row['error']}", ""))
+            continue
+        found = row["classes"]
+        enough = [name for name, own in found.items() if own["iou"] >= ENOUGH]
+        short = "".join(
+            f"; {name}: IoU {own['iou']:.2f}, of whose voxels {own['occupied']:.0%} are occupied"
+            for name, own in found.items()
+            if name not in enough
+        )
+        share = f"{len(enough)} of {len(found)}, {len(enough) / max(len(found), 1):.0%}"
+        lines += [
+            (f"{where}: classes found with IoU ≥ {ENOUGH}", share + short, "≥ 80 %"),
+            (f"{where}: {' and '.join(row['absent'])} that return a region", f"{len(row['absent_answered'])}", "0"),
+            (
+                f"{where}: one word in a loaded map, median and most",
+                f"{1e3 * row['loaded_seconds']:.1f}, {1e3 * row['loaded_most_seconds']:.1f} ms "
+                f"({1e3 * row['loaded_processor_seconds']:.1f} ms of the processor)",
+                "≤ 30 ms",
+            ),
+        ]
+        lines += [
+            (f"{where}: cold start, {options}", f"{taken:.2f} s", "≤ 1.5 s")
+            for options, taken in row["cold_seconds"].items()
+        ]
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", nargs="*", type=Path, help="folders of scans [default: those of the data folder]")
+    parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
+    parser.add_argument("--seconds", type=Path, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.seconds is not None:
+        print(json.dumps(seconds(given.seconds)))
+        return
+    captures = given.captures or [DATA / name for name in ("house/bedroom", "house/living")]
+    rows = [{"capture": path.name, **measure_present(str(path.resolve()))} for path in captures]
+    if given.json:
+        print(json.dumps(rows))
+        return
+    for line in present_lines(rows):
+        print(f"| {' | '.join(line)} |")
+    for row in rows:
+        for name, own in row["classes"].items():
+            print(
+                f"{row['capture']}: {name}: {own['voxels']} voxels, IoU {own['iou']:.2f}, {own['occupied']:.0%} "
+                f"occupied, IoU where both are occupied {own['iou_occupied']:.2f}, {own['regions']} regions"
+            )
+
+
+if __name__ == "__main__":
+    main()
