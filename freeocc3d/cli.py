@@ -460,7 +460,10 @@ def evaluate(
             help="True poses; one for each map. [default: the poses of the capture that the map was made of]",
         ),
     ] = None,
-    align: Annotated[str, typer.Option("--align", help="se3, sim3 (monocular) or none.")] = "se3",
+    align: Annotated[
+        str | None,
+        typer.Option("--align", help="se3, sim3 or none. [default: se3; sim3 for maps of unknown scale]"),
+    ] = None,
     classes: Annotated[Path | None, typer.Option("--classes", metavar="FILE", help="Classes to score.")] = None,
     split: Annotated[
         Path | None, typer.Option("--split", metavar="FILE", help="Score the scenes that this file lists.")

@@ -211,3 +211,13 @@ def test_given_trackers_know_whether_their_poses_are_metric(tmp_path: Path, room
     )
     assert scaled.metric
     np.testing.assert_allclose(scaled.T_world_cam[:, :3, 3], 3 * tracker.T_world_cam[:, :3, 3])
+
+
+def test_a_map_of_unknown_scale_is_scored_at_the_true_one(half: Map, tmp_path: Path) -> None:
+    truth = tmp_path / "truth.npz"
+    run("ground-truth", "builtin:room", "-o", truth)
+    scored = json.loads(run("evaluate", half.path, "--ground-truth", truth, "--json").stdout)
+    assert scored["align"] == "sim3"
+    assert scored["alignment"]["scale"] == pytest.approx(2.0)
+    as_it_is = json.loads(run("evaluate", half.path, "--ground-truth", truth, "--align", "se3", "--json").stdout)
+    assert scored["iou"] > 0.5 > 10 * as_it_is["iou"]

@@ -198,7 +198,7 @@ class Asked:
 
     ground_truths: one for each map, or one folder of packages, or none: the captures' own ``ground_truth.npz``.
     poses: one for each map, or none: the captures' own.  classes: a class file.  split: a file that lists the scenes to
-    score.  overrides: options of layer 4.
+    score.  overrides: options of layer 4.  align: se3, sim3 or none; None = se3, and sim3 if a map's scale is unknown.
     """
 
     maps: Sequence[Path] = ()
@@ -208,7 +208,7 @@ class Asked:
     trajectory: Path | None = None
     ground_truths: Sequence[Path] = ()
     poses: Sequence[str] = ()
-    align: str = "se3"
+    align: str | None = None
     classes: Path | None = None
     split: Path | None = None
     overrides: Sequence[str] = ()
@@ -217,6 +217,7 @@ class Asked:
 def evaluate(asked: Asked) -> Evaluation:
     """Read what is asked for, score each scene, pool. Raises FreeOccError with one sentence about what does not fit."""
     maps = [load_map(path) for path in asked.maps]
+    how = asked.align or ("se3" if all(scan_map.metric for scan_map in maps) else "sim3")
     if asked.split is not None:
         maps = _in_split(maps, asked.split)
     count = max(len(maps), 1)
@@ -236,22 +237,22 @@ def evaluate(asked: Asked) -> Evaluation:
             raise FreeOccError(f"There is no {other} to score.")
     if maps:
         scenes = [
-            score_map(scan_map, truth, classes, true, asked.align, asked.overrides)
+            score_map(scan_map, truth, classes, true, how, asked.overrides)
             for scan_map, truth, true in zip(maps, truths, poses, strict=True)
         ]
     elif asked.gaussians is not None:
         scenes = [
-            score_gaussians(asked.gaussians, truths[0], classes, trajectory, poses[0], asked.align, asked.overrides)
+            score_gaussians(asked.gaussians, truths[0], classes, trajectory, poses[0], how, asked.overrides)
         ]
     elif asked.grid is not None:
-        scenes = [score_grid(asked.grid, truths[0], classes, trajectory, poses[0], asked.align)]
+        scenes = [score_grid(asked.grid, truths[0], classes, trajectory, poses[0], how)]
     elif asked.frames is not None:
         if poses[0] is None:
             raise FreeOccError("Per-frame Gaussians are fused by true poses: name them with --poses.")
         scenes = [score_frames(asked.frames, truths[0], classes, poses[0], asked.overrides)]
     else:
         raise FreeOccError("There is nothing to score: give a map, or --gaussians, --grid or --frames.")
-    return Evaluation(tuple(scenes), classes.classes, asked.align, listed is not None)
+    return Evaluation(tuple(scenes), classes.classes, how, listed is not None)
 
 
 def scene_name(scan_map: Map) -> str:
