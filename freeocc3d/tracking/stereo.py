@@ -57,7 +57,7 @@ class Options:
     agreeing: int = 3
     """Views whose depth must confirm a pixel's, of twice as many as each frame is compared with."""
     vaguest: float = 0.02
-    """Standard deviation over depth beyond which a pixel is left empty."""
+    """Standard deviation over depth beyond which a pixel is left empty; small images need more."""
     network: str | None = None
     """ONNX network that guesses (inverse) depth from one image, fitted to each frame's stereo depth; it fills what
     stereo leaves empty."""
