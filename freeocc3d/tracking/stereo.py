@@ -54,9 +54,9 @@ class Options:
     """Views that each frame is compared with."""
     planes: int = 12
     """Planes looked for around each frame, on which surfaces without texture are put; 0 = leave these empty."""
-    agreeing: int = 3
+    agreeing: int = 2
     """Views whose depth must confirm a pixel's, of twice as many as each frame is compared with."""
-    vaguest: float = 0.02
+    vaguest: float = 0.025
     """Standard deviation over depth beyond which a pixel is left empty; small images need more."""
     network: str | None = None
     """ONNX network that guesses (inverse) depth from one image, fitted to each frame's stereo depth; it fills what
