@@ -40,7 +40,7 @@ _STORED: dict[str, dict[str, tuple[str, int]]] = {
     **{stage: {"inverse": ("f", 2), "sigma": ("f", 2)} for stage in ("measured", "completed", "depth")},
 }
 _SAME_DEPTH = 0.01  # relative: up to it views agree, whatever their standard deviations
-_LOOKING_THROUGH = 0.25  # views that contradict, over those that agree
+_LOOKING_THROUGH = 0.5  # views that contradict, over those that agree
 _SAME_SURFACE = 0.02  # relative: beyond it, depths of adjacent pixels belong to different things
 
 
