@@ -50,7 +50,7 @@ class Colour(Capture):
 def _tracker(capture: Capture, folder: Path, frames=FRAMES, change: Callable = lambda T: T, **options):
     tracker = known.load(known.Options(), capture)
     tracker.T_world_cam = change(tracker.T_world_cam)
-    tracker.stereo = stereo.Options(size=160, **options)
+    tracker.stereo = stereo.Options(size=160, vaguest=0.08, **options)  # a pixel of so small an image is vague
     assert tracker.offline
     tracker.prepare(folder, frames, Progress())
     return tracker

@@ -40,7 +40,7 @@ _STORED: dict[str, dict[str, tuple[str, int]]] = {
     **{stage: {"inverse": ("f", 2), "sigma": ("f", 2)} for stage in ("measured", "completed", "depth")},
 }
 _SAME_DEPTH = 0.01  # relative: up to it views agree, whatever their standard deviations
-_LOOKING_THROUGH = 0.25  # views that contradict, over those that agree
+_LOOKING_THROUGH = 0.5  # views that contradict, over those that agree
 _SAME_SURFACE = 0.02  # relative: beyond it, depths of adjacent pixels belong to different things
 
 
@@ -54,10 +54,10 @@ class Options:
     """Views that each frame is compared with."""
     planes: int = 12
     """Planes looked for around each frame, on which surfaces without texture are put; 0 = leave these empty."""
-    agreeing: int = 3
+    agreeing: int = 2
     """Views whose depth must confirm a pixel's, of twice as many as each frame is compared with."""
-    vaguest: float = 0.02
-    """Standard deviation over depth beyond which a pixel is left empty."""
+    vaguest: float = 0.025
+    """Standard deviation over depth beyond which a pixel is left empty; small images need more."""
     network: str | None = None
     """ONNX network that guesses (inverse) depth from one image, fitted to each frame's stereo depth; it fills what
     stereo leaves empty."""
