@@ -362,6 +362,9 @@ def _track(mapper: Mapper, work: WorkFolder, progress: Progress) -> None:
     frames = used_frames(capture)
     if mapper.tracker.offline:
         mapper.tracker.prepare(work.begin_offline(), frames, progress)
+        for text in mapper.tracker.warnings:
+            work.warnings.append(text)
+            progress.warn(text)
     first = _restore(mapper, work)
     progress.stage("tracking", len(frames))
     allowed = capture.options.max_broken * len(frames)

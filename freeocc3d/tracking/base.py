@@ -60,6 +60,8 @@ class Tracker(ABC):
     """Whether its poses are in metres; where not, their unit is unknown, and so is the scale of what is mapped."""
     offline: bool = False
     """Whether ``prepare`` works through the whole scan before the first frame is tracked."""
+    warnings: tuple[str, ...] = ()
+    """What ``prepare`` found that the user should know."""
     stereo: stereo.Options
     """How depth is measured where the capture has none; set before ``prepare``."""
 

@@ -80,9 +80,7 @@ class ColmapTracker(GivenTracker):
 
     def scan(self, folder: Path, frames: range, progress: Progress) -> Scan:
         found = self._reconstructed(folder, frames, progress)
-        for text in found.warnings:
-            progress.warn(text)
-        self.reconstruction, self.T_world_cam = found, found.T_world_cam
+        self.reconstruction, self.T_world_cam, self.warnings = found, found.T_world_cam, found.warnings
         return found
 
     def _reconstructed(self, folder: Path, frames: range, progress: Progress) -> Reconstruction:
