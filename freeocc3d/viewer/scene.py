@@ -47,6 +47,13 @@ def upright(up: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np
     return turn @ R
 
 
+def lengthwise(R: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """A (3, 3) rotation to a frame with z up and walls along x and y, or that and a quarter turn, so that (N, 3) points
+    reach farther along x than along y."""
+    x, y = np.ptp(points @ R[:2].T, axis=0)
+    return R if x >= y else np.array(((0, 1, 0), (-1, 0, 0), (0, 0, 1.0))) @ R
+
+
 def cut_height(height: NDArray[np.floating], voxel_size: float) -> float:
     """Up to which height voxels are drawn, of (V,) heights of voxel centres: not too near to the ceiling."""
     low, high = np.percentile(height, (1, 99))
