@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 from pathlib import Path
@@ -369,6 +370,9 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command; a known error is one line on stderr and exit code 1, or with --debug its traceback."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
+    for stream, errors in ((sys.stdin, "replace"), (sys.stdout, "backslashreplace")):  # what no terminal shows is told
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=errors)
     try:
         app(args=[argument for argument in arguments if argument != "--debug"], prog_name="freeocc3d")
     except FreeOccError as error:

@@ -102,9 +102,11 @@ def query(
         raise typer.BadParameter("--views adds to the document of --json: give both.")
     if refine_to is not None and questions > 1:
         raise typer.BadParameter("--refine looks around the best match of one word.")
-    for target in (ply, picture, html):
-        if target is not None:
-            refuse_existing(target, overwrite)
+    targets = [target for target in (ply, picture, html) if target is not None]
+    if len(set(targets)) < len(targets):
+        raise typer.BadParameter("--ply, --picture and --html are files of their own: give each another name.")
+    for target in targets:
+        refuse_existing(target, overwrite)
     options: dict[str, Any] = {}
     if top is not None:
         options["top_k"] = top
