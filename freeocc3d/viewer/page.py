@@ -71,7 +71,7 @@ def _page(scan_map: Map, results: Sequence[QueryResult]) -> str:
             at += 1
         answers.append({"result": result, "color": f"rgb({', '.join(map(str, color))})", "rows": rows})
     return environment.get_template("page.html").render(
-        version=__version__, name=str(scan_map.path), answers=answers, picture=picture, why=why
+        version=__version__, name=str(scan_map.path), answers=answers, picture=picture, why=why, metric=scan_map.metric
     )
 
 
