@@ -133,7 +133,7 @@ def query(
             f"{text.features.shape[1]}: make the map again with this version."
         )
     expressed = others.features.any(axis=1)
-    competes: NDArray[np.bool_] = np.asarray((text.features @ others.features.T < text_encoder.same_word) & expressed)
+    competes = (cosines(text.features, others.features) < text_encoder.same_word) & expressed
     cosine = similarity(features, text)
     says = known(features)
     plain = options.scores == "cosine"
