@@ -69,6 +69,21 @@ def test_walls_lie_along_the_picture_though_the_least_box_around_the_map_does_no
     assert np.linalg.det(R) == 1
 
 
+def test_a_match_is_in_the_view_however_far_off(tmp_path) -> None:
+    far = [(x, 20, 0) for x in (400, 401)]
+    floor = [(x, 20, z) for x in range(40) for z in range(40)]
+    room = room_map(tmp_path)
+    room.occupancy = occupancy_of([*floor, *far], colors=[(150, 120, 90)] * len(floor) + [(20, 20, 20)] * len(far))
+    size, voxels = room.occupancy.voxel_size, room.occupancy.occupied_voxels()
+    rows = np.flatnonzero(voxels[:, 0] >= 400)
+    corner = room.occupancy.origin + voxels[rows].min(axis=0) * size
+    region = Region(1.0, 1.0, corner + size, corner, corner + size * np.array((2, 1, 1)), 2 * size**3, rows)
+    result = SimpleNamespace(word="far", regions=[region])
+    pictures.query_picture(room, [result], tmp_path / "far.png")
+    view = cv2.imread(str(tmp_path / "far.png"))[56:-56, :800, ::-1].astype(int)
+    assert (np.abs(view - HIGHLIGHTS[0]).max(axis=-1) < 40).any()
+
+
 def test_by_class_and_height(tmp_path) -> None:
     room = room_map(tmp_path)
     pictures.map_picture(room, tmp_path / "class.png", by="class")
