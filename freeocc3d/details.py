@@ -22,7 +22,8 @@ def details(scan_map: Map, results: Sequence[QueryResult], views: bool = False) 
 
     oriented_box: extent (metres along its own axes), yaw (radians, gravity frame), T_map_box (4 x 4).
     views: also keyframes, the frame, pixel box x0 y0 x1 y1 and visible share of those that show it best, and stand,
-    the nearest place x y z on the floor where a robot could stand and see it, null where there is none.
+    the nearest place x y z on the floor where a robot could stand and see it, null where there is none, or
+    where lengths are not metres.
     """
     regions = [region for result in results for region in result.regions]
     number = {id(region): n for n, region in enumerate(regions)}
@@ -31,10 +32,9 @@ def details(scan_map: Map, results: Sequence[QueryResult], views: bool = False) 
     stands: list[NDArray[np.float64] | None] = []
     if views and regions:
         from .region_views import best_views
-        from .standing import standing_places
 
         seen = best_views(scan_map.occupancy, scan_map.trajectory, scan_map.keyframes, regions)
-        stands = standing_places(scan_map.occupancy, scan_map.T_gravity_map, regions)
+        stands = scan_map.standing_places(regions)
 
     def more(region: Region) -> dict[str, Any]:
         box = boxes[number[id(region)]]

@@ -25,13 +25,14 @@ from .language import matching
 from .language.codec import Features, cosines, known
 from .occupancy.connected import connected
 from .regions import Region, best_regions
-from .registry import require_positive
+from .registry import nearest, require_positive
 from .types import Occupancy
 
 if TYPE_CHECKING:
     from .language.encoders.base import TextEncoder, TextFeatures
 
 _LONGEST_WORD = 200
+_MISSPELT = 0.75  # of difflib's ratio: "soffa" is, "canoe" for "camera" is not
 _SCORES = ("cosine", "softmax", "relevancy")
 _EVEN = 0.5  # a probability
 _ROWS = 16384  # voxels worked on at once, so that float32 copies of all features never exist
@@ -46,7 +47,7 @@ class Options:
     """What a score is: "cosine" (over the cosine that the word allows), "softmax" (the word's probability against the
     contrast words) or "relevancy" (the least against each of some phrases that fit anything, as in LERF)."""
     threshold: float | None = None
-    """Least score of a matching voxel, 0…1; null = the encoder's own for cosines, 0.5 for probabilities."""
+    """Least score of a matching voxel, -1…1; null = the encoder's own for cosines, 0.5 for probabilities."""
     grow: float = 0.8
     """A region goes on over voxels that touch it down to this share of the threshold; 1 = it does not."""
     top_k: int = 20
@@ -63,7 +64,7 @@ class Options:
     def __post_init__(self) -> None:
         require_positive(self, "top_k", "min_voxels")
         if self.threshold is not None and not -1 <= self.threshold <= 1:
-            raise ConfigError(f"'threshold' must lie between 0 and 1, got {self.threshold:g}.")
+            raise ConfigError(f"'threshold' must lie between -1 and 1, got {self.threshold:g}.")
         for name in ("narrow", "min_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"'{name}' must lie between 0 and 1, got {getattr(self, name):g}.")
@@ -121,7 +122,7 @@ def query(
     excluded = text_encoder.encode_words(list(negative))
     for word, part in zip(negative, excluded.understood, strict=True):
         if not part:
-            raise FreeOccError(f"'{word}' cannot be excluded: this map knows only {text_encoder.knows}.")
+            raise FreeOccError(f"'{word}' cannot be excluded{_only_known(word, text_encoder)}")
         if part in text.understood:
             raise FreeOccError(f"'{word}' is asked for and excluded: leave one out.")
     others = text_encoder.encode_words(list(dict.fromkeys((*text_encoder.contrast_words(), *contrast, *negative))))
@@ -132,7 +133,7 @@ def query(
             f"{text.features.shape[1]}: make the map again with this version."
         )
     expressed = others.features.any(axis=1)
-    competes: NDArray[np.bool_] = np.asarray((text.features @ others.features.T < text_encoder.same_word) & expressed)
+    competes = (cosines(text.features, others.features) < text_encoder.same_word) & expressed
     cosine = similarity(features, text)
     says = known(features)
     plain = options.scores == "cosine"
@@ -269,6 +270,12 @@ def _probability(
     return np.where(known(features), made, np.float32(0))
 
 
+def _only_known(word: str, text_encoder: TextEncoder) -> str:
+    """The end of a sentence about a word that is not understood: what may have been meant, and what is known."""
+    meant = nearest(word.lower(), text_encoder.contrast_words(), _MISSPELT)
+    return f"{meant}: this map knows only {text_encoder.knows}."
+
+
 def _note(
     word: str,
     understood: str,
@@ -278,7 +285,7 @@ def _note(
     matched: bool,
 ) -> str:
     if not understood:
-        return f"'{word}' is not understood: this map knows only {text_encoder.knows}."
+        return f"'{word}' is not understood{_only_known(word, text_encoder)}"
     if len(scores) == 0:
         return "The map has no occupied voxels."
     if not matched:

@@ -145,9 +145,9 @@ def require_positive(options: Any, *names: str) -> None:
             raise ConfigError(f"'{name}' must be greater than 0, got {value}.")
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
-    """``" (did you mean 'x'?)"`` for the closest known word, or an empty string."""
-    close = difflib.get_close_matches(str(word), list(known), n=1, cutoff=0.5)
+def nearest(word: str, known: Iterable[str], least: float = 0.5) -> str:
+    """``" (did you mean 'x'?)"`` for the closest known word, or an empty string. least: of difflib's ratio, 0…1."""
+    close = difflib.get_close_matches(str(word), list(known), n=1, cutoff=least)
     return f" (did you mean '{close[0]}'?)" if close else ""
 
 

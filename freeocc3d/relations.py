@@ -92,13 +92,15 @@ def only_where(
     conditions = _conditions(there, where, dict(zip(where.words, references, strict=True)))
     narrowed = []
     for result in results:
-        regions, note = result.regions, result.note
+        regions, note, told = result.regions, result.note, []
         for kept, condition in conditions:
-            left = [region for region in regions if kept(region)]
-            if regions and not left:
-                count = f"{len(regions)} region{'s' if len(regions) > 1 else ''}"
-                note = f"Of {count} that '{result.understood}' matches none is {condition}."
-            regions = left
+            if not regions:
+                break
+            told.append(condition)
+            regions = [region for region in regions if kept(region)]
+        if result.regions and not regions:
+            count = f"{len(result.regions)} region{'s' if len(result.regions) > 1 else ''}"
+            note = f"Of {count} that '{result.understood}' matches none is {' and '.join(told)}."
         narrowed.append(replace(result, regions=_picked(regions, where.pick, up)[:top_k], note=note))
     return narrowed
 
@@ -125,7 +127,9 @@ def _conditions(
 
 
 def _absent(reference: QueryResult) -> str:
-    return "" if reference.matched else ", which nothing in this map matches"
+    if reference.matched:
+        return ""
+    return ", which nothing in this map matches" if reference.understood else ", which is not understood"
 
 
 def _picked(regions: list[Region], pick: str | None, up: NDArray[np.float64]) -> list[Region]:

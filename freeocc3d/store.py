@@ -272,6 +272,20 @@ class Map:
 
         return best_views(self.occupancy, self.trajectory, self.keyframes, [region])[0]
 
+    def stand_of(self, region: Region) -> NDArray[np.float64] | None:
+        """(3,) the nearest place on the floor, map frame, where a robot could stand and see a region; see
+        ``standing_places``."""
+        return self.standing_places([region])[0]
+
+    def standing_places(self, regions: Sequence[Region]) -> list[NDArray[np.float64] | None]:
+        """``stand_of`` for several regions: see ``standing``. None throughout where lengths are not metres, for a robot
+        has a size."""
+        if not regions or not self.metric:
+            return [None] * len(regions)
+        from .standing import standing_places
+
+        return standing_places(self.occupancy, self.T_gravity_map, regions)
+
     @functools.cached_property
     def _feature_arrays(self) -> dict[str, NDArray[Any]]:
         return read_arrays(self.path / FEATURES, _FEATURE_ARRAYS)

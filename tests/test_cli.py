@@ -17,13 +17,17 @@ ROOT = Path(__file__).parents[1]
 SMALL = ["--set", "capture.stop=8", "--set", "capture.synthetic.width=160", "--set", "capture.synthetic.height=120"]
 
 
-def run(*arguments: object, code: int = 0, lines: str = "") -> subprocess.CompletedProcess[str]:
+def run(
+    *arguments: object, code: int = 0, lines: str = "", encoding: str | None = None
+) -> subprocess.CompletedProcess[str]:
     done = subprocess.run(
         [sys.executable, "-m", "freeocc3d.cli", *map(str, arguments)],
         input=lines,
         capture_output=True,
         text=True,
+        errors="surrogateescape",
         timeout=300,
+        env=os.environ | ({"PYTHONIOENCODING": encoding} if encoding else {}),
     )
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
@@ -157,6 +161,18 @@ def test_a_query_tells_of_an_unusable_target_before_it_answers(room, tmp_path, o
     assert kept.read_bytes() == b"mine"
     assert "there is no folder" in refused("query", room, "red", option, tmp_path / "none" / "q.png")
     assert "is a folder" in refused("query", room, "red", option, tmp_path, "--overwrite")
+
+
+def test_one_file_is_not_asked_for_twice(room, tmp_path) -> None:
+    same = tmp_path / "answer.png"
+    assert "another name" in run("query", room, "red", "--picture", same, "--html", same, code=2).stderr
+    assert not same.exists()
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8:strict"])
+def test_words_that_a_terminal_cannot_show_are_answered(room, encoding) -> None:
+    assert "no match" in run("query", room, "\udcff", "диван", encoding=encoding).stdout
+    assert "\nred: " in run("query", room, "--interactive", lines="\udcff\nred", encoding=encoding).stdout
 
 
 def test_info_json_has_the_documented_keys(room) -> None:

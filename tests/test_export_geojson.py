@@ -20,7 +20,8 @@ def asked(scan_map):
 
     def query_words(words, top_k):
         assert top_k >= len(center)  # every region, however many there are
-        return [SimpleNamespace(word=word, regions=[region] if word == "cup" else []) for word in words]
+        found = {"cup": SimpleNamespace(word="cup", regions=[region], note="")}
+        return [found.get(word, SimpleNamespace(word=word, regions=[], note=f"no {word}")) for word in words]
 
     scan_map.query_words = query_words
     return scan_map
@@ -47,7 +48,9 @@ def test_an_outline_on_the_floor_with_its_height_and_scores(tmp_path) -> None:
 
 def test_words_are_those_asked_for(tmp_path) -> None:
     scan_map = asked(map_of(occupancy_of([(0, 0, 1)])))
-    export_map(scan_map, "geojson", tmp_path / "map.geojson", {"words": ["table"]})
+    assert export_map(scan_map, "geojson", tmp_path / "map.geojson", {"words": ["cup", "table"]}) == ["no table"]
+    assert len(json.loads((tmp_path / "map.geojson").read_text())["features"]) == 1
+    assert export_map(scan_map, "geojson", tmp_path / "map.geojson", {"words": ["table"]}, True) == ["no table"]
     assert json.loads((tmp_path / "map.geojson").read_text())["features"] == []
     scan_map.vocabulary = []
     with pytest.raises(ExportError, match="name words"):

@@ -333,6 +333,14 @@ def test_words_in_other_scripts_are_not_understood_in_a_sentence(word: str) -> N
     assert "not understood" in result.note
 
 
+def test_a_word_that_is_misspelt_is_told_what_it_may_mean() -> None:
+    sofa, canoe = query(occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1))), WORDS, ["Soffa", "canoe"])
+    assert sofa.note.startswith("'Soffa' is not understood (did you mean 'sofa'?): this map knows only")
+    assert canoe.note.startswith("'canoe' is not understood: ")
+    with pytest.raises(FreeOccError, match="did you mean 'sofa'"):
+        query(occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1))), WORDS, ["table"], negative=["sofaa"])
+
+
 def test_results_do_not_depend_on_the_size_of_the_work_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     room = occupancy({voxel: rng.random(5) for voxel in box((0, 0, 0), (9, 9, 9), feature())})

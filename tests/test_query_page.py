@@ -47,7 +47,7 @@ def decoded(source: str) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(base64.b64decode(source.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
 
 
-def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path) -> None:
+def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = room.query_words(["red", "<b>blue</b>", "unicorn"])
     page.query_page(room, results, tmp_path / "q.html")
     text = (tmp_path / "q.html").read_text(encoding="utf-8")
@@ -73,6 +73,12 @@ def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path) -> None
         page.query_page(room, results, tmp_path / "q.html")
     page.query_page(room, results, tmp_path / "q.html", overwrite=True)
     assert (tmp_path / "q.html").read_text(encoding="utf-8") == text
+    assert "Metres in the map" in text
+    monkeypatch.setitem(room.manifest, "scale", {"metric": False, "by": "unknown", "factor": 1.0})
+    page.query_page(room, results, tmp_path / "q.html", overwrite=True)
+    text = (tmp_path / "q.html").read_text(encoding="utf-8")
+    assert "lengths are not metres" in text
+    assert "nowhere" not in text
 
 
 def test_a_crop_holds_the_box_in_the_words_colour() -> None:

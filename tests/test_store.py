@@ -59,6 +59,17 @@ def test_what_a_picture_of_the_room_shows_is_found_again(saved) -> None:
     assert set(asked.regions[0].rows.tolist()) & set(found.regions[0].rows.tolist())
 
 
+def test_a_place_to_stand_is_told_where_lengths_are_metres(saved, monkeypatch) -> None:
+    loaded = freeocc3d.load_map(saved)
+    region = loaded.query("red").regions[0]
+    monkeypatch.setattr("freeocc3d.standing.standing_places", lambda _, T, regions: [T[:3, 3]] * len(regions))
+    assert loaded.stand_of(region) is not None
+    assert len(loaded.standing_places([region, region])) == 2
+    loaded.manifest["scale"] = {"metric": False, "by": "unknown", "factor": 1.0}
+    assert loaded.stand_of(region) is None
+    assert loaded.standing_places([region, region]) == [None, None]
+
+
 def test_gaussians_survive_the_point_cloud_and_the_file_exactly(tmp_path) -> None:
     g = random_gaussians(50, seed=0)
     write_ply(g, tmp_path / "g.ply")

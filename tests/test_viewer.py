@@ -12,7 +12,7 @@ from freeocc3d.palette import HIGHLIGHTS, class_colors
 from freeocc3d.regions import Region
 from freeocc3d.types import Trajectory
 from freeocc3d.viewer import pictures
-from freeocc3d.viewer.scene import cut_height
+from freeocc3d.viewer.scene import cut_height, lengthwise
 
 
 def room_map(tmp_path):
@@ -28,9 +28,12 @@ def room_map(tmp_path):
     occupancy = occupancy_of(voxels, colors=[*colors, *[(215, 20, 20)] * len(red)])
     T = np.tile(np.eye(4), (2, 1, 1))
     T[:, :3, 3] = [(1.0, 1.0, 0.5), (1.5, 1.0, 0.5)]
+    T_gravity_map = np.eye(4)
+    T_gravity_map[:3, :3] = (1, 0, 0), (0, 0, 1), (0, -1, 0)
     labels = np.where((occupancy.colors == (215, 20, 20)).all(axis=1), 2, 1).astype(np.uint8)
     return SimpleNamespace(
-        path=tmp_path, occupancy=occupancy, up=np.array((0.0, -1.0, 0.0)), vocabulary=["wall", "red"],
+        path=tmp_path, occupancy=occupancy, up=np.array((0.0, -1.0, 0.0)), T_gravity_map=T_gravity_map,
+        vocabulary=["wall", "red"],
         labels=lambda: labels,
         trajectory=Trajectory(np.arange(2.0), T, np.array([0, 1], np.int32), np.array(["keyframe"] * 2), np.ones(2)),
         manifest={
@@ -55,6 +58,30 @@ def test_a_map_picture_looks_into_the_room_from_both_sides(tmp_path) -> None:
     first = (tmp_path / "map.png").read_bytes()
     pictures.map_picture(room, tmp_path / "again.png")
     assert (tmp_path / "again.png").read_bytes() == first
+
+
+def test_walls_lie_along_the_picture_though_the_least_box_around_the_map_does_not() -> None:
+    diamond = np.array([(0, 0, 0), (2, 3, 0), (3, 2, 0), (5, 5, 1.0)])
+    np.testing.assert_array_equal(lengthwise(np.eye(3), diamond), np.eye(3))
+    long = diamond * (1, 2, 1)
+    R = lengthwise(np.eye(3), long)
+    np.testing.assert_array_equal(np.ptp(long @ R.T, axis=0), (10, 5, 1))
+    assert np.linalg.det(R) == 1
+
+
+def test_a_match_is_in_the_view_however_far_off(tmp_path) -> None:
+    far = [(x, 20, 0) for x in (400, 401)]
+    floor = [(x, 20, z) for x in range(40) for z in range(40)]
+    room = room_map(tmp_path)
+    room.occupancy = occupancy_of([*floor, *far], colors=[(150, 120, 90)] * len(floor) + [(20, 20, 20)] * len(far))
+    size, voxels = room.occupancy.voxel_size, room.occupancy.occupied_voxels()
+    rows = np.flatnonzero(voxels[:, 0] >= 400)
+    corner = room.occupancy.origin + voxels[rows].min(axis=0) * size
+    region = Region(1.0, 1.0, corner + size, corner, corner + size * np.array((2, 1, 1)), 2 * size**3, rows)
+    result = SimpleNamespace(word="far", regions=[region])
+    pictures.query_picture(room, [result], tmp_path / "far.png")
+    view = cv2.imread(str(tmp_path / "far.png"))[56:-56, :800, ::-1].astype(int)
+    assert (np.abs(view - HIGHLIGHTS[0]).max(axis=-1) < 40).any()
 
 
 def test_by_class_and_height(tmp_path) -> None:

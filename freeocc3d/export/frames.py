@@ -56,6 +56,11 @@ class Placed:
     T_frame_map: NDArray[np.float64]
     metric: bool
 
+    @property
+    def unit(self) -> str:
+        """What lengths are in."""
+        return "metres" if self.metric else "units of unknown length"
+
     def described(self) -> dict[str, Any]:
         """What a reader of an export has to know of its frame; of plain values."""
         return {

@@ -2,7 +2,8 @@
 
 A FeatureCollection with one Polygon for each region: the convex outline of its voxels seen from above, x and y in
 metres of the frame (no longitudes), with word, score, confidence, centroid, height_min_m and height_max_m,
-area and volume. Members `frame` and `T_frame_map` of the collection say what frame that is. Source: RFC 7946.
+area and volume. Members `frame` and `T_frame_map` of the collection say what frame that is, `unit`
+whether its lengths are metres. Source: RFC 7946.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ class Options:
         check_upright(self.frame)
 
 
-def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the regions. Raises ExportError without any word to ask or voxel to find it in; a word that nothing matches
-    has no feature."""
+def write(scan_map: Map, path: Path, options: Options) -> list[str]:
+    """Write the regions; returns a sentence for each word that nothing matches, which has no feature, or of which only
+    a part is understood. Raises ExportError without any word to ask or voxel to find it in."""
     words = list(options.words) or scan_map.vocabulary
     if not words:
         raise ExportError("The map has no vocabulary of its own: name words with --set 'words=[sofa, chair]'.")
@@ -56,19 +57,21 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         lattice = voxels[rows, None] + _CORNERS * edges[rows, None, None]
         return transform(T_frame_map, occupancy.origin + lattice.reshape(-1, 3) * occupancy.finest)
 
+    results = scan_map.query_words(words, top_k=len(occupancy.colors))
     features = [
         _feature(result.word, region, corners(region.rows), transform(T_frame_map, region.centroid))
-        for result in scan_map.query_words(words, top_k=len(occupancy.colors))
+        for result in results
         for region in result.regions
     ]
     collection = {
         "type": "FeatureCollection",
         "frame": options.frame,
         "T_frame_map": T_frame_map.tolist(),
-        "unit": "metre",
+        "unit": "metre" if scan_map.metric else "unknown",
         "features": features,
     }
     path.write_text(json.dumps(collection, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return [result.note for result in results if result.note] if options.words else []
 
 
 def _feature(word: str, region: Region, corners: NDArray[np.float64], centroid: NDArray[np.float64]) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     with path.open("wb") as stream:
         kind = "OcTree binary" if binary else "OcTree"
         name = "ColorOcTree" if options.color else "OcTree"
-        header = f"# Octomap {kind} file\n# freeocc3d, {there.frame} frame, metres\nid {name}\nsize {len(tree)}\n"
+        header = f"# Octomap {kind} file\n# freeocc3d, {there.frame} frame, {there.unit}\nid {name}\nsize {len(tree)}\n"
         stream.write(f"{header}res {there.occupancy.finest:.12g}\ndata\n".encode("ascii"))
         stream.write(_binary_nodes(tree) if binary else _full_nodes(tree, options.color))
     write_description(path, there.described())

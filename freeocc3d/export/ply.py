@@ -105,7 +105,7 @@ def write_ply(
     OSError."""
     vertex = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     vertex["xyz"], vertex["rgb"] = points, colors
-    comments = ["freeocc3d, metres", *(f"{name} {json.dumps(value)}" for name, value in (described or {}).items())]
+    comments = ["freeocc3d", *(f"{name} {json.dumps(value)}" for name, value in (described or {}).items())]
     header = [
         "ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments),
         f"element vertex {len(points)}",

@@ -130,7 +130,7 @@ class Codec:
         """(V, W) cosines of coded features with (W, D) unit text features, without decoding: with levels c and text t
         in the codec's coordinates, the dot product is c (scale t) + offset t. Zero features give zero. inverse: their
         ``inverse_norms`` where these are known already."""
-        t = (text.astype(np.float32) @ self.basis.T).astype(np.float32)
+        t = _product(text.astype(np.float32), self.basis.T)
         if _compiled(len(codes)):
             from . import scoring
 
@@ -211,7 +211,7 @@ def cosines(features: Features, text: NDArray[np.floating]) -> NDArray[np.float3
     found = np.empty((len(text), len(features)), np.float32).T
     t = text.astype(np.float32).T
     for rows, out in zip(_chunks(features), _chunks(found), strict=True):
-        out[:] = rows.astype(np.float32) @ t
+        out[:] = _product(rows.astype(np.float32, copy=False), t)
     return found
 
 

@@ -17,7 +17,6 @@ from ..palette import HIGHLIGHTS
 from ..places import oriented_boxes
 from ..query import QueryResult
 from ..region_views import View, best_views
-from ..standing import standing_places
 from ..store import Map
 from .pictures import query_png
 
@@ -56,7 +55,7 @@ def _page(scan_map: Map, results: Sequence[QueryResult]) -> str:
         picture, why = "", str(error)
     regions = [region for result in results for region in result.regions]
     views = best_views(scan_map.occupancy, scan_map.trajectory, scan_map.keyframes, regions)
-    stands = standing_places(scan_map.occupancy, scan_map.T_gravity_map, regions) if regions else []
+    stands = scan_map.standing_places(regions)
     boxes = oriented_boxes(scan_map.occupancy, regions, scan_map.T_gravity_map)
     row_of = {int(frame): row for row, frame in enumerate(scan_map.trajectory.keyframes)}
     answers, at = [], 0
@@ -72,7 +71,7 @@ def _page(scan_map: Map, results: Sequence[QueryResult]) -> str:
             at += 1
         answers.append({"result": result, "color": f"rgb({', '.join(map(str, color))})", "rows": rows})
     return environment.get_template("page.html").render(
-        version=__version__, name=str(scan_map.path), answers=answers, picture=picture, why=why
+        version=__version__, name=str(scan_map.path), answers=answers, picture=picture, why=why, metric=scan_map.metric
     )
 
 

@@ -17,7 +17,7 @@ from ..query import QueryResult
 from ..regions import Region
 from ..store import Map
 from ..types import Occupancy
-from .scene import BACKGROUND, CUT, VIEWS, Scene, cut_height, render, shaded, upright
+from .scene import BACKGROUND, CUT, VIEWS, Scene, cut_height, lengthwise, render, shaded
 
 SIZE = 1600, 900
 _BAR = 56  # pixels above and below the views
@@ -110,10 +110,10 @@ def _write_bytes(path: Path, data: bytes) -> None:
 
 def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region, tuple[int, int, int]]]) -> Scene:
     """The exposed faces of the voxels below the cut and of the regions that lie mostly above it, turned so that z is up
-    and the longer walls lie along x."""
+    and the walls lie along x and y."""
     occupancy = scan_map.occupancy
     centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
-    R = upright(scan_map.up, centers)
+    R = lengthwise(scan_map.T_gravity_map[:3, :3], centers)
     height = centers @ R[2]
     kept = height <= cut_height(height, occupancy.voxel_size)
     for region, _ in regions:  # a lamp that was asked for is drawn; a wall that was asked for does not hide the room

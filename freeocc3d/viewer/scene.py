@@ -47,6 +47,13 @@ def upright(up: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np
     return turn @ R
 
 
+def lengthwise(R: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """A (3, 3) rotation to a frame with z up and walls along x and y, or that and a quarter turn, so that (N, 3) points
+    reach farther along x than along y."""
+    x, y = np.ptp(points @ R[:2].T, axis=0)
+    return R if x >= y else np.array(((0, 1, 0), (-1, 0, 0), (0, 0, 1.0))) @ R
+
+
 def cut_height(height: NDArray[np.floating], voxel_size: float) -> float:
     """Up to which height voxels are drawn, of (V,) heights of voxel centres: not too near to the ceiling."""
     low, high = np.percentile(height, (1, 99))
@@ -103,7 +110,7 @@ def render(scene: Scene, view: str, size: tuple[int, int], framed: Scene | None 
 
 def _aim(plotter: Any, scene: Scene, view: str, size: tuple[int, int]) -> None:
     """Look from straight above, or down into the scene from the diagonal on which the camera walked, such that all but
-    a few stray voxels fill the view. Both views are parallel projections: equal lengths look equal."""
+    a few stray voxels, and all boxes, fill the view. Both views are parallel projections: equal lengths look equal."""
     points, path = scene.vertices, scene.path
     middle = 0.5 * (np.percentile(points, 1, axis=0) + np.percentile(points, 99, axis=0))
     if view == "above":
@@ -114,7 +121,10 @@ def _aim(plotter: Any, scene: Scene, view: str, size: tuple[int, int]) -> None:
     right = np.cross(up, back)
     axes = np.stack((right / np.linalg.norm(right), np.cross(back, right) / np.linalg.norm(np.cross(back, right))))
     spread = (points - middle) @ axes.T
-    low, high = np.percentile(spread, 0.3, axis=0), np.percentile(spread, 99.7, axis=0)
+    low, high = _bounds(spread, scene)
+    for corners, _ in scene.boxes:  # what was asked for is seen, however far off it is
+        at = (corners - middle) @ axes.T
+        low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
     half = 0.5 * (high - low)
     focus = middle + 0.5 * (low + high) @ axes
     plotter.camera.focal_point = focus
@@ -123,3 +133,16 @@ def _aim(plotter: Any, scene: Scene, view: str, size: tuple[int, int]) -> None:
     plotter.camera.parallel_projection = True
     plotter.camera.parallel_scale = 1.06 * max(half[1], half[0] * size[1] / size[0], 1e-3)
     plotter.reset_camera_clipping_range()
+
+
+def _bounds(spread: NDArray[np.float64], scene: Scene) -> tuple[NDArray[np.float64], ...]:
+    """(2,) and (2,) between which lies all but 0.3 % to either side of the scene's faces, by area, their vertices in
+    the view being given; of its points, where it has no faces."""
+    weights = np.ones(len(spread))
+    if len(scene.quads):
+        corners = scene.vertices.reshape(-1, 4, 3)
+        weights = np.repeat(((corners[:, 2] - corners[:, 0]) ** 2).sum(axis=1), 4)
+    order = np.argsort(spread, axis=0)
+    up_to = np.cumsum(weights[order], axis=0)
+    ends = (np.count_nonzero(up_to < share * up_to[-1], axis=0) for share in (0.003, 0.997))
+    return tuple(np.take_along_axis(spread, np.take_along_axis(order, end[None], 0), 0)[0] for end in ends)
