@@ -43,7 +43,7 @@ class ConsoleProgress(Progress):
         if self._name:
             self._clear()
             seconds = time.monotonic() - self._start
-            steps = f", {self._total} frames" if self._total else ""
+            steps = f", {self._total} steps" if self._total else ""
             print(f"{self._name}: {seconds:.1f} s{steps}", file=sys.stderr)
         self._name = ""
 
