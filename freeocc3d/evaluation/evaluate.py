@@ -241,9 +241,7 @@ def evaluate(asked: Asked) -> Evaluation:
             for scan_map, truth, true in zip(maps, truths, poses, strict=True)
         ]
     elif asked.gaussians is not None:
-        scenes = [
-            score_gaussians(asked.gaussians, truths[0], classes, trajectory, poses[0], how, asked.overrides)
-        ]
+        scenes = [score_gaussians(asked.gaussians, truths[0], classes, trajectory, poses[0], how, asked.overrides)]
     elif asked.grid is not None:
         scenes = [score_grid(asked.grid, truths[0], classes, trajectory, poses[0], how)]
     elif asked.frames is not None:
