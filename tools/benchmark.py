@@ -63,6 +63,7 @@ PEERS = {
 """``POSES_OCCUPANCY``: where the poses come from, and what makes voxels of them."""
 
 UNFITTED = "rgbd_no_fitting"
+MONO = "mono"
 
 KERNELS = ("splat", "voxels", "query", "rasterizer", "encoders", "lifting")
 CLASSES = "rgbd_true_poses_closed_set"
@@ -116,6 +117,8 @@ def map_row(job: Job, variant: variants.Variant) -> Figures:
     command = [*COMMAND, "reconstruct", str(job.capture), "-o", str(folder), "--config", str(variant.path)]
     if job.frames is not None:
         command += ["--set", f"capture.stop={job.frames}"]
+    if variant.colour_alone:
+        command += ["--set", f"capture.stride={mono.stride(_frames(job.capture))}"]
     seconds, peak_bytes, _ = _timed_command(command)
     facts = json.loads(_timed_command([*COMMAND, "info", str(folder), "--json"])[2])
     used = facts["frames"] - facts["frame_status"].get("unused", 0)
@@ -134,6 +137,12 @@ def map_row(job: Job, variant: variants.Variant) -> Figures:
     }
 
 
+def _frames(capture: Path) -> int:
+    from freeocc3d.capture import open_capture
+
+    return len(open_capture(capture))
+
+
 def score_map(map: str, capture: str, out: str) -> Figures:
     """ATE and RPE against the capture's poses; IoU and mIoU where it brings a ground truth. Leaves the aligned poses of
     all frames in ``out``."""
@@ -145,7 +154,8 @@ def score_map(map: str, capture: str, out: str) -> Figures:
 
     loaded = load_map(map)
     estimated, true = estimated_poses(loaded.trajectory), true_poses(evaluate.capture_of(loaded))
-    alignment = align(estimated, true)
+    how = "se3" if loaded.metric else "sim3"
+    alignment = align(estimated, true, how)
     errors = trajectory_errors(estimated, true, alignment)
     _save_poses(Path(out), alignment.poses(loaded.trajectory.T_world_cam), errors, loaded.up @ alignment.rotation.T)
     figures: Figures = {"ate_rmse_m": errors.ate_rmse_m, "trajectory": errors.to_json()}
@@ -154,8 +164,8 @@ def score_map(map: str, capture: str, out: str) -> Figures:
     if truth_path.is_file():
         truth = load_ground_truth(truth_path)
         classes = evaluate.common_classes([truth])
-        scene = evaluate.score_map(loaded, truth, classes, true)
-        scored = evaluate.Evaluation((scene,), classes.classes, "se3")
+        scene = evaluate.score_map(loaded, truth, classes, true, how)
+        scored = evaluate.Evaluation((scene,), classes.classes, how)
         figures |= _scores(scored.scores, scored.miou(), scored.classes_in_miou)
     return figures
 
@@ -574,6 +584,7 @@ def markdown(results: Figures) -> str:
             *[line for name, found in (results.get("each") or {}).items() for line in EACH[name].lines(found)],
             *language.fusion_lines(results.get("layer_3") or {}),
             *_pose_lines(results["rows"]),
+            *_mono_lines(results["rows"]),
             *_fit_lines(results["rows"]),
         ]
     )
@@ -597,6 +608,19 @@ def _pose_lines(rows: list[Figures]) -> list[str]:
         ours, given = iou.get((capture, OURS)), iou.get((capture, TRUE_POSES))
         if ours and given:
             lines.append(f"\n{capture}: IoU with our poses is {ours / given:.3f} of that with the capture's poses")
+    return lines
+
+
+def _mono_lines(rows: list[Figures]) -> list[str]:
+    """IoU from colour alone over IoU with depth, where both were measured."""
+    iou = {(row["capture"], row["variant"]): row.get("iou") for row in rows}
+    lines = []
+    for capture in dict.fromkeys(row["capture"] for row in rows):
+        alone, with_depth = iou.get((capture, MONO)), iou.get((capture, OURS))
+        if alone and with_depth:
+            lines.append(
+                f"\n{capture}: IoU from colour alone is {alone / with_depth:.3f} of that with depth (0.6 asked)"
+            )
     return lines
 
 

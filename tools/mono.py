@@ -24,7 +24,7 @@ def measure_mono(capture: str) -> Figures:
     from freeocc3d.tracking.structure import Recipe, reconstruct
 
     opened = open_capture(capture, Options(depth=False))
-    frames = range(0, len(opened), STRIDES[len(opened) < LONG])
+    frames = range(0, len(opened), stride(len(opened)))
     true = np.stack([_or_none(opened.pose(index)) for index in frames])
     with tempfile.TemporaryDirectory() as folder:
         watch = _Watch()
@@ -41,6 +41,11 @@ def measure_mono(capture: str) -> Figures:
         "distortion": list(camera.distortion),
     }
     return {"frames": len(frames), "ours": ours, "pycolmap": _defaults(opened, frames, true)}
+
+
+def stride(frames: int) -> int:
+    """Of a capture of so many frames, every how many-th is used where colour alone is read."""
+    return STRIDES[frames < LONG]
 
 
 class _Watch:

@@ -11,6 +11,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
+
 FOLDER = Path(__file__).resolve().parents[1] / "configs" / "ablations"
 
 _TRY = """
@@ -29,13 +31,15 @@ for path in sys.argv[1:]:
 
 @dataclass(frozen=True)
 class Variant:
-    """title: what it is.  table: where the paper has it.  lacking: why it cannot run, one sentence; empty if it can."""
+    """title: what it is.  table: where the paper has it.  lacking: why it cannot run, one sentence; empty if it can.
+    colour_alone: whether it does without depth."""
 
     name: str
     title: str
     table: str
     path: Path
     lacking: str
+    colour_alone: bool
 
 
 def names() -> list[str]:
@@ -52,7 +56,9 @@ def all_variants() -> dict[str, Variant]:
 
 
 def _variant(path: Path, refused: str) -> Variant:
-    comments = [line[1:].strip() for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
+    text = path.read_text(encoding="utf-8")
+    comments = [line[1:].strip() for line in text.splitlines() if line.startswith("#")]
     facts = dict(line.split(": ", 1) for line in comments[1:] if line.startswith(("table: ", "needs: ")))
     lacking = f"needs {facts['needs']}" if refused and "needs" in facts else refused
-    return Variant(path.stem, comments[0], facts.get("table", ""), path, lacking)
+    capture = (yaml.safe_load(text) or {}).get("capture") or {}
+    return Variant(path.stem, comments[0], facts.get("table", ""), path, lacking, capture.get("depth") is False)

@@ -29,10 +29,12 @@ from .consistency import DepthImage, confirmed
 from .multi_view import completed, measured
 from .neighbours import Chosen, neighbours
 from .photo_consistency import View
+from .scan_planes import ScanPlane, scan_planes, snapped
 
 __all__ = ["Options", "Scan", "StereoDepth", "View", "depth_map"]
 
 _AT_ONCE = 16  # frames
+_SCAN_PLANES = 60  # of the whole scan, at most
 _FILES_KEPT = 128  # in memory: images and depths of the frames around the one in work
 _STORED: dict[str, dict[str, tuple[str, int]]] = {
     "view": {"grey": ("u", 2), "T_world_cam": ("f", 2), "size": ("i", 1), "camera": ("f", 1)},
@@ -53,7 +55,8 @@ class Options:
     neighbours: int = 4
     """Views that each frame is compared with."""
     planes: int = 12
-    """Planes looked for around each frame, on which surfaces without texture are put; 0 = leave these empty."""
+    """Planes looked for around each frame, on which surfaces without texture are put; 0 = leave these empty, and do
+    without the planes of the whole scan, too, which depths that cannot be told from them are moved to."""
     agreeing: int = 2
     """Views whose depth must confirm a pixel's, of twice as many as each frame is compared with."""
     vaguest: float = 0.025
@@ -106,6 +109,7 @@ class StereoDepth:
     def __init__(self, folder: Path, options: Options):
         self.folder, self.options = folder, options
         self._lock = threading.Lock()
+        self._planes: list[ScanPlane] = []
         self._read: OrderedDict[Path, dict[str, NDArray[np.generic]]] = OrderedDict()
 
     def compute(
@@ -137,6 +141,8 @@ class StereoDepth:
         for stage, step in (("measured", self._measure), ("completed", self._complete), ("depth", self._confirm)):
             missing = [frame for frame in able if not self._path(stage, frame).exists()]
             progress.stage(f"stereo: {stage}", len(missing))
+            if stage == "completed" and missing and self.options.planes:
+                self._planes = scan_planes((self._depth("measured", frame) for frame in able), _SCAN_PLANES)
             for done, frame, depth in self._each(missing, functools.partial(step, chosen=chosen)):
                 self._write(
                     stage, frame, inverse=depth.inverse.astype(np.float16), sigma=depth.sigma.astype(np.float16)
@@ -208,7 +214,8 @@ class StereoDepth:
         others = [self._view(other) for other in partners]
         around = [self._depth("measured", other) for other in partners if len(chosen.partners[other])]
         own = self._depth("measured", frame)
-        return completed(self._view(frame), others, own, around, options.planes, options.device)
+        found = completed(self._view(frame), others, own, around, options.planes, options.device)
+        return snapped(found, self._planes, float(own.sigma.min()))
 
     def _confirm(self, frame: int, chosen: Chosen) -> DepthImage:
         own, options = self._depth("completed", frame), self.options
