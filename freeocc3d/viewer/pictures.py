@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from ..errors import ExportError
 from ..files import write_whole
+from ..geometry import transform
 from ..occupancy.faces import exposed_faces
 from ..palette import HIGHLIGHTS, class_colors, height_colors, highlighted
+from ..places import OrientedBox, oriented_boxes
 from ..query import QueryResult
 from ..regions import Region
 from ..store import Map
@@ -123,14 +125,14 @@ def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region,
     turned = vertices.astype(np.float64) @ R.T
     trajectory = scan_map.trajectory
     way = trajectory.T_world_cam[trajectory.has_pose][:, :3, 3] @ R.T
-    boxes = tuple((_corners(region) @ R.T, color) for region, color in regions)
+    upright = oriented_boxes(occupancy, [region for region, _ in regions], scan_map.T_gravity_map)
+    boxes = tuple((_corners(box) @ R.T, color) for box, (_, color) in zip(upright, regions, strict=True))
     return Scene(turned, quads, shaded(turned, colors[rows]), way, boxes)
 
 
-def _corners(region: Region) -> NDArray[np.float64]:
-    """(8, 3) corners of a region's box."""
-    choice = np.indices((2, 2, 2)).reshape(3, -1).T
-    return np.where(choice == 0, region.box_min, region.box_max)
+def _corners(box: OrientedBox) -> NDArray[np.float64]:
+    """(8, 3) corners, map frame."""
+    return transform(box.T_map_box, (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * box.extent)
 
 
 def _framed(views: NDArray[np.uint8], title: str, legend: list[tuple[str, tuple[int, int, int]]]) -> NDArray[np.uint8]:
