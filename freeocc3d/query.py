@@ -56,7 +56,7 @@ class Options:
     """Smaller regions are left out, unless all are smaller."""
     min_share: float = 0.001
     """Regions of less than this share of the volume of the word's largest one are left out, and those of one to three
-    voxels below 50 times the share: specks beside a thing. 0 = none is."""
+    voxels within half a metre of one that they are less than 50 times the share of: specks beside a thing. 0 = none."""
     narrow: float = 0.5
     """Things that touch are told apart where their region, seen from above, narrows to less than this share of the
     narrower one, and to four voxels or less; 0 = regions stay whole."""

@@ -11,6 +11,8 @@ from .types import Occupancy
 
 _PATCH, _FEW = 4, 50
 """Voxels of the least patch of a surface, two by two; of how much larger a share what is smaller has to be."""
+_BESIDE_M = 0.5
+_MOST_COMPARED = 4_000_000
 _DOUBT_M3 = 0.001
 """Volume of non-matching matter that is added to each region when it is scored: a speck of a voxel or two does not
 outrank a large object, and the size of the voxels has no part in it."""
@@ -61,8 +63,9 @@ def best_regions(
     """The at most ``top_k`` best regions, best first, among matching voxels.
 
     rows: (n,) rows of occupied voxels, component: (n,) the region of each, of numbers that need not be successive,
-    scores, confidence: (n,). Regions of fewer than ``min_voxels`` voxels are left out, unless all are, and those of
-    less than ``min_share`` of the largest one's volume, 50 times it for what is no patch of a surface.
+    scores, confidence: (n,). Regions of fewer than ``min_voxels`` voxels are left out, unless all are, those of less
+    than ``min_share`` of the largest one's volume, and, of what is no patch of a surface, those of less than 50 times
+    this share of the volume of a region nearby.
     """
     if len(rows) == 0:
         return []
@@ -70,8 +73,9 @@ def best_regions(
     own_volume = (edges * occupancy.finest) ** 3
     size, volume = np.bincount(component), np.bincount(component, own_volume)
     score = np.bincount(component, scores * own_volume) / (volume + _DOUBT_M3)
-    least = np.where(size < _PATCH, min(_FEW * min_share, 1.0), min_share)
-    there = (size > 0) & (volume >= least * volume.max())
+    there = (size > 0) & (volume >= min_share * volume.max())
+    if min_share:
+        there[_specks(occupancy, rows, component, size, volume, _FEW * min_share)] = False
     large = there & (size >= min_voxels)
     chosen = np.flatnonzero(large if large.any() else there)
     chosen = chosen[np.argsort(-score[chosen], kind="stable")][:top_k]
@@ -99,3 +103,32 @@ def best_regions(
         )
         for n, c in enumerate(chosen)
     ]
+
+
+def _specks(
+    occupancy: Occupancy,
+    rows: NDArray[np.int64],
+    component: NDArray[np.integer],
+    size: NDArray[np.integer],
+    volume: NDArray[np.number],
+    share: float,
+) -> NDArray[np.int64]:
+    """Regions of a few voxels whose box lies within half a metre of that of a region which they are less than ``share``
+    of: a chair's feet are no chairs, and a cup in the middle of a room is no part of the carpet."""
+    few, things = np.flatnonzero((size > 0) & (size < _PATCH)), np.flatnonzero(size >= _PATCH)
+    if not len(few) or not len(things):
+        return few[:0]
+    things = things[np.argsort(-volume[things], kind="stable")][: max(1, _MOST_COMPARED // len(few))]
+    order = np.argsort(component, kind="stable")
+    starts = (np.cumsum(size) - size)[size > 0]
+    place = np.cumsum(size > 0) - 1
+    corners = occupancy.occupied_voxels()[rows[order]]
+    upper = corners + occupancy.occupied_edges()[rows[order], None]
+    low, high = np.minimum.reduceat(corners, starts), np.maximum.reduceat(upper, starts)
+    gaps = np.zeros((len(few), len(things)))
+    for axis in range(3):
+        below = low[place[things], axis][None] - high[place[few], axis][:, None]
+        above = low[place[few], axis][:, None] - high[place[things], axis][None]
+        gaps += np.maximum(np.maximum(below, above), 0) ** 2
+    near = gaps <= (_BESIDE_M / occupancy.finest) ** 2
+    return few[(near & (volume[few][:, None] < share * volume[things][None])).any(axis=1)]

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from itertools import product
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -417,10 +417,15 @@ def test_what_is_tiny_beside_the_largest_region_is_a_speck_whatever_the_voxels()
     assert [r.voxels for r in query(small, WORDS, ["cup"])[0].regions] == [1000, 4]
 
 
-def test_what_is_no_patch_of_a_surface_is_a_speck_beside_a_thing_and_no_speck_beside_its_like() -> None:
-    few = box((20, 0, 0), (23, 1, 1), feature(CUP=1))
-    beside_a_thing = occupancy(box((0, 0, 0), (4, 4, 4), feature(CUP=1)) | few)
-    assert [r.voxels for r in query(beside_a_thing, WORDS, ["cup"])[0].regions] == [64]
-    assert [r.voxels for r in query(beside_a_thing, WORDS, ["cup"], Options(min_share=0.0))[0].regions] == [64, 3]
-    beside_its_like = occupancy(box((0, 0, 0), (5, 1, 1), feature(CUP=0.8, SOFA=0.6)) | few)
-    assert sorted(r.voxels for r in query(beside_its_like, WORDS, ["cup"])[0].regions) == [3, 5]
+def test_a_few_voxels_are_a_speck_beside_a_thing_and_neither_far_from_it_nor_beside_their_like() -> None:
+    def found(first: int, thing: dict, **options: Any) -> list[int]:
+        """Voxels of the regions where three in a row begin at voxel ``first`` along x."""
+        few = box((first, 0, 0), (first + 3, 1, 1), feature(CUP=1))
+        regions = query(occupancy(thing | few), WORDS, ["cup"], Options(**options))[0].regions
+        return sorted(region.voxels for region in regions)
+
+    thing = box((0, 0, 0), (4, 4, 4), feature(CUP=1))
+    assert found(9, thing) == [64]  # half a metre
+    assert found(10, thing) == [3, 64]
+    assert found(9, thing, min_share=0.0) == [3, 64]
+    assert found(8, box((0, 0, 0), (5, 1, 1), feature(CUP=0.8, SOFA=0.6))) == [3, 5]

@@ -28,8 +28,8 @@ def check_features(counts: list[int], what: str) -> None:
     """Raises TrackingError if most images show nothing that could be recognised."""
     if np.median(counts) < _FEW_FEATURES:
         raise TrackingError(
-            f"The images of {what} are blurred or show bare surfaces: half of them have fewer than "
-            f"{int(np.median(counts)) + 1} features. Film sharp images of textured things: {_SLOWLY}."
+            f"The images of {what} are blurred or show bare surfaces: half of them have at most "
+            f"{int(np.median(counts))} features. Film sharp images of textured things: {_SLOWLY}."
         )
 
 
@@ -45,8 +45,8 @@ def check_motion(database: SfmDatabase, what: str) -> None:
     moved = [database.displacement(*pair) for pair in pairs[::step]]
     if max(moved) < _STILL_PX * max(database.size()[0] / 640, 1):
         raise TrackingError(
-            f"The camera of {what} stands still: between its images nothing moves by more than {max(moved):.1f} "
-            "pixels. Walk around what is to be mapped."
+            f"The camera of {what} stands still: between its images things move by {max(moved):.1f} pixels at "
+            "most. Walk around what is to be mapped."
         )
 
 
