@@ -31,7 +31,7 @@ SECTIONS: dict[str, tuple[str, str | None]] = {
 }
 """Section -> (module whose ``Options`` it configures, folder of its backends)."""
 
-NESTED: dict[str, dict[str, str]] = {"tracking": {"stereo": "tracking.stereo"}}
+NESTED: dict[str, dict[str, str]] = {"tracking": {"stereo": "tracking.stereo.scan_depth"}}
 """Section -> what it holds besides its backends -> module whose ``Options`` that configures."""
 
 Config = dict[str, dict[str, Any]]

@@ -36,8 +36,9 @@ from .language.encoders.base import Encoder
 from .occupancy import build, carve, splat
 from .progress import Progress
 from .store import Map, load_map
-from .tracking import calibration, stereo
+from .tracking import calibration
 from .tracking.base import Tracked, Tracker
+from .tracking.stereo import scan_depth
 from .types import Frame, Gaussians, Occupancy, PosedFrame, Submap, Trajectory
 from .viewer import paths, renders
 from .work import WorkFolder
@@ -62,7 +63,7 @@ class Mapper:
                 "capture.depth=false): estimate poses from colour with tracking.backend=colmap, or give them (known, "
                 "file)."
             )
-        self.tracker.stereo = _options(stereo, settings["tracking"]["stereo"])
+        self.tracker.stereo = _options(scan_depth, settings["tracking"]["stereo"])
         self.rasterizer: Rasterizer = _load_backend(settings, "fitting", "rasterizer")
         self._fitted: tuple[Gaussians, Trajectory] | None = None
 
@@ -610,7 +611,7 @@ def check(settings: Config) -> None:
     if settings["occupancy"]["finest"] is not None:
         adaptive.halvings(settings["occupancy"]["voxel_size"], settings["occupancy"]["finest"])
     scene_vocabulary.load(_options(scene_vocabulary, settings["vocabulary"]))
-    _options(stereo, settings["tracking"]["stereo"])
+    _options(scan_depth, settings["tracking"]["stereo"])
     for section, key in (("tracking", "backend"), ("fitting", "rasterizer"), ("language", "encoder")):
         name = settings[section][key]
         backend = registry.load(str(config.SECTIONS[section][1]), name)

@@ -13,11 +13,13 @@ from photographs import Photographs, turning, walk
 from freeocc3d.errors import ConfigError, TrackingError
 from freeocc3d.geometry import umeyama
 from freeocc3d.progress import Progress
-from freeocc3d.tracking import colmap, colmap_model, given, mapping, stereo, structure
+from freeocc3d.tracking import colmap, given
 from freeocc3d.tracking.colmap import ColmapTracker, Options
 from freeocc3d.tracking.lens import LensCamera
-from freeocc3d.tracking.sfm import Reconstruction
-from freeocc3d.tracking.structure import Recipe
+from freeocc3d.tracking.sfm import colmap_model, mapping, structure
+from freeocc3d.tracking.sfm.reconstruction import Reconstruction
+from freeocc3d.tracking.sfm.structure import Recipe
+from freeocc3d.tracking.stereo import scan_depth
 from freeocc3d.types import Intrinsics
 
 
@@ -178,7 +180,7 @@ def test_scans_that_give_no_poses_are_told_apart(tmp_path: Path) -> None:
 class StereoStub:
     """Depth of the nominal 2 metres for every frame with a pose."""
 
-    def __init__(self, folder: Path, options: stereo.Options):
+    def __init__(self, folder: Path, options: scan_depth.Options):
         self.folder = folder
 
     def compute(self, capture: Any, found: Reconstruction, frames: range, progress: Progress, prepared: Any) -> None:
@@ -197,7 +199,7 @@ def tracked(found: Reconstruction, folder: Path, monkeypatch: pytest.MonkeyPatch
     images, _, camera = walk()
     tracker = colmap.load(Options(**options), Photographs(images, camera))
     assert tracker.offline
-    tracker.stereo = stereo.Options()
+    tracker.stereo = scan_depth.Options()
     tracker.prepare(folder, range(len(images)), Progress())
     return tracker
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from textured import CAMERA, Rectangle, looking, render
 
-from freeocc3d.tracking.consistency import DepthImage, confirmed
+from freeocc3d.tracking.stereo.consistency import DepthImage, confirmed
 
 ROOM = [Rectangle((-3, -3, 3.0), (6, 0, 0), (0, 6, 0)), Rectangle((-0.3, -0.4, 1.5), (0.6, 0, 0), (0, 0.8, 0), seed=1)]
 

@@ -8,7 +8,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from freeocc3d.errors import ModelError
-from freeocc3d.tracking import depth_network
+from freeocc3d.tracking.stereo import depth_network
 
 
 def _write(path: Path, size=("height", "width"), channels: int = 3, output: str | None = None) -> Path:

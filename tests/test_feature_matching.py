@@ -9,9 +9,9 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from freeocc3d.errors import ModelError
-from freeocc3d.tracking import candidates
-from freeocc3d.tracking.local_features import Sift, detector
-from freeocc3d.tracking.matching import _nearest, _nearest_reference, match
+from freeocc3d.tracking.sfm import candidates
+from freeocc3d.tracking.sfm.local_features import Sift, detector
+from freeocc3d.tracking.sfm.matching import _nearest, _nearest_reference, match
 
 
 def unit(rows: np.ndarray) -> np.ndarray:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from textured import CAMERA, Rectangle, looking, render
 
-from freeocc3d.tracking import stereo
-from freeocc3d.tracking.multi_view import measured
+from freeocc3d.tracking.stereo import scan_depth
+from freeocc3d.tracking.stereo.multi_view import measured
 
 SLANTED = Rectangle((-3, -3, 1.5), (6, 0, 1.0), (0, 6, 0.6))
 PLACES = (0.0, -0.3, -0.15, 0.15, 0.3)
@@ -44,13 +44,13 @@ def test_what_has_no_texture_is_not_measured() -> None:
 def test_a_blank_part_of_a_wall_is_put_on_its_plane() -> None:
     view, others, depth = _views([Rectangle((-3, -3, 1.5), (6, 0, 1.0), (0, 6, 0), blank=(0.45, 0.55))])
     assert (measured(view, others, 1.0, 6.0).inverse > 0)[:, 60:100].mean() < 0.3
-    found, sigma = stereo.depth_map(view, others, 1.0, 6.0, stereo.Options(size=CAMERA.width))
+    found, sigma = scan_depth.depth_map(view, others, 1.0, 6.0, scan_depth.Options(size=CAMERA.width))
     blank = (slice(10, -10), slice(60, 100))
     assert (found[blank] > 0).mean() > 0.95
     off = np.abs(found - depth)[blank][found[blank] > 0]
     assert np.median(off / depth[blank][found[blank] > 0]) < 0.01
     assert np.median(off / sigma[blank][found[blank] > 0]) < 1.5
-    without, _ = stereo.depth_map(view, others, 1.0, 6.0, stereo.Options(size=CAMERA.width, planes=0))
+    without, _ = scan_depth.depth_map(view, others, 1.0, 6.0, scan_depth.Options(size=CAMERA.width, planes=0))
     assert (without[blank] > 0).mean() < 0.3
 
 
@@ -67,7 +67,7 @@ def test_edges_of_what_stands_in_front_stay_where_they_are() -> None:
 @pytest.mark.parametrize("size", [64, 160])
 def test_depth_maps_have_the_size_asked_for(size: int) -> None:
     view, others, depth = _views([SLANTED])
-    found, sigma = stereo.depth_map(view, others, 1.0, 6.0, stereo.Options(size=size, planes=0))
+    found, sigma = scan_depth.depth_map(view, others, 1.0, 6.0, scan_depth.Options(size=size, planes=0))
     assert found.shape == sigma.shape == (round(size * 0.75), size)
     there = found > 0
     assert (sigma[there] > 0).all()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from freeocc3d.tracking.neighbours import neighbours
+from freeocc3d.tracking.stereo.neighbours import neighbours
 
 
 def _line(positions):

@@ -5,7 +5,7 @@ import torch
 from textured import CAMERA, Rectangle, looking, render
 
 from freeocc3d.geometry import back_project, invert, project, transform
-from freeocc3d.tracking.photo_consistency import NOISE, Matcher, best_half, box_mean
+from freeocc3d.tracking.stereo.photo_consistency import NOISE, Matcher, best_half, box_mean
 
 WALL = [Rectangle((-3, -3, 2.0), (6, 0, 0.5), (0, 6, 0))]
 RADIUS = 2

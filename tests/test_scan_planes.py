@@ -1,8 +1,8 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from freeocc3d.tracking.consistency import DepthImage
-from freeocc3d.tracking.scan_planes import find_planes, patches, scan_planes, snapped
+from freeocc3d.tracking.stereo.consistency import DepthImage
+from freeocc3d.tracking.stereo.scan_planes import find_planes, patches, scan_planes, snapped
 from freeocc3d.types import Intrinsics
 
 CAMERA = Intrinsics(160, 120, 130.0, 130.0, 79.5, 59.5)

@@ -6,7 +6,7 @@ from photographs import Photographs
 
 from freeocc3d.errors import FrameError
 from freeocc3d.progress import Progress
-from freeocc3d.tracking import selection
+from freeocc3d.tracking.sfm import selection
 from freeocc3d.types import Frame, Intrinsics
 
 CAMERA = Intrinsics(160, 120, 130.0, 130.0, 79.5, 59.5)

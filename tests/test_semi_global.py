@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from freeocc3d.tracking.semi_global import aggregated, jumps
+from freeocc3d.tracking.stereo.semi_global import aggregated, jumps
 
 DIRECTIONS = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
 

@@ -8,7 +8,7 @@ import pytest
 
 from freeocc3d.errors import MapError
 from freeocc3d.tracking.lens import LensCamera
-from freeocc3d.tracking.sfm import Reconstruction
+from freeocc3d.tracking.sfm.reconstruction import Reconstruction
 from freeocc3d.types import Intrinsics
 
 

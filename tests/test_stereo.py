@@ -13,8 +13,9 @@ from freeocc3d.capture.base import Capture, Options
 from freeocc3d.errors import ConfigError, FrameError, TrackingError
 from freeocc3d.geometry import invert, project, transform
 from freeocc3d.progress import Progress
-from freeocc3d.tracking import known, stereo
-from freeocc3d.tracking.triangulation import triangulated
+from freeocc3d.tracking import known
+from freeocc3d.tracking.stereo import scan_depth
+from freeocc3d.tracking.stereo.triangulation import triangulated
 from freeocc3d.types import Frame
 
 FRAMES = range(24)
@@ -50,7 +51,7 @@ class Colour(Capture):
 def _tracker(capture: Capture, folder: Path, frames=FRAMES, change: Callable = lambda T: T, **options):
     tracker = known.load(known.Options(), capture)
     tracker.T_world_cam = change(tracker.T_world_cam)
-    tracker.stereo = stereo.Options(size=160, vaguest=0.08, **options)  # a pixel of so small an image is vague
+    tracker.stereo = scan_depth.Options(size=160, vaguest=0.08, **options)  # a pixel of so small an image is vague
     assert tracker.offline
     tracker.prepare(folder, frames, Progress())
     return tracker
@@ -146,4 +147,4 @@ def test_a_camera_that_only_turns_measures_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("given", [{"size": 10}, {"planes": -1}, {"neighbours": 0}, {"vaguest": 0.0}])
 def test_options_out_of_range(given) -> None:
     with pytest.raises(ConfigError):
-        stereo.Options(**given)
+        scan_depth.Options(**given)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from freeocc3d.tracking.surfaces import find_planes
+from freeocc3d.tracking.stereo.surfaces import find_planes
 
 
 def _points(normal, count, rng, sigma):

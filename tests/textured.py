@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from freeocc3d.geometry import invert
-from freeocc3d.tracking.stereo import View
+from freeocc3d.tracking.stereo.scan_depth import View
 from freeocc3d.types import Intrinsics
 
 CAMERA = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)

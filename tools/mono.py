@@ -21,7 +21,7 @@ def measure_mono(capture: str) -> Figures:
 
     from freeocc3d.capture import open_capture
     from freeocc3d.capture.base import Options
-    from freeocc3d.tracking.structure import Recipe, reconstruct
+    from freeocc3d.tracking.sfm.structure import Recipe, reconstruct
 
     opened = open_capture(capture, Options(depth=False))
     frames = range(0, len(opened), stride(len(opened)))

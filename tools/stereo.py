@@ -16,8 +16,9 @@ from freeocc3d.capture import open_capture, used_frames
 from freeocc3d.capture.base import Capture, Options
 from freeocc3d.capture.registration import Grid
 from freeocc3d.progress import Progress
-from freeocc3d.tracking import calibration, known, stereo
-from freeocc3d.tracking.triangulation import triangulated
+from freeocc3d.tracking import calibration, known
+from freeocc3d.tracking.stereo import scan_depth
+from freeocc3d.tracking.stereo.triangulation import triangulated
 from freeocc3d.types import Frame
 
 Figures = dict[str, Any]
@@ -45,7 +46,7 @@ def measure_stereo(capture: str, frames: int | None = None) -> Figures:
     compared = used if frames is None else used[:: max(1, len(used) // frames)][:frames]
     T_world_cam = known.load(known.Options(), opened).T_world_cam
     with tempfile.TemporaryDirectory() as folder:
-        depth = stereo.StereoDepth(Path(folder), stereo.Options())
+        depth = scan_depth.StereoDepth(Path(folder), scan_depth.Options())
         started, cpu = time.perf_counter(), time.process_time()
         scan = triangulated(opened, T_world_cam, used, Progress(), colour)
         depth.compute(opened, scan, _with_others(compared, used), Progress(), colour)

@@ -21,7 +21,7 @@ from .pose_graph import Edge, edges_to_arrays
 from .records import Records
 
 if TYPE_CHECKING:
-    from . import stereo
+    from .stereo import scan_depth
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Tracker(ABC):
     """Whether ``prepare`` works through the whole scan before the first frame is tracked."""
     warnings: tuple[str, ...] = ()
     """What ``prepare`` found that the user should know."""
-    stereo: stereo.Options
+    stereo: scan_depth.Options
     """How depth is measured where the capture has none; set before ``prepare``."""
 
     def __init__(self) -> None:

@@ -15,11 +15,11 @@ from ..progress import Progress
 from ..registry import require_positive
 from ..types import Frame, Trajectory
 from .base import Tracked
-from .colmap_model import read_model
 from .given import GivenTracker
-from .sfm import Reconstruction
-from .stereo import Scan
-from .structure import Recipe, reconstruct
+from .sfm.colmap_model import read_model
+from .sfm.reconstruction import Reconstruction
+from .sfm.structure import Recipe, reconstruct
+from .stereo.scan_depth import Scan
 
 REQUIRES: tuple[str, ...] = ("pycolmap",)
 

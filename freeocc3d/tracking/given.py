@@ -17,8 +17,8 @@ from ..types import Frame
 from .base import Tracked, Tracker
 from .overlap import DepthView, mutual_overlap, sample_points
 from .records import Records
-from .stereo import Scan, StereoDepth
-from .triangulation import triangulated
+from .stereo.scan_depth import Scan, StereoDepth
+from .stereo.triangulation import triangulated
 
 _FARTHEST = 2000.0
 _LEAST_COVERED = 0.05  # share of the pixels with a depth, or a frame shows nothing

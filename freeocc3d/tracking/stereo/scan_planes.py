@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Intrinsics
+from ...types import Intrinsics
 from .consistency import DepthImage
 
 _PATCHES_EACH = 2000  # of a view

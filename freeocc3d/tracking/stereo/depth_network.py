@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ModelError
-from ..onnx_model import load_session
+from ...errors import ModelError
+from ...onnx_model import load_session
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, on which encoders are trained
 _FREE_SIZE = 518

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import read_ahead
-from ..capture.base import Capture
-from ..errors import FrameError
-from ..progress import Progress
+from ...capture import read_ahead
+from ...capture.base import Capture
+from ...errors import FrameError
+from ...progress import Progress
 
 _WIDTH = 320  # motion and sharpness are measured in images of this width
 _CORNERS, _LEAST_FOLLOWED = 150, 20

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import TrackingError
-from .sfm_database import SfmDatabase
+from ...errors import TrackingError
+from .database import SfmDatabase
 
 LEAST_IMAGES = 5
 _FEW_FEATURES = 40

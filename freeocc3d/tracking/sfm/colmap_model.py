@@ -9,11 +9,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ..capture.base import Capture
-from ..errors import TrackingError
-from ..types import Intrinsics
-from .lens import LensCamera
-from .sfm import Reconstruction
+from ...capture.base import Capture
+from ...errors import TrackingError
+from ...types import Intrinsics
+from ..lens import LensCamera
+from .reconstruction import Reconstruction
 
 _READABLE = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV"
 

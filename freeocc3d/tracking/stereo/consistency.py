@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..geometry import invert
-from ..types import Intrinsics
+from ...geometry import invert
+from ...types import Intrinsics
 from .photo_consistency import rays
 
 

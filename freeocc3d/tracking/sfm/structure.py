@@ -20,16 +20,16 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ..capture.base import Capture
-from ..errors import FrameError
-from ..progress import Progress
-from ..types import Intrinsics
+from ...capture.base import Capture
+from ...errors import FrameError
+from ...progress import Progress
+from ...types import Intrinsics
 from . import candidates, diagnosis, mapping, selection
 from .colmap_model import reconstruction_of
+from .database import SfmDatabase, image_name
 from .local_features import Detector, LocalFeatures, detector
 from .matching import match
-from .sfm import Reconstruction
-from .sfm_database import SfmDatabase, image_name
+from .reconstruction import Reconstruction
 
 _DATABASE, _CHOSEN, _RESULT = "database.db", "chosen.json", "reconstruction.npz"
 

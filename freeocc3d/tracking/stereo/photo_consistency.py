@@ -16,8 +16,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..geometry import invert
-from ..types import Intrinsics
+from ...geometry import invert
+from ...types import Intrinsics
 
 NOISE = 3.0 / 255.0
 """Standard deviation of what differs between two images of the same surface; fainter texture scores little."""

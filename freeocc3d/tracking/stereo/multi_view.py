@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..geometry import invert, transform
+from ...geometry import invert, transform
 from .consistency import DepthImage
 from .photo_consistency import Matcher, View
 from .semi_global import aggregated, jumps

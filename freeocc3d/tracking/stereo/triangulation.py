@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import read_ahead
-from ..capture.base import Capture
-from ..errors import FrameError
-from ..progress import Progress
-from ..types import Frame
-from . import features
+from ...capture import read_ahead
+from ...capture.base import Capture
+from ...errors import FrameError
+from ...progress import Progress
+from ...types import Frame
+from .. import features
 
 _STEPS = (1, 2, 3, 5, 8, 12)  # frames ahead
 _NEAR = 6  # frames of another time whose cameras look the same way from close by
@@ -24,7 +24,7 @@ _AGREES = 2.0 / 500.0  # of a ray's length: how far two rays of one point may pa
 
 @dataclass(frozen=True)
 class PosedPoints:
-    """What stereo needs of a scan (``stereo.Scan``)."""
+    """What stereo needs of a scan (``scan_depth.Scan``)."""
 
     T_world_cam: NDArray[np.float64]
     points: NDArray[np.float32]

@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..arrays import read_arrays
-from ..capture import read_ahead
-from ..capture.base import Capture
-from ..errors import ConfigError, FrameError, TrackingError
-from ..progress import Progress
-from ..registry import require_positive
-from ..types import Frame, Intrinsics
+from ...arrays import read_arrays
+from ...capture import read_ahead
+from ...capture.base import Capture
+from ...errors import ConfigError, FrameError, TrackingError
+from ...progress import Progress
+from ...registry import require_positive
+from ...types import Frame, Intrinsics
 from . import depth_network
 from .consistency import DepthImage, confirmed
 from .multi_view import completed, measured

@@ -1,0 +1,1 @@
+"""Multi-view stereo: dense depth of posed frames from their colour."""
