@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from freeocc3d.capture import Options, open_capture
 from freeocc3d.capture.base import NOMINAL_DEPTH
-from freeocc3d.capture.rectified import Lens, Rectified
 from freeocc3d.errors import CaptureError, ConfigError, FrameError
 from freeocc3d.evaluation.align import read_poses
 from freeocc3d.geometry import invert, rotations_to_quats
@@ -251,14 +250,3 @@ def test_distortion_is_taken_out_as_colmap_states_it(
     off = np.abs(frame.color[..., :2] - expected)
     assert off.max() < 2.5
     assert off.mean() < 0.6
-
-
-def test_without_distortion_images_are_the_same_arrays() -> None:
-    camera = Intrinsics(32, 24, 30.0, 30.0, 15.5, 11.5)
-    image = color_image(0)
-    rectified = Rectified(Lens(camera, (0.0, 0.0, 0.0, 0.0)), None)
-    assert rectified.color(image) is image
-    assert rectified.intrinsics == camera
-    distorted = Rectified(Lens(camera, (-0.2, 0.0, 0.0, 0.0)), None)
-    depth_m = np.where(np.arange(24)[:, None] < 12, np.float32(1), np.float32(2)) * np.ones((1, 32), np.float32)
-    assert set(np.unique(distorted.depth(depth_m))) == {1.0, 2.0}, "depth is never interpolated"

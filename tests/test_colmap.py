@@ -10,12 +10,12 @@ import pycolmap
 import pytest
 from photographs import Photographs, turning, walk
 
+from freeocc3d.capture.rectified import Lens
 from freeocc3d.errors import ConfigError, TrackingError
 from freeocc3d.geometry import umeyama
 from freeocc3d.progress import Progress
 from freeocc3d.tracking import colmap, given
 from freeocc3d.tracking.colmap import ColmapTracker, Options
-from freeocc3d.tracking.lens import LensCamera
 from freeocc3d.tracking.sfm import colmap_model, mapping, structure
 from freeocc3d.tracking.sfm.reconstruction import Reconstruction
 from freeocc3d.tracking.sfm.structure import Recipe
@@ -71,9 +71,9 @@ def test_every_image_is_placed_and_the_focal_length_found(room: tuple[Reconstruc
     _, true, camera = walk()
     assert found.has_pose.all()
     assert ate_cm(found, true) < 0.6
-    assert found.camera.intrinsics.fx == pytest.approx(camera.fx, rel=0.01)
-    assert (found.camera.intrinsics.cx, found.camera.intrinsics.cy) == (camera.cx, camera.cy)
-    assert not found.camera.distorts
+    assert found.lens.camera.fx == pytest.approx(camera.fx, rel=0.01)
+    assert (found.lens.camera.cx, found.lens.camera.cy) == (camera.cx, camera.cy)
+    assert not any(found.lens.distortion)
     assert np.median(found.depths()) == pytest.approx(2.0)
     assert found.warnings == ()
 
@@ -83,7 +83,7 @@ def test_points_lie_where_they_are_seen(room: tuple[Reconstruction, Path]) -> No
     found, folder = room
     with structure.SfmDatabase(folder / "database.db") as database:
         pixels = [database.pixels(frame) for frame in range(3)]
-    K = found.camera.intrinsics.matrix
+    K = found.lens.camera.matrix
     for frame in range(3):
         T = np.linalg.inv(found.T_world_cam[frame])
         points = found.points[found.seen_point[found.seen_frame == frame]]
@@ -96,7 +96,7 @@ def test_points_lie_where_they_are_seen(room: tuple[Reconstruction, Path]) -> No
 
 def test_cameras_of_which_nothing_is_known_are_estimated(tmp_path: Path) -> None:
     images, true, camera = walk()
-    lens = LensCamera(camera, (-0.12, 0.0, 0.0, 0.0))
+    lens = Lens(camera, (-0.12, 0.0, 0.0, 0.0))
     rays = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).reshape(-1, 1, 2)
     maps = cv2.undistortPoints(
         rays.astype(np.float32), camera.matrix, np.array(lens.distortion), None, None, camera.matrix
@@ -106,8 +106,8 @@ def test_cameras_of_which_nothing_is_known_are_estimated(tmp_path: Path) -> None
     found = reconstructed(bent, guess, tmp_path, known=False)
     assert found.has_pose.all()
     assert ate_cm(found, true) < 1.0
-    assert found.camera.intrinsics.fx == pytest.approx(camera.fx, rel=0.03)
-    assert found.camera.distortion[0] == pytest.approx(-0.12, abs=0.04)
+    assert found.lens.camera.fx == pytest.approx(camera.fx, rel=0.03)
+    assert found.lens.distortion[0] == pytest.approx(-0.12, abs=0.04)
 
 
 def test_the_global_mapper_finds_the_same(tmp_path: Path) -> None:
@@ -216,7 +216,7 @@ def test_the_tracker_gives_poses_depth_and_what_became_of_frames(
     tracker = tracked(altered, tmp_path, monkeypatch)
     for index in range(8):
         frame = tracker.completed(tracker._capture[index])
-        assert frame.intrinsics == found.camera.pinhole()
+        assert frame.intrinsics == found.rectified.intrinsics
         assert frame.depth_m[0, 0] == 2.0
         tracker.track(frame)
     state = tracker.state()
@@ -235,11 +235,11 @@ def test_frames_are_undistorted(
     room: tuple[Reconstruction, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found, _ = room
-    bent = replace(found, camera=LensCamera(found.camera.intrinsics, (-0.2, 0.0, 0.0, 0.0)))
+    bent = replace(found, lens=Lens(found.lens.camera, (-0.2, 0.0, 0.0, 0.0)))
     tracker = tracked(bent, tmp_path, monkeypatch)
     frame = tracker.completed(tracker._capture[0])
-    assert frame.intrinsics == bent.camera.pinhole() != bent.camera.intrinsics
-    np.testing.assert_array_equal(frame.color, bent.camera.undistorted(tracker._capture[0].color))
+    assert frame.intrinsics == bent.rectified.intrinsics != bent.lens.camera
+    np.testing.assert_array_equal(frame.color, bent.rectified.color(tracker._capture[0].color))
 
 
 def test_options_are_checked() -> None:
@@ -273,8 +273,8 @@ def test_an_existing_model_is_read(text: bool, tmp_path: Path) -> None:
     found = colmap_model.read_model(tmp_path, Photographs(images, own))
     np.testing.assert_array_equal(found.has_pose, [True, True, False, True])
     np.testing.assert_allclose(found.T_world_cam[3], true[3], atol=1e-6)
-    assert found.camera.intrinsics == Intrinsics(own.width, own.height, 250.0, 251.0, 159.5, 119.5)
-    assert found.camera.distortion == (0.1, -0.02, 0.001, 0.002)
+    assert found.lens.camera == Intrinsics(own.width, own.height, 250.0, 251.0, 159.5, 119.5)
+    assert found.lens.distortion == (0.1, -0.02, 0.001, 0.002)
     np.testing.assert_allclose(np.sort(found.depths()), [4] * 9 + [5] * 3, atol=1e-5)
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from freeocc3d.capture.rectified import Lens
 from freeocc3d.errors import MapError
-from freeocc3d.tracking.lens import LensCamera
 from freeocc3d.tracking.sfm.reconstruction import Reconstruction
 from freeocc3d.types import Intrinsics
 
@@ -19,7 +19,7 @@ def reconstruction() -> Reconstruction:
     T[2, 0, 3] = 1.0
     points = np.array([(0, 0, 5), (1, 0, 5), (0, 1, 7)], np.float32)
     return Reconstruction(
-        T, LensCamera(Intrinsics(64, 48, 50.0, 51.0, 31.5, 23.5), (0.1, 0.0, 0.0, 0.0)), points,
+        T, Lens(Intrinsics(64, 48, 50.0, 51.0, 31.5, 23.5), (0.1, 0.0, 0.0, 0.0)), points,
         np.array([0, 0, 2, 2], np.int32), np.array([0, 1, 1, 2], np.int32), False,
         np.array([False, True, False]), np.ones(3, bool), ("it fell into two",),
     )  # fmt: skip

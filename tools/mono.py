@@ -31,14 +31,14 @@ def measure_mono(capture: str) -> Figures:
         found = reconstruct(opened, frames, Path(folder), Recipe(frames=len(frames)), watch)
         watch.stage("")
         seconds, cpu_seconds = watch.seconds, time.process_time() - watch.began
-    camera = found.camera
+    lens = found.lens
     ours = {
         **_scores(found.T_world_cam[list(frames)], true),
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "points": len(found.points),
-        "focal_px": camera.intrinsics.fx,
-        "distortion": list(camera.distortion),
+        "focal_px": lens.camera.fx,
+        "distortion": list(lens.distortion),
     }
     return {"frames": len(frames), "ours": ours, "pycolmap": _defaults(opened, frames, true)}
 

@@ -95,8 +95,8 @@ class ColmapTracker(GivenTracker):
     def as_pinhole(self, frame: Frame) -> Frame:
         """Undistorted."""
         assert self.reconstruction is not None, "prepare comes first"
-        lens = self.reconstruction.camera
-        return replace(frame, color=lens.undistorted(frame.color), intrinsics=lens.pinhole())
+        rectified = self.reconstruction.rectified
+        return replace(frame, color=rectified.color(frame.color), intrinsics=rectified.intrinsics)
 
     def track(self, frame: Frame) -> Tracked:
         assert self.reconstruction is not None, "prepare comes first"

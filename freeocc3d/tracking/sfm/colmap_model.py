@@ -10,9 +10,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
+from ...capture.rectified import Lens
 from ...errors import TrackingError
 from ...types import Intrinsics
-from ..lens import LensCamera
 from .reconstruction import Reconstruction
 
 _READABLE = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV"
@@ -48,7 +48,7 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
     if not len(found.points):
         raise TrackingError(f"The model in {folder} holds no points of the capture's frames.")
     size = capture[int(np.flatnonzero(found.has_pose)[0])].color.shape[1::-1]
-    camera = found.camera.intrinsics
+    camera = found.lens.camera
     if (camera.width, camera.height) != size:
         raise TrackingError(
             f"The model in {folder} is of images of {camera.width} x {camera.height} pixels, those of {capture.path} "
@@ -97,7 +97,7 @@ def reconstruction_of(
     )
 
 
-def lens_of(camera: pycolmap.Camera) -> LensCamera:
+def lens_of(camera: pycolmap.Camera) -> Lens:
     """COLMAP's camera in OpenCV's model. Raises TrackingError if that does not express it."""
     extra = dict(zip(_names(camera), camera.params.tolist(), strict=True))
     if camera.model_name == "FULL_OPENCV" and not any(extra[name] for name in ("k3", "k4", "k5", "k6")):
@@ -115,14 +115,14 @@ def lens_of(camera: pycolmap.Camera) -> LensCamera:
         camera.focal_length_y if "fy" in extra else camera.focal_length,
         camera.principal_point_x - 0.5, camera.principal_point_y - 0.5,
     )  # fmt: skip
-    return LensCamera(intrinsics, (radial, *(extra.get(name, 0.0) for name in ("k2", "p1", "p2"))))
+    return Lens(intrinsics, (radial, *(extra.get(name, 0.0) for name in ("k2", "p1", "p2"))))
 
 
 def _names(camera: pycolmap.Camera) -> list[str]:
     return [name.strip() for name in camera.params_info.split(",")]
 
 
-_NO_LENS = LensCamera(Intrinsics(1, 1, 1.0, 1.0, 0.0, 0.0))
+_NO_LENS = Lens(Intrinsics(1, 1, 1.0, 1.0, 0.0, 0.0))
 
 
 def registered(model: pycolmap.Reconstruction) -> NDArray[np.int64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 
 from ...arrays import read_arrays
 from ...capture.base import NOMINAL_DEPTH
+from ...capture.rectified import Lens, Rectified
 from ...types import Intrinsics
-from ..lens import LensCamera
 
 _EXPECTED = {
     "T_world_cam": ("f", 3), "camera": ("f", 1), "points": ("f", 2), "seen_frame": ("i", 1), "seen_point": ("i", 1),
@@ -25,7 +26,7 @@ class Reconstruction:
     """Poses and sparse points of a scan by structure from motion, or read from a model.
 
     T_world_cam: (N, 4, 4) float64, row n = frame n of the capture, NaN where it has no pose.
-    camera: of all frames.  points: (P, 3) float32 world.
+    lens: of all frames.  points: (P, 3) float32 world.
     seen_frame, seen_point: (O,) int32, point ``seen_point[i]`` is seen in frame ``seen_frame[i]``.
     metric: whether the world's unit is the metre.
     apart: (N,) whether the frame is in another model than this, which nothing ties to it.
@@ -33,7 +34,7 @@ class Reconstruction:
     """
 
     T_world_cam: NDArray[np.float64]
-    camera: LensCamera
+    lens: Lens
     points: NDArray[np.float32]
     seen_frame: NDArray[np.int32]
     seen_point: NDArray[np.int32]
@@ -46,6 +47,11 @@ class Reconstruction:
     def has_pose(self) -> NDArray[np.bool_]:
         """(N,) which frames have one."""
         return np.asarray(np.isfinite(self.T_world_cam).all(axis=(1, 2)))
+
+    @cached_property
+    def rectified(self) -> Rectified:
+        """Resamples frames as a pinhole camera would have taken them."""
+        return Rectified(self.lens, None)
 
     def depths(self) -> NDArray[np.float64]:
         """(O,) of each observation: the point's z in the frame's camera."""
@@ -65,8 +71,8 @@ class Reconstruction:
 
     def save(self, path: Path) -> None:
         """As an .npz file that is whole or not there."""
-        camera = self.camera.intrinsics
-        numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *self.camera.distortion)
+        camera = self.lens.camera
+        numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *self.lens.distortion)
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _EXPECTED if name not in ("camera", "warnings")}
         arrays["warnings"] = np.array(self.warnings, "U")
 
@@ -79,6 +85,6 @@ class Reconstruction:
         """The inverse of ``save``. Raises MapError for a damaged file."""
         arrays = read_arrays(path, _EXPECTED)
         width, height, fx, fy, cx, cy, *distortion = arrays.pop("camera").tolist()
-        lens = LensCamera(Intrinsics(int(width), int(height), fx, fy, cx, cy), tuple(distortion))
+        lens = Lens(Intrinsics(int(width), int(height), fx, fy, cx, cy), tuple(distortion))
         metric, warnings = bool(arrays.pop("metric")), tuple(arrays.pop("warnings").tolist())
-        return cls(camera=lens, metric=metric, warnings=warnings, **arrays)
+        return cls(lens=lens, metric=metric, warnings=warnings, **arrays)

@@ -3,15 +3,16 @@
 import cv2
 import numpy as np
 
-from freeocc3d.tracking.lens import LensCamera
+from freeocc3d.capture.rectified import Lens, Rectified
 from freeocc3d.types import Intrinsics
 
 CAMERA = Intrinsics(160, 120, 130.0, 131.0, 80.5, 58.0)
 
 
 def test_undistorted_images_are_those_of_the_pinhole_camera() -> None:
-    lens = LensCamera(CAMERA, (-0.2, 0.05, 0.003, -0.002))
-    pinhole = lens.pinhole()
+    lens = Lens(CAMERA, (-0.2, 0.05, 0.003, -0.002))
+    rectified = Rectified(lens, None)
+    pinhole = rectified.intrinsics
     assert (pinhole.width, pinhole.height) == (160, 120)
     taken = np.zeros((120, 160, 3), np.uint8)
     dots = np.array([(30, 25), (80, 60), (130, 95), (25, 100)], np.float32)
@@ -20,7 +21,7 @@ def test_undistorted_images_are_those_of_the_pinhole_camera() -> None:
     expected = cv2.undistortPoints(
         dots[:, None], CAMERA.matrix, np.array(lens.distortion), None, None, pinhole.matrix
     ).reshape(-1, 2)
-    seen = lens.undistorted(taken)[:, :, 0].astype(float)
+    seen = rectified.color(taken)[:, :, 0].astype(float)
     for u, v in expected:
         window = np.s_[int(v) - 6 : int(v) + 8, int(u) - 6 : int(u) + 8]
         rows, columns = np.mgrid[window]
@@ -30,13 +31,16 @@ def test_undistorted_images_are_those_of_the_pinhole_camera() -> None:
 
 
 def test_no_pixel_of_an_undistorted_image_lies_outside() -> None:
-    white = np.full((120, 160, 3), 255, np.uint8)
+    inside = np.ones((120, 160), np.float32)  # of depth, which has a hole where nothing was seen
     for k1 in (-0.25, 0.15):
-        assert LensCamera(CAMERA, (k1, 0.0, 0.0, 0.0)).undistorted(white).min() > 200
+        assert Rectified(Lens(CAMERA, (k1, 0.0, 0.0, 0.0)), None).depth(inside)[1:-1, 1:-1].all()
 
 
-def test_without_distortion_images_stay_what_they_are() -> None:
+def test_without_distortion_images_are_the_same_arrays() -> None:
     color = np.zeros((120, 160, 3), np.uint8)
-    lens = LensCamera(CAMERA)
-    assert lens.undistorted(color) is color
-    assert lens.pinhole() == CAMERA
+    rectified = Rectified(Lens(CAMERA, (0.0, 0.0, 0.0, 0.0)), None)
+    assert rectified.color(color) is color
+    assert rectified.intrinsics == CAMERA
+    distorted = Rectified(Lens(CAMERA, (-0.2, 0.0, 0.0, 0.0)), None)
+    depth_m = np.where(np.arange(120)[:, None] < 60, np.float32(1), np.float32(2)) * np.ones((1, 160), np.float32)
+    assert set(np.unique(distorted.depth(depth_m))) == {1.0, 2.0}, "depth is never interpolated"
