@@ -28,7 +28,7 @@ from .errors import CaptureError, FrameError, Interrupted, MapError, TrackingErr
 from .gaussians import anchors, fit, images
 from .gaussians.gravity import gravity_frame
 from .gaussians.rasterizers.base import Rasterizer
-from .gaussians.upright import estimate_up
+from .gaussians.upright import estimate_up, turned_back
 from .keyframes import Keyframes
 from .language import lift, scene_vocabulary
 from .language.codec import Codec
@@ -427,9 +427,10 @@ def _open(capture: str | Path, settings: Config, progress: Progress, work: WorkF
     section = settings["capture"]
     opened = open_capture(capture, _options(capture_base, config.options(settings, "capture")), section)
     used_frames(opened)
-    if opened.has_depth and (warning := check_depth_scale(opened)):
-        work.warnings.append(warning)
-        progress.warn(warning)
+    warning = check_depth_scale(opened) if opened.has_depth else None
+    for text in (*opened.warnings, *([warning] if warning else [])):
+        work.warnings.append(text)
+        progress.warn(text)
     return opened
 
 
@@ -499,7 +500,9 @@ def _save(
         store.write_tum(folder / store.TRAJECTORY, trajectory)
         (folder / store.CONFIG).write_text(config.dump(mapper.settings), encoding="utf-8")
         metric = mapper.tracker.metric
-        paths.path_picture(folder / store.PATH_PICTURE, submaps, trajectory, gaussians, capture.path, metric)
+        manifest = _manifest(mapper, trajectory, gaussians, occupancy, encoder, submaps)
+        up = np.array(manifest["up"])
+        paths.path_picture(folder / store.PATH_PICTURE, submaps, trajectory, gaussians, up, capture.path, metric)
         views = list(zip(trajectory.keyframes.tolist(), mapper.views(trajectory), strict=True))
         shown = [views[row] for row in _evenly(len(views), renders.SHOWN)]
         picture = folder / store.RENDER_PICTURE
@@ -512,7 +515,6 @@ def _save(
         keyframes.drop_unlisted()
     report = {**_report(work, capture, trajectory, submaps), "rendering": dataclasses.asdict(fidelity)}
     (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
-    manifest = _manifest(mapper, trajectory, gaussians, occupancy, encoder, submaps)
     store.write_manifest(folder, {**manifest, **({"vocabulary": vocabulary} if vocabulary else {})})
 
 
@@ -525,6 +527,8 @@ def _manifest(
     submaps: list[Submap],
 ) -> dict[str, Any]:
     capture = mapper.capture
+    turned = np.array([capture.turned(index) for index in trajectory.keyframes.tolist()], np.int8)
+    held = turned_back(trajectory.T_world_keyframe, turned)
     return {
         "freeocc3d": __version__,
         "capture": {"path": _absolute(capture.path), "format": capture.format, "frames": len(capture)},
@@ -533,9 +537,9 @@ def _manifest(
         **store.sizes(occupancy),
         "origin": occupancy.origin.tolist(),
         "scale": _scale(mapper),
-        "up": estimate_up(trajectory.T_world_keyframe, gaussians.means).tolist(),
+        "up": estimate_up(held, gaussians.means).tolist(),
         "T_world_map": np.eye(4).tolist(),
-        "T_gravity_map": gravity_frame(trajectory.T_world_keyframe, gaussians).tolist(),
+        "T_gravity_map": gravity_frame(held, gaussians).tolist(),
         "encoder": {"name": encoder.name, "dimension": encoder.dimension, "state": encoder.text_state()},
         "codec": "transform coding, 8, 4 and 2 bits a direction",
         "counts": {

@@ -236,7 +236,9 @@ def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussi
     ends = np.array([closure[:2] for closure in closures], np.int32).reshape(-1, 2)
     held = np.array([closure[2] for closure in closures], bool)
     submap = Submap(frames, trajectory.T_world_cam[frames], trajectory.keyframes, ends, held)
-    paths.path_picture(folder / store.PATH_PICTURE, [submap], trajectory, gaussians, capture)
+    paths.path_picture(
+        folder / store.PATH_PICTURE, [submap], trajectory, gaussians, np.array(scan_map.manifest["up"]), capture
+    )
     rasterizer = registry.load("gaussians.rasterizers", "cpu").load()
     width = int(config.load(scan_map.path / store.CONFIG)["fitting"]["width"])
     keyframes = scan_map.keyframes

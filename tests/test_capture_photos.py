@@ -120,17 +120,57 @@ def test_times_are_those_of_exif_if_they_ascend(tmp_path: Path) -> None:
     np.testing.assert_allclose(open_capture(tmp_path).timestamps, [0, 1, 2, 3])
 
 
-def test_images_of_another_size_are_broken_frames_or_no_capture(tmp_path: Path) -> None:
-    write_photos(tmp_path, 12)
-    write_photo(tmp_path / "IMG_10.jpg", size=(48, 64))
+@pytest.mark.parametrize(("most", "least"), [(1, 6), (1, 8), (6, 1), (6, 3)])
+def test_what_one_camera_took_held_the_other_way_is_turned_to_the_size_of_most(
+    tmp_path: Path, most: int, least: int
+) -> None:
+    write_photos(tmp_path, 4, orientation=most, exif={0xA405: 28})
+    write_photo(tmp_path / "IMG_9.jpg", 1, orientation=least, exif={0xA405: 28})
     capture = open_capture(tmp_path)
-    with pytest.raises(FrameError, match=r"IMG_10\.jpg has 48 x 64 pixels, most of the other images have 64 x 48"):
-        capture[2]
-    assert capture[3].color.shape == (48, 64, 3)
-    write_photo(tmp_path / "IMG_11.jpg", size=(48, 64))
-    with pytest.raises(CaptureError, match=r"several sizes \(10 of 64 x 48, 2 of 48 x 64 pixels; IMG_10\.jpg"):
+    assert capture.warnings == ()
+    assert capture.focal_stated
+    assert [capture.turned(index) for index in (0, 2, 3)] == [0, 0, 0]
+    # Pixels lie on the sensor as those of the other images do, so that all have one principal point and lens.
+    stored = color_image(1, SIZE).astype(int)
+    expected = np.rot90(stored, -1) if most == 6 else stored
+    assert np.abs(capture[1].color - expected).mean() < 4
+    assert capture[1].color.flags.c_contiguous
+    assert {capture[index].intrinsics for index in range(4)} == {capture[1].intrinsics}
+    with Image.open(tmp_path / "IMG_9.jpg") as image:
+        held = np.asarray(ImageOps.exif_transpose(image)).astype(int)
+    np.testing.assert_allclose(np.rot90(held, capture.turned(1)), capture[1].color, atol=4)
+
+
+def test_photographs_without_exif_are_turned_as_well(tmp_path: Path) -> None:
+    write_photos(tmp_path, 3)
+    write_photo(tmp_path / "IMG_9.jpg", 1, size=(48, 64))
+    capture = open_capture(tmp_path)
+    assert capture.turned(1) == 1
+    assert np.abs(capture[1].color - np.rot90(color_image(1, (48, 64)).astype(int))).mean() < 4
+
+
+def test_images_of_other_sizes_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    write_photos(tmp_path, 6)
+    write_photo(tmp_path / "IMG_10.jpg", size=(48, 64))
+    write_photo(tmp_path / "IMG_11.jpg", size=(80, 60))
+    (tmp_path / "IMG_12.jpg").write_text("no image")
+    capture = open_capture(tmp_path)
+    assert [capture.name(index) for index in range(len(capture))] == [f"IMG_{n}.jpg" for n in (8, 9, 10, 12, 13)]
+    (warning,) = capture.warnings
+    assert "1 of the 6 images" in warning
+    assert "is left out, the first IMG_11.jpg of 80 x 60 pixels: the others have 64 x 48" in warning
+    assert capture[2].color.shape == (48, 64, 3)
+    with pytest.raises(FrameError, match=r"IMG_12\.jpg is not a readable image"):
+        capture[3]
+    write_photo(tmp_path / "IMG_13.jpg", size=(80, 60))
+    assert "2 of the 6 images" in open_capture(tmp_path).warnings[0]
+
+
+def test_images_of_which_no_two_have_one_size_are_refused(tmp_path: Path) -> None:
+    for index in range(3):
+        write_photo(tmp_path / f"{index}.jpg", size=(64, 48 + 2 * index))
+    with pytest.raises(CaptureError, match=r"The 3 images of .* have as many sizes, but a scan is of one camera"):
         open_capture(tmp_path)
-    assert len(open_capture(tmp_path, Options(max_broken=0.3))) == 12
 
 
 def test_damaged_images_are_broken_frames(tmp_path: Path) -> None:

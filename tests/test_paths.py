@@ -21,6 +21,9 @@ def submap(frames: range, keyframes: list[int], closures=(), held=()) -> Submap:
     )
 
 
+UP = np.array((0.0, -1.0, 0.0))
+
+
 def trajectory(status: list[str]) -> Trajectory:
     posed = np.array([name not in ("lost", "apart", "unused") for name in status])
     T = np.where(posed[:, None, None], np.stack([pose_matrix(i) for i in range(len(status))]), np.nan)
@@ -31,7 +34,7 @@ def trajectory(status: list[str]) -> Trajectory:
 def drawn(
     path: Path, submaps: list[Submap], status: list[str], points=((0, 0, 2), (1, 0, 2), (0.5, 0.2, 3))
 ) -> np.ndarray:
-    paths.path_picture(path, submaps, trajectory(status), gaussians(points, 0.02), Path("scan"))
+    paths.path_picture(path, submaps, trajectory(status), gaussians(points, 0.02), UP, Path("scan"))
     picture = cv2.imread(str(path))[:, :, ::-1]
     assert picture.shape == (paths.SIZE[1], paths.SIZE[0], 3)
     return picture

@@ -3,7 +3,7 @@
 import numpy as np
 
 from freeocc3d.capture.synthetic import camera_on_the_walk
-from freeocc3d.gaussians.upright import estimate_up
+from freeocc3d.gaussians.upright import estimate_up, turned_back
 from freeocc3d.geometry import quats_to_rotations
 
 
@@ -51,6 +51,19 @@ def test_cameras_that_are_rolled_or_held_sideways_have_the_same_up() -> None:
         for scale in (0.4, 1.0, 4.0):  # units that are no metres
             held[:, :3, 3] = scale * T[:, :3, 3]
             assert estimate_up(held, scale * points)[2] > np.cos(np.deg2rad(1.5)), (roll, scale)
+
+
+def test_images_that_were_turned_to_one_size_do_not_turn_up() -> None:
+    T = np.stack([camera_on_the_walk(phase) for phase in np.linspace(0, 0.1, 20)])  # they look about the same way
+    quarters = np.where(np.arange(20) % 5 < 2, 1, 0) * np.where(np.arange(20) % 2, 1, -1)
+    # What a picture shows above lies on its left once it is turned counter-clockwise.
+    given = rolled(T, 90.0 * quarters)
+    turned_left = int(np.flatnonzero(quarters == 1)[0])
+    np.testing.assert_allclose(-given[turned_left, :3, 0], -T[turned_left, :3, 1], atol=1e-12)
+    np.testing.assert_allclose(turned_back(given, quarters), T, atol=1e-12)
+    points = np.zeros((0, 3))
+    assert estimate_up(turned_back(given, quarters), points) @ estimate_up(T, points) > 1 - 1e-12
+    assert estimate_up(given, points) @ estimate_up(T, points) < 0.99, "what the turned images alone would say"
 
 
 def test_a_camera_that_nods_is_not_held_sideways() -> None:

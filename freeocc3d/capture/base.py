@@ -76,6 +76,8 @@ class Capture(ABC):
     """Whether at least the focal length is stated, if roughly, as EXIF does; true where the intrinsics are known."""
     metric_poses: bool = True
     """Whether ``pose`` is in metres."""
+    warnings: tuple[str, ...] = ()
+    """What the user should know of what was found, such as files that are left out."""
     classes: tuple[str, ...] = ()
     """Names of the class images' values, index 0 = nothing; empty where the capture has no class images."""
 
@@ -103,6 +105,11 @@ class Capture(ABC):
     def name(self, index: int) -> str:
         """File name of the frame's colour image, by which other systems' poses may know it; "" where there is none."""
         return ""
+
+    def turned(self, index: int) -> int:
+        """Quarter turns, counter-clockwise, by which the frame's image is turned from how the camera was held: images
+        of a scan have one size. All else (poses, pixels, pictures) is of the image as it is turned."""
+        return 0
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """(4, 4) T_world_cam that the capture states for the frame, or None. Read by the ``known`` tracker and by

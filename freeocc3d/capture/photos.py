@@ -47,8 +47,9 @@ class Header:
 
 class Reader(Capture):
     """The images lie in the folder or in its ``images/``; an EXIF orientation is applied, and they are reduced to
-    ``capture.max_size``. All have one camera: images of another size than most are broken frames, or, if they are more
-    than ``capture.max_broken``, no capture.
+    ``capture.max_size``. All have one camera: what it took held the other way, so that width and height are swapped, is
+    turned by a quarter to the size of most (``turned``), and images of really other sizes are left out with a warning.
+    Frames are numbered over what is left, and poses, pixels and pictures are of the images as they are turned.
 
     The camera is ``capture.intrinsics``, for the upright size before it is reduced; else a guess with the focal length
     that EXIF states (35 mm equivalent, or focal length and sensor resolution) for most of them: good to some percent,
@@ -56,20 +57,25 @@ class Reader(Capture):
     """
 
     format = "photos"
-    layout = "images (jpg, png, tif, bmp, webp) of one size"
+    layout = "images (jpg, png, tif, bmp, webp) by one camera"
     general = True
     has_depth = False
 
     def __init__(self, path: Path, options: Options):
         super().__init__(path, options)
-        self._paths = images_in(path)
-        if len(self._paths) < 2:
-            raise CaptureError(_too_few(path, self._paths))
-        headers = [read_header(image) for image in self._paths]
-        self._size = _common_size(self._paths, headers, options.max_broken)
+        paths = images_in(path)
+        if len(paths) < 2:
+            raise CaptureError(_too_few(path, paths))
+        images = [(image, read_header(image)) for image in paths]
+        self._size = _common_size(path, [header for _, header in images if header is not None])
+        both = self._size, self._size[::-1]
+        odd = [(image, header) for image, header in images if header is not None and header.size not in both]
+        images = [(image, header) for image, header in images if header is None or header.size in both]
+        if odd:
+            self.warnings = (_left_out(path, odd, len(images), self._size),)
+        self._paths, headers = [image for image, _ in images], [header for _, header in images]
         self._headers = headers
-        usable = [header for header in headers if header is not None and header.size == self._size]
-        stated, lens = given(options), _focal(usable, self._size)
+        stated, lens = given(options), _focal([header for header in headers if header is not None], self._size)
         camera = stated.camera(self._size) if stated else lens or usual(self._size)
         self.intrinsics_known, self.focal_stated = stated is not None, stated is not None or lens is not None
         self.intrinsics: Intrinsics = reduced(camera, options.max_size)
@@ -85,6 +91,7 @@ class Reader(Capture):
             raise IndexError(f"Frame {index} of {len(self)} images.")
         path, header, camera = self._paths[index], self._headers[index], self.intrinsics
         color = upright(read_color(path), header.orientation if header else 1)
+        color = np.ascontiguousarray(np.rot90(color, self.turned(index)))
         height, width = color.shape[:2]
         if (width, height) != self._size:
             raise FrameError(
@@ -97,6 +104,15 @@ class Reader(Capture):
 
     def name(self, index: int) -> str:
         return self._paths[index].name
+
+    def turned(self, index: int) -> int:
+        header = self._headers[index]
+        if header is None or header.size == self._size:
+            return 0
+        if header.orientation >= 5:  # back to how it is stored, as the others are
+            return 1 if header.orientation in (5, 6) else -1
+        # To portrait as phones store it, the sensor's left edge being above.
+        return 1 if self._size[0] > self._size[1] or header.orientation in (3, 4) else -1
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -178,21 +194,32 @@ def _focal(headers: Sequence[Header], size: Size) -> Intrinsics | None:
     return None if high - low > SAME_LENS * middle else equivalent(float(middle) * DIAGONAL_35MM, size)
 
 
-def _common_size(paths: Sequence[Path], headers: Sequence[Header | None], max_broken: float) -> Size:
-    """The upright size of most images. Raises CaptureError if too many have another, or none can be read."""
-    count = Counter(header.size for header in headers if header is not None)
-    if not count:
-        raise CaptureError(f"No image of {paths[0].parent} can be read: all are damaged, or no images at all.")
-    (size, most), *others = count.most_common()
-    if sum(count.values()) - most > max_broken * len(paths):
-        said = ", ".join(f"{number} of {w} x {h}" for (w, h), number in [(size, most), *others[:3]])
-        odd = next(path for path, header in zip(paths, headers, strict=True) if header and header.size != size)
+def _common_size(folder: Path, headers: Sequence[Header]) -> Size:
+    """The upright size of most images, of which those held the other way count as well. Raises CaptureError if none can
+    be read, or no two are of one size."""
+    if not headers:
+        raise CaptureError(f"No image of {folder} can be read: all are damaged, or no images at all.")
+    upright_sizes = Counter(header.size for header in headers)
+    either = {
+        size: count + (upright_sizes[size[::-1]] if size[0] != size[1] else 0) for size, count in upright_sizes.items()
+    }
+    size = max(upright_sizes, key=lambda size: (either[size], upright_sizes[size]))
+    if either[size] < 2 <= len(headers):
         raise CaptureError(
-            f"{paths[0].parent} holds images of several sizes ({said} pixels; {odd.name} is the first odd one), but a "
-            "scan is of one camera, held one way: take them apart, or raise capture.max_broken to leave out all but "
-            "the most."
+            f"The {len(headers)} images of {folder} have as many sizes, but a scan is of one camera: give "
+            "images of one size, as a camera stores them."
         )
     return size
+
+
+def _left_out(folder: Path, odd: Sequence[tuple[Path, Header]], used: int, size: Size) -> str:
+    """A warning in one sentence."""
+    (path, header), count = odd[0], len(odd)
+    return (
+        f"{count} of the {count + used} images of {folder} {'is' if count == 1 else 'are'} left out, the first "
+        f"{path.name} of {header.size[0]} x {header.size[1]} pixels: the others have {size[0]} x {size[1]}, and a scan "
+        "is of one camera."
+    )
 
 
 def _too_few(path: Path, found: Sequence[Path]) -> str:

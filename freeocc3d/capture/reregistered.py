@@ -39,6 +39,9 @@ class Reregistered(Capture):
     def name(self, index: int) -> str:
         return self._capture.name(index)
 
+    def turned(self, index: int) -> int:
+        return self._capture.turned(index)
+
     def pose(self, index: int) -> NDArray[np.float64] | None:
         return self._capture.pose(index)
 

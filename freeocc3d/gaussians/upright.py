@@ -35,6 +35,15 @@ def estimate_up(T_world_cam: NDArray[np.float64], points_world: NDArray[np.float
     return up
 
 
+def turned_back(T_world_cam: NDArray[np.float64], quarters: NDArray[np.integer]) -> NDArray[np.float64]:
+    """(K, 4, 4) poses of the same cameras as they were held, whose images are turned counter-clockwise by (K,) quarter
+    turns (``Capture.turned``)."""
+    cos, sin = np.array((1, 0, -1, 0))[quarters % 4], np.array((0, -1, 0, 1))[quarters % 4]
+    T_cam_held = np.tile(np.eye(4), (len(T_world_cam), 1, 1))
+    T_cam_held[:, :2, :2] = np.stack((cos, -sin, sin, cos), axis=-1).reshape(-1, 2, 2)
+    return T_world_cam @ T_cam_held
+
+
 def _held(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(K, 3) the cameras' axes that are level, and (3,) the mean of those that point up: of people who turn around, the
     axis that stays what it is."""

@@ -32,18 +32,19 @@ def path_picture(
     submaps: Sequence[Submap],
     trajectory: Trajectory,
     gaussians: Gaussians,
+    up: NDArray[np.float64],
     capture: Path,
     metric: bool = True,
 ) -> None:
-    """Write a PNG. submaps: the mapped one first, whose world the Gaussians are in.  metric: whether lengths are
-    metres. Raises OSError."""
+    """Write a PNG. submaps: the mapped one first, whose world the Gaussians and (3,) ``up`` are in.  metric: whether
+    lengths are metres. Raises OSError."""
     unit = "m" if metric else "units of unknown length"
     picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
     apart = list(submaps[1:])
     width = SIZE[0] - (_ASIDE if apart else 0)
     if submaps:
         box = (0, _BAR, width, SIZE[1] - _BAR - _LEGEND)
-        _draw(picture, box, submaps[0], trajectory, gaussians, unit)
+        _draw(picture, box, submaps[0], trajectory, (gaussians, up), unit)
     rows = apart[:_SHOWN]
     for number, submap in enumerate(rows):
         height = (SIZE[1] - _BAR - _LEGEND) // len(rows)
@@ -67,18 +68,17 @@ def _draw(
     box: tuple[int, int, int, int],
     submap: Submap,
     trajectory: Trajectory,
-    gaussians: Gaussians | None,
+    mapped: tuple[Gaussians, NDArray[np.float64]] | None,
     unit: str,
 ) -> None:
-    """One submap, seen from above, into the box x, y, width, height."""
-    T = trajectory.T_world_cam if gaussians is not None else None
-    frames, poses = submap.frames, submap.T_submap_cam
-    if T is not None:  # with the frames that were interpolated
+    """One submap, seen from above, into the box x, y, width, height. mapped: the Gaussians and where up is, for the
+    submap that was mapped."""
+    frames, poses, means = submap.frames, submap.T_submap_cam, np.zeros((0, 3), np.float32)
+    if mapped is not None:  # with the frames that were interpolated
         frames = np.flatnonzero(trajectory.has_pose).astype(np.int32)
-        poses = T[frames]
+        poses, means = trajectory.T_world_cam[frames], mapped[0].means
     at_keyframe = np.searchsorted(frames, submap.keyframes)
-    means = np.zeros((0, 3), np.float32) if gaussians is None else gaussians.means
-    up = estimate_up(poses[at_keyframe], means)
+    up = estimate_up(poses[at_keyframe], means) if mapped is None else mapped[1]
     R = upright(up, np.concatenate((means[:: max(1, len(means) // 50_000)], poses[:, :3, 3])))
     way = poses[:, :3, 3] @ R.T
     points = means @ R.T.astype(np.float32)
@@ -95,8 +95,8 @@ def _draw(
         center = np.array((x0 + 0.5 * width, y0 + 0.5 * height))
         return np.asarray(center + (flat - middle) * (scale, -scale))
 
-    if gaussians is not None and len(points):
-        _plan(picture, box, pixel(points[:, :2]), points[:, 2], gaussians.colors, round(_DOT_M * scale))
+    if mapped is not None and len(points):
+        _plan(picture, box, pixel(points[:, :2]), points[:, 2], mapped[0].colors, round(_DOT_M * scale))
     places = pixel(way[:, :2])
     ends = dict(zip(submap.keyframes.tolist(), places[at_keyframe], strict=True))
     for (a, b), held in sorted(zip(submap.closures.tolist(), submap.held.tolist(), strict=True), key=lambda c: c[1]):
