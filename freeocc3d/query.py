@@ -336,21 +336,23 @@ def to_json(
     }
 
 
-def to_text(results: list[QueryResult]) -> str:
-    """A table for people."""
+def to_text(results: list[QueryResult], metric: bool = True) -> str:
+    """A table for people, in metres and litres, or in the map's units where these are not ``metric``."""
+    length, volume, per_unit3, digits = ("m", "l", 1000, 1) if metric else ("units", "units^3", 1, 5)
     lines = []
     for result in results:
         count = len(result.regions)
         title = f"{result.word}: {count} region{'s' if count != 1 else ''}" if count else f"{result.word}: no match"
         lines.append(f"{title}. {result.note}".rstrip(". ") + ("." if result.note else ""))
         if count:
-            lines.append("   #  score  conf.  centroid (m)             size (m)            volume (l)  voxels")
+            columns = f"{f'centroid ({length})':23}  {f'size ({length})':19}  {f'volume ({volume})':>10}"
+            lines.append(f"   #  score  conf.  {columns}  voxels")
         for number, region in enumerate(result.regions, start=1):
             x, y, z = region.centroid
             dx, dy, dz = region.box_max - region.box_min
             lines.append(
                 f"  {number:2d}   {region.score:.2f}   {region.confidence:.2f}  "
-                f"{x:7.2f} {y:7.2f} {z:7.2f}  {dx:5.2f} x {dy:4.2f} x {dz:4.2f}  {1000 * region.volume_m3:10.1f}  "
-                f"{region.voxels:6d}"
+                f"{x:7.2f} {y:7.2f} {z:7.2f}  {dx:5.2f} x {dy:4.2f} x {dz:4.2f}  "
+                f"{per_unit3 * region.volume_m3:{len(f'volume ({volume})')}.{digits}f}  {region.voxels:6d}"
             )
     return "\n".join(lines)

@@ -78,6 +78,9 @@ def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path, monkeyp
     page.query_page(room, results, tmp_path / "q.html", overwrite=True)
     text = (tmp_path / "q.html").read_text(encoding="utf-8")
     assert "lengths are not metres" in text
+    assert " l</td>" not in text
+    assert " units³</td>" in text
+    assert "litre" not in text
     assert "nowhere" not in text
 
 

@@ -15,6 +15,7 @@ from freeocc3d.errors import FreeOccError, MapError
 from freeocc3d.geometry import is_rigid, transform
 from freeocc3d.store import Map, load_map
 from freeocc3d.tracking import file, known
+from freeocc3d.viewer import pictures
 
 
 @pytest.fixture(scope="module")
@@ -173,8 +174,22 @@ def test_the_commands_say_what_the_unit_is(room: Map, half: Map, tmp_path: Path)
     facts = json.loads(run("info", half.path, "--json").stdout)
     assert facts["metric"] is False
     assert json.loads(run("info", room.path, "--json").stdout)["scale"]["by"] == "sensor"
-    assert "Lengths are not metres" in run("query", half.path, "red cup").stdout
-    assert "Lengths are not metres" not in run("query", room.path, "red cup").stdout
+    assert "edge 0.04 units\n" in run("info", half.path).stdout
+    assert "edge 0.08 m\n" in run("info", room.path).stdout
+    unknown, known = (run("query", scan_map.path, "red cup").stdout for scan_map in (half, room))
+    assert "Lengths are not metres" in unknown
+    assert "Lengths are not metres" not in known
+    assert "(m)" not in unknown
+    assert "(l)" not in unknown
+    (header, row), (header_m, row_l) = (text.splitlines()[1:3] for text in (unknown, known))
+    for name in ("centroid (units)", "size (units)", "volume (units^3)"):
+        assert name in header
+    assert header_m.split("conf.")[1].split() == ["centroid", "(m)", "size", "(m)", "volume", "(l)", "voxels"]
+    # A row's columns end, and a volume stands, where the header says; half as large is an eighth of the volume.
+    assert (len(row), len(row_l)) == (len(header), len(header_m))
+    assert float(row.split()[-2]) == pytest.approx(float(row_l.split()[-2]) / 8000, rel=0.02)
+    assert "voxels of 0.04 units," in pictures._title(half)
+    assert "voxels of 8 cm," in pictures._title(room)
     assert json.loads(run("query", half.path, "red cup", "--json").stdout)["metric"] is False
     exported = run("export", half.path, "--format", "octomap", "-o", tmp_path / "half.bt")
     assert "lengths are not metres" in exported.stderr

@@ -32,7 +32,7 @@ def room_map(tmp_path):
     T_gravity_map[:3, :3] = (1, 0, 0), (0, 0, 1), (0, -1, 0)
     labels = np.where((occupancy.colors == (215, 20, 20)).all(axis=1), 2, 1).astype(np.uint8)
     return SimpleNamespace(
-        path=tmp_path, occupancy=occupancy, up=np.array((0.0, -1.0, 0.0)), T_gravity_map=T_gravity_map,
+        path=tmp_path, metric=True, occupancy=occupancy, up=np.array((0.0, -1.0, 0.0)), T_gravity_map=T_gravity_map,
         vocabulary=["wall", "red"],
         labels=lambda: labels,
         trajectory=Trajectory(np.arange(2.0), T, np.array([0, 1], np.int32), np.array(["keyframe"] * 2), np.ones(2)),

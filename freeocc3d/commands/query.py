@@ -152,7 +152,7 @@ def _answer(map_path: Path, loaded: Any, results: list[Any], as_json: bool, view
 
     if not as_json:
         unit = "" if loaded.metric else "\nLengths are not metres: the map's scale is unknown (freeocc3d scale)."
-        return asking.to_text(results) + unit
+        return asking.to_text(results, loaded.metric) + unit
     from ..details import details
 
     return json.dumps(asking.to_json(map_path, results, details(loaded, results, views), loaded.metric))

@@ -54,7 +54,7 @@ def to_text(loaded: Map) -> str:
     size = sum(said["bytes"].values())
     used = said["frames"] - said["frame_status"].get("unused", 0)
     largest, smallest = said["voxel_size_m"], said["finest_voxel_m"]
-    unit = "m" if said["metric"] else "units of unknown length"
+    unit = "m" if said["metric"] else "units"
     plural = {name: "s" if said[name] != 1 else "" for name in ("keyframes", "submaps")}
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in said["seconds"].items())
     lines = [

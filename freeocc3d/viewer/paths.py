@@ -38,7 +38,7 @@ def path_picture(
 ) -> None:
     """Write a PNG. submaps: the mapped one first, whose world the Gaussians and (3,) ``up`` are in.  metric: whether
     lengths are metres. Raises OSError."""
-    unit = "m" if metric else "units of unknown length"
+    unit = "m" if metric else "units"
     picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
     apart = list(submaps[1:])
     width = SIZE[0] - (_ASIDE if apart else 0)
@@ -142,7 +142,7 @@ def _ruler(picture: NDArray[np.uint8], box: tuple[int, int, int, int], scale: fl
     metres = max((m for m in _RULERS_M if m * scale < 220), default=_RULERS_M[0])
     y, x = y0 + height - 12, x0 + 16
     cv2.line(picture, (x, y), (x + round(metres * scale), y), _TEXT, 2, cv2.LINE_AA)
-    _put(picture, f"{metres:g} {unit}", (x, y - 8), 0.5)
+    _put(picture, f"{metres:g} {unit.removesuffix('s') if metres == 1 else unit}", (x, y - 8), 0.5)
 
 
 def _legend(picture: NDArray[np.uint8], submaps: Sequence[Submap], trajectory: Trajectory) -> None:

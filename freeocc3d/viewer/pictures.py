@@ -18,7 +18,6 @@ from ..places import OrientedBox, oriented_boxes
 from ..query import QueryResult
 from ..regions import Region
 from ..store import Map
-from ..types import Occupancy
 from .scene import BACKGROUND, CUT, VIEWS, Scene, cut_height, lengthwise, render, shaded
 
 SIZE = 1600, 900
@@ -171,15 +170,17 @@ def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: floa
     cv2.putText(picture, printable, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _TEXT, 1, cv2.LINE_AA)
 
 
-def _size(occupancy: Occupancy) -> str:
-    largest, smallest = 100 * occupancy.voxel_size, 100 * occupancy.finest
-    return f"{largest:g} cm" if largest == smallest else f"{largest:g} to {smallest:g} cm"
+def _size(scan_map: Map) -> str:
+    """The edges of the voxels, with their unit."""
+    factor, unit = (100, "cm") if scan_map.metric else (1, "units")
+    largest, smallest = factor * scan_map.occupancy.voxel_size, factor * scan_map.occupancy.finest
+    return f"{largest:.3g} {unit}" if largest == smallest else f"{largest:.3g} to {smallest:.3g} {unit}"
 
 
 def _title(scan_map: Map) -> str:
     counts = scan_map.manifest["counts"]
     name = Path(str(scan_map.manifest["capture"]["path"])).name
     return (
-        f"{name}: {counts['voxels']['occupied']:,} occupied voxels of {_size(scan_map.occupancy)}, "
+        f"{name}: {counts['voxels']['occupied']:,} occupied voxels of {_size(scan_map)}, "
         f"{counts['frames_with_pose']} of {counts['frames']} frames; above {CUT:.0%} of the height is cut away"
     )

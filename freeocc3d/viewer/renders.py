@@ -62,8 +62,8 @@ def _row(gaussians: Gaussians, frame: int, view: View, rasterizer: Rasterizer, m
     if found.psnr_measured is not None:
         facts.append(f"{found.psnr_measured:.1f} dB where depth is measured")
     if found.depth_l1_m is not None:
-        off = f"{100 * found.depth_l1_m:.1f} cm" if metric else f"{found.depth_l1_m:.3f}"
-        facts.append(f"depth off by {off}, shown from {low:.1f} to {high:.1f}{' m' if metric else ''}")
+        off = f"{100 * found.depth_l1_m:.1f} cm" if metric else f"{found.depth_l1_m:.3f} units"
+        facts.append(f"depth off by {off}, shown from {low:.1f} to {high:.1f} {'m' if metric else 'units'}")
     _put(row, ", ".join(facts), (_GAP, height + 20), 0.45)
     return row
 
