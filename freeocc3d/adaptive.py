@@ -20,7 +20,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from . import config, registry, store
+from . import registry, store
 from .config import Config
 from .errors import MapError
 from .gaussians.cells import cell_keys
@@ -131,9 +131,7 @@ def refine_where_needed(
         raise MapError(f"{scan_map.path} has voxels of several sizes already: refine the map that it was made of.")
     if not halvings(base.voxel_size, finest):
         raise MapError(f"{scan_map.path} has voxels of {finest:g} m already: give a smaller size.")
-    if Path(output).resolve() == scan_map.path.resolve():
-        raise MapError(f"The finer map of {scan_map.path} cannot take its place: choose another folder.")
-    work = WorkFolder.open(Path(output), overwrite, resume=False)
+    work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
     settings, trajectory = settings_of(scan_map), scan_map.trajectory
     settings["occupancy"]["finest"] = finest
 
@@ -149,27 +147,17 @@ def refine_where_needed(
         finest, progress,
     )  # fmt: skip
     progress.stage("saving")
-    try:
-        work.begin([str(scan_map.path), finest], settings)
-        shutil.copytree(scan_map.path / store.KEYFRAMES, work.folder / store.KEYFRAMES)
+    with work.writing(Path(output), [str(scan_map.path), finest], settings) as folder:
+        shutil.copytree(scan_map.path / store.KEYFRAMES, folder / store.KEYFRAMES)
         for name in (store.GAUSSIANS, store.TRAJECTORY, store.PATH_PICTURE, store.RENDER_PICTURE):
             if (scan_map.path / name).is_file():
-                shutil.copy2(scan_map.path / name, work.folder / name)
-        store.write_occupancy(
-            work.folder, occupancy, Codec.fit(np.asarray(occupancy.features)), scan_map.gaussian_features
-        )
-        (work.folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
-        (work.folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
+                shutil.copy2(scan_map.path / name, folder / name)
+        store.write_occupancy(folder, occupancy, Codec.fit(np.asarray(occupancy.features)), scan_map.gaussian_features)
+        (folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
         kept = {key: value for key, value in scan_map.manifest.items() if key not in ("format_version", "files")}
         counts = {**kept["counts"], "voxels": store.counts(occupancy)}
         refined = {"map": str(scan_map.path.absolute())}
-        store.write_manifest(work.folder, {**kept, **store.sizes(occupancy), "refined": refined, "counts": counts})
-        work.finish(Path(output))
-    except BaseException as error:
-        work.discard()
-        if isinstance(error, OSError):
-            raise MapError(f"Cannot write {output}: {error.strerror}.") from error
-        raise
+        store.write_manifest(folder, {**kept, **store.sizes(occupancy), "refined": refined, "counts": counts})
     return load_map(output)
 
 

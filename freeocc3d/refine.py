@@ -94,9 +94,7 @@ def refine(
             f"The box holds {math.prod(blocks) * BLOCK**3:,} voxels of {voxel_size:g} m, more than can be kept: take "
             f"one of up to {edge:.1f} m an edge, or larger voxels."
         )
-    if Path(output).resolve() == scan_map.path.resolve():
-        raise MapError(f"A box of {scan_map.path} cannot take the map's own place: choose another folder.")
-    work = WorkFolder.open(Path(output), overwrite, resume=False)
+    work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
     settings = settings_of(scan_map)
     settings["occupancy"]["voxel_size"] = voxel_size
     seeing, rows, trajectory = _seeing(scan_map, box, AROUND * voxel_size, progress)
@@ -125,24 +123,16 @@ def refine(
     if not len(occupancy.colors):
         raise MapError(f"No voxel of {voxel_size:g} m in the box is occupied: {scan_map.path} holds no surface there.")
     progress.stage("saving")
-    try:
-        work.begin([str(scan_map.path), *box.low.tolist(), *box.high.tolist()], settings)
-        keyframes = Keyframes(work.folder / store.KEYFRAMES)
+    with work.writing(Path(output), [str(scan_map.path), *box.low.tolist(), *box.high.tolist()], settings) as folder:
+        keyframes = Keyframes(folder / store.KEYFRAMES)
         for frame in seeing:
             keyframes.append(frame)
         keyframes.save_index()
-        write_ply(gaussians, work.folder / store.GAUSSIANS)
-        store.write_occupancy(work.folder, occupancy, Codec.fit(features), features)
-        store.write_tum(work.folder / store.TRAJECTORY, trajectory)
-        (work.folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
-        (work.folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
-        store.write_manifest(work.folder, _manifest(scan_map, box, trajectory.keyframes, gaussians, occupancy))
-        work.finish(Path(output))
-    except BaseException as error:
-        work.discard()
-        if isinstance(error, OSError):
-            raise MapError(f"Cannot write {output}: {error.strerror}.") from error
-        raise
+        write_ply(gaussians, folder / store.GAUSSIANS)
+        store.write_occupancy(folder, occupancy, Codec.fit(features), features)
+        store.write_tum(folder / store.TRAJECTORY, trajectory)
+        (folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
+        store.write_manifest(folder, _manifest(scan_map, box, trajectory.keyframes, gaussians, occupancy))
     return load_map(output)
 
 

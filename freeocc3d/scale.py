@@ -58,30 +58,20 @@ def scaled(scan_map: Map, factor: float, by: str, output: str | Path, *, overwri
             f"Times {factor:g}, voxels would have an edge of {voxel:.2g} m and depth would reach {farthest:.3g} m, of "
             f"which a map holds {_LEAST_VOXEL_M:g} m and up, and up to {_MOST_DEPTH_M:.0f} m: check the length."
         )
-    if Path(output).resolve() == scan_map.path.resolve():
-        raise MapError(f"A scaled {scan_map.path} cannot take the map's own place: choose another folder.")
-    work = WorkFolder.open(Path(output), overwrite, resume=False)
+    work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
     settings = _settings(scan_map, factor)
     trajectory = _trajectory(scan_map.trajectory, factor)
     gaussians = _gaussians(scan_map.gaussians, factor)
     report = _report(scan_map, factor)
-    try:
-        work.begin([str(scan_map.path), factor], settings)
+    with work.writing(Path(output), [str(scan_map.path), factor], settings) as folder:
         for name in (store.OCCUPANCY, store.FEATURES):
-            shutil.copyfile(scan_map.path / name, work.folder / name)
-        scan_map.keyframes.write_scaled(work.folder / store.KEYFRAMES, factor)
-        write_ply(gaussians, work.folder / store.GAUSSIANS)
-        store.write_tum(work.folder / store.TRAJECTORY, trajectory)
-        (work.folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
-        (work.folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
-        _draw(scan_map, work.folder, trajectory, gaussians, factor)
-        store.write_manifest(work.folder, _manifest(scan_map, factor, by))
-        work.finish(Path(output))
-    except BaseException as error:
-        work.discard()
-        if isinstance(error, OSError):
-            raise MapError(f"Cannot write {output}: {error.strerror}.") from error
-        raise
+            shutil.copyfile(scan_map.path / name, folder / name)
+        scan_map.keyframes.write_scaled(folder / store.KEYFRAMES, factor)
+        write_ply(gaussians, folder / store.GAUSSIANS)
+        store.write_tum(folder / store.TRAJECTORY, trajectory)
+        (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
+        _draw(scan_map, folder, trajectory, gaussians, factor)
+        store.write_manifest(folder, _manifest(scan_map, factor, by))
     return load_map(output)
 
 

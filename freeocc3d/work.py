@@ -71,6 +71,28 @@ class WorkFolder:
                 )
         return cls(folder, resume and (folder / _MARKS).is_file())
 
+    @classmethod
+    def made_of(cls, source: Path, output: Path, overwrite: bool) -> WorkFolder:
+        """For a map that is made of another one. Raises MapError as ``open`` does, and for the other's own place."""
+        if output.resolve() == source.resolve():
+            raise MapError(f"A map made of {source} cannot take that map's own place: choose another folder.")
+        return cls.open(output, overwrite, resume=False)
+
+    @contextlib.contextmanager
+    def writing(self, output: Path, identity: list[Any], settings: Config) -> Iterator[Path]:
+        """The folder, in which the configuration stands; what is written to it inside is the map ``output`` afterwards,
+        and gone where that fails. Raises MapError where nothing can be written."""
+        try:
+            self.begin(identity, settings)
+            (self.folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
+            yield self.folder
+            self.finish(output)
+        except BaseException as error:
+            self.discard()
+            if isinstance(error, OSError):
+                raise MapError(f"Cannot write {output}: {error.strerror}.") from error
+            raise
+
     def begin(self, identity: list[Any], settings: Config) -> None:
         """Make the folder, and decide which saved stages are still valid for this configuration and for what
         ``identity`` says of the input. Raises MapError, and touches nothing, if a resumed run was another's."""

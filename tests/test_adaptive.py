@@ -208,7 +208,7 @@ def test_what_cannot_be_refined(room: Map, fine: Map, tmp_path: Path) -> None:
         adaptive.refine_where_needed(fine, 0.005, tmp_path / "map")
     with pytest.raises(MapError, match="already"):
         adaptive.refine_where_needed(room, 0.08, tmp_path / "map")
-    with pytest.raises(MapError, match="take its place"):
+    with pytest.raises(MapError, match="own place"):
         adaptive.refine_where_needed(room, 0.04, room.path, overwrite=True)
     assert "by halves" in refused("refine", room.path, "--voxel", 0.03, "-o", tmp_path / "map")
     assert not list(tmp_path.iterdir())
