@@ -19,7 +19,7 @@ def _views(rectangles, noise=1.0):
 
 def test_a_slanted_wall_is_measured_to_a_fraction_of_a_pixel() -> None:
     view, others, depth = _views([SLANTED])
-    found = measured(view, others, 1.0, 6.0)
+    found = measured(view, others, others, 1.0, 6.0)
     known = found.inverse > 0
     assert known.mean() > 0.75
     pixels = np.abs(found.inverse - 1.0 / depth)[known] * CAMERA.fx * 0.225  # in the views' median baseline
@@ -29,7 +29,7 @@ def test_a_slanted_wall_is_measured_to_a_fraction_of_a_pixel() -> None:
 
 def test_sigma_is_what_errors_are() -> None:
     view, others, depth = _views([SLANTED], noise=4.0)
-    found = measured(view, others, 1.0, 6.0)
+    found = measured(view, others, others, 1.0, 6.0)
     known = found.inverse > 0
     off = np.abs(found.inverse - 1.0 / depth)[known] / found.sigma[known]
     assert 0.1 < np.median(off) < 1.0
@@ -38,12 +38,12 @@ def test_sigma_is_what_errors_are() -> None:
 
 def test_what_has_no_texture_is_not_measured() -> None:
     view, others, _ = _views([Rectangle((-3, -3, 2.0), (6, 0, 0), (0, 6, 0), blank=(0.0, 1.0))])
-    assert (measured(view, others, 1.0, 6.0).inverse > 0).mean() < 0.02
+    assert (measured(view, others, others, 1.0, 6.0).inverse > 0).mean() < 0.02
 
 
 def test_a_blank_part_of_a_wall_is_put_on_its_plane() -> None:
     view, others, depth = _views([Rectangle((-3, -3, 1.5), (6, 0, 1.0), (0, 6, 0), blank=(0.45, 0.55))])
-    assert (measured(view, others, 1.0, 6.0).inverse > 0)[:, 60:100].mean() < 0.3
+    assert (measured(view, others, others, 1.0, 6.0).inverse > 0)[:, 60:100].mean() < 0.3
     found, sigma = scan_depth.depth_map(view, others, 1.0, 6.0, scan_depth.Options(size=CAMERA.width))
     blank = (slice(10, -10), slice(60, 100))
     assert (found[blank] > 0).mean() > 0.95
@@ -57,7 +57,7 @@ def test_a_blank_part_of_a_wall_is_put_on_its_plane() -> None:
 def test_edges_of_what_stands_in_front_stay_where_they_are() -> None:
     box = Rectangle((-0.25, -0.4, 1.4), (0.5, 0, 0), (0, 0.8, 0), seed=1)
     view, others, depth = _views([Rectangle((-4, -4, 3.0), (8, 0, 0), (0, 8, 0)), box])
-    found = measured(view, others, 1.0, 6.0)
+    found = measured(view, others, others, 1.0, 6.0)
     known = found.inverse > 0
     off = np.abs(1.0 / np.maximum(found.inverse, 1e-6) - depth)[known] / depth[known]
     assert (off < 0.02).mean() > 0.93

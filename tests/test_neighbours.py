@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from freeocc3d.tracking.stereo.neighbours import neighbours
+from freeocc3d.tracking.stereo.neighbours import APART, neighbours
 
 
 def _line(positions):
@@ -21,6 +21,16 @@ def test_a_few_degrees_beside_are_preferred() -> None:
     assert set(chosen.partners[0].tolist()) == {2, 3}
     assert 1.2 < chosen.near[0] < 1.9
     assert 2.1 < chosen.far[0] < 4.0
+
+
+def test_views_apart_are_under_wider_angles() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-0.5, -0.5, 1.9), (0.5, 0.5, 2.1), (200, 3)).astype(np.float32)
+    T = _line([0.0, 0.25, 0.3, 0.5, 0.55])  # 7, 8.5, 14 and 15 degrees
+    seen_frame = np.repeat(np.arange(5), 200).astype(np.int32)
+    seen_point = np.tile(np.arange(200), 5).astype(np.int32)
+    assert set(neighbours(T, points, seen_frame, seen_point, 2).partners[0].tolist()) == {1, 2}
+    assert set(neighbours(T, points, seen_frame, seen_point, 2, APART).partners[0].tolist()) == {3, 4}
 
 
 def test_frames_that_share_nothing_or_have_no_pose_are_no_partners() -> None:

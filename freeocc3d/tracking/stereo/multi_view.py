@@ -19,7 +19,8 @@ from .surfaces import Plane, find_planes
 _FEWEST, _MOST_HYPOTHESES = 32, 160
 _CONTRAST = 4.0 / 255.0  # a change of grey beyond this may be the edge of something
 _STEP, _JUMPS = 0.05, (0.3, 1.2)  # in units of 1 - correlation
-_RADIUS = 2
+_RADIUS, _FINE_RADIUS = 2, 3
+_LEAST_SWEPT = 160  # pixels of the longer side: texture is lost in smaller images
 _REFINED = (1.0, 0.5)  # pixels between hypotheses about the depth so far
 _LEAST_SCORE = 0.5
 _SUREST, _UNSURE = 0.25, 1.0  # pixels: what no match is better than, and what is no match any more
@@ -43,21 +44,26 @@ def swept(view: View, others: Sequence[View], near: float, far: float, device: s
     return least + (best[..., 0] + shift.clamp(-0.5, 0.5)) * ((most - least) / (count - 1))
 
 
-def measured(view: View, others: Sequence[View], near: float, far: float, device: str = "cpu") -> DepthImage:
+def measured(
+    view: View, others: Sequence[View], apart: Sequence[View], near: float, far: float, device: str = "cpu"
+) -> DepthImage:
     """What the photographs say: inverse depths where patches match well and in one place only, 0 elsewhere.
+
+    Matches are found among ``others``, in images of a quarter of the size (of half, where those would be small) and of
+    twice as much, and refined among views ``apart``, whose baselines are longer.
 
     sigma: for n independent pixels, a correlation c at the peak and its curvature 2 k, the least-squares estimate has
     the variance (1 - c) / (n k); no match is taken for better than a quarter of a pixel.
     """
     camera = view.intrinsics
-    half = camera.width // 2, camera.height // 2
-    coarse = swept(view.shrunk(*half), [other.shrunk(*half) for other in others], near, far, device)
-    matcher = Matcher(view, others, _RADIUS, device)
-    inverse = F.interpolate(median(coarse)[None, None], matcher.grey.shape, mode="bilinear")[0, 0]
-    before = score = sigma = inverse
-    for pixels in _REFINED:
-        before = median(inverse)
-        inverse, score, sigma = _refined(matcher, before, pixels * matcher.pixel)
+    longer = max(camera.width, camera.height)
+    first = min(longer / 2, max(longer / 4, _LEAST_SWEPT)) / longer
+    coarse = swept(_scaled(view, first), [_scaled(other, first) for other in others], near, far, device)
+    second = 2.0 * first
+    finder = Matcher(_scaled(view, second), [_scaled(other, second) for other in others], _RADIUS, device)
+    inverse = _all_refined(finder, coarse)[0]
+    matcher = Matcher(view, apart, _FINE_RADIUS, device)
+    inverse, before, score, sigma = _all_refined(matcher, inverse)
     sure = (score > _LEAST_SCORE) & (sigma < _UNSURE * matcher.pixel)
     sure &= ((inverse - before).abs() < _STEADY * matcher.pixel) & (inverse > 1.0 / far) & (inverse < 1.0 / near)
     sigma = torch.sqrt(sigma.square() + (_SUREST * matcher.pixel) ** 2)
@@ -100,6 +106,21 @@ def median(image: Tensor) -> Tensor:
     """(H, W) median of 5 x 5 pixels."""
     padded = F.pad(image[None, None], (2, 2, 2, 2), mode="replicate")
     return F.unfold(padded, 5).median(dim=1)[0].view(image.shape)
+
+
+def _scaled(view: View, by: float) -> View:
+    camera = view.intrinsics
+    return view.shrunk(round(camera.width * by), round(camera.height * by))
+
+
+def _all_refined(matcher: Matcher, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Inverse depths refined from those of a smaller image; those before the last step; scores; sigmas."""
+    inverse = F.interpolate(median(inverse)[None, None], matcher.grey.shape, mode="bilinear")[0, 0]
+    before = score = sigma = inverse
+    for pixels in _REFINED:
+        before = median(inverse)
+        inverse, score, sigma = _refined(matcher, before, pixels * matcher.pixel)
+    return inverse, before, score, sigma
 
 
 def _refined(matcher: Matcher, inverse: Tensor, step: float) -> tuple[Tensor, Tensor, Tensor]:

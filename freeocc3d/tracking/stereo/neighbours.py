@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-_BEST_DEG, _NARROW_DEG, _WIDE_DEG = 8.0, 3.0, 8.0
 _LEAST_WEIGHT = 3.0  # as many points, seen under the best angle
 _MARGIN = 0.7, 1.6  # around the nearest and farthest points, for what lies between has no texture
 _OUTLIERS = 2.0  # per cent of the points at either end
 _LEAST_POINTS = 20
+
+
+class Angles(NamedTuple):
+    """Degrees between the rays of a point: the best, and the standard deviations below and above it."""
+
+    best: float
+    below: float
+    above: float
+
+
+ALIKE = Angles(8.0, 3.0, 8.0)
+"""Images are much alike still: for matches that have to be found."""
+
+APART = Angles(14.0, 6.0, 10.0)
+"""Depth is surer: for matches that are known to a pixel or two."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +45,7 @@ def neighbours(
     seen_frame: NDArray[np.int32],
     seen_point: NDArray[np.int32],
     count: int,
+    angles: Angles = ALIKE,
 ) -> Chosen:
     """Up to ``count`` partners of each frame.
 
@@ -64,8 +80,8 @@ def neighbours(
         to_here, to_other = points[point] - centres[frame], points[point] - centres[other]
         here, there = np.linalg.norm(to_here, axis=1), np.linalg.norm(to_other, axis=1)
         angle = np.degrees(np.arccos(np.clip(np.einsum("pc,pc->p", to_here, to_other) / (here * there), -1.0, 1.0)))
-        width = np.where(angle < _BEST_DEG, _NARROW_DEG, _WIDE_DEG)
-        weight = np.exp(-0.5 * ((angle - _BEST_DEG) / width) ** 2) * np.minimum(here / there, there / here)
+        width = np.where(angle < angles.best, angles.below, angles.above)
+        weight = np.exp(-0.5 * ((angle - angles.best) / width) ** 2) * np.minimum(here / there, there / here)
         weight = np.where((other != frame) & np.isfinite(weight), weight, 0.0)
         score = np.bincount(other, weight, frames)
         ranked = np.argsort(-score, kind="stable")[:count]

@@ -27,7 +27,7 @@ from ...types import Frame, Intrinsics
 from . import depth_network
 from .consistency import DepthImage, confirmed
 from .multi_view import completed, measured
-from .neighbours import Chosen, neighbours
+from .neighbours import APART, Chosen, neighbours
 from .photo_consistency import View
 from .scan_planes import ScanPlane, scan_planes, snapped
 
@@ -50,7 +50,7 @@ _SAME_SURFACE = 0.02  # relative: beyond it, depths of adjacent pixels belong to
 class Options:
     """Depth for captures that have none, by multi-view stereo."""
 
-    size: int = 320
+    size: int = 640
     """Longer side of the depth images in pixels; frames get them enlarged to their own size."""
     neighbours: int = 4
     """Views that each frame is compared with."""
@@ -98,7 +98,7 @@ def depth_map(
     """Depth of one view from ``others``, which nothing has confirmed yet: (H, W) metres, 0 = none, and its standard
     deviation. The depth lies between ``near`` and ``far``; H, W are those of a view of ``options.size``."""
     small, sources = _shrunk(view, options.size), [_shrunk(other, options.size) for other in others]
-    depth = measured(small, sources, near, far, options.device)
+    depth = measured(small, sources, sources, near, far, options.device)
     depth = completed(small, sources, depth, [], options.planes, options.device)
     return _metres(depth.inverse, depth.sigma)
 
@@ -131,14 +131,17 @@ class StereoDepth:
         posed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
         broken = self._decode(capture, posed, T, progress, prepared)
         T[broken] = np.nan
-        chosen = neighbours(T, scan.points, scan.seen_frame, scan.seen_point, 2 * self.options.neighbours)
+        seen, count = (T, scan.points, scan.seen_frame, scan.seen_point), self.options.neighbours
+        chosen = neighbours(*seen, 2 * count)
+        apart = neighbours(*seen, count + count // 2, APART).partners
         able = [frame for frame, partners in enumerate(chosen.partners) if len(partners)]
         if len(able) < 2:
             raise TrackingError(
                 f"No depth can be had from the images of {capture.path}: no two of its frames see the same things from "
                 "different places. Move the camera sideways, do not only turn it."
             )
-        for stage, step in (("measured", self._measure), ("completed", self._complete), ("depth", self._confirm)):
+        measure = functools.partial(self._measure, apart=apart)
+        for stage, step in (("measured", measure), ("completed", self._complete), ("depth", self._confirm)):
             missing = [frame for frame in able if not self._path(stage, frame).exists()]
             progress.stage(f"stereo: {stage}", len(missing))
             if stage == "completed" and missing and self.options.planes:
@@ -204,9 +207,10 @@ class StereoDepth:
             progress.advance(done)
         return broken
 
-    def _measure(self, frame: int, chosen: Chosen) -> DepthImage:
+    def _measure(self, frame: int, chosen: Chosen, apart: list[NDArray[np.int64]]) -> DepthImage:
         others = [self._view(other) for other in chosen.partners[frame][: self.options.neighbours]]
-        return measured(self._view(frame), others, chosen.near[frame], chosen.far[frame], self.options.device)
+        wide = [self._view(other) for other in apart[frame]] or others
+        return measured(self._view(frame), others, wide, chosen.near[frame], chosen.far[frame], self.options.device)
 
     def _complete(self, frame: int, chosen: Chosen) -> DepthImage:
         options = self.options
