@@ -25,8 +25,8 @@ _UNCONFIRMED = 4  # times as many are kept until it is known which ones other ca
 
 @dataclass(frozen=True)
 class Points:
-    """points: (P, 3) float64 world.  sigma_m: (P,) metres.  ray_point, ray_camera: (R,) int32, a camera measured a point.
-    cell_m: edge of the cells that hold one point each."""
+    """points: (P, 3) float64 world.  sigma_m: (P,) metres.  ray_point, ray_camera: (R,) int32, the rays along which
+    points were measured.  cell_m: edge of the cells that hold one point each."""
 
     points: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
