@@ -12,7 +12,7 @@ from freeocc3d.tracking.stereo.watertight import Surface, boundary, cut, roundne
 
 
 def _crossings(space: Tetrahedra, start, way, length: float):
-    """Plainly: (enters at, tetrahedron, leaves at, by its facet) of those that the way from a vertex leads through, in order."""
+    """Plainly: (enters at, tetrahedron, leaves at, by its facet) of those on the way from a vertex, in order."""
     found = []
     for cell, corners in enumerate(space.corners):
         first, last, out = 0.0, length, -1

@@ -1,4 +1,4 @@
-"""Dense depth of one view from the views around it: swept, refined, and completed by the planes of the room."""
+"""Dense depth of one view from the views around it: swept and refined."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...geometry import invert, transform
 from .consistency import DepthImage
 from .photo_consistency import Matcher, View
 from .semi_global import aggregated, jumps
-from .surfaces import Plane, find_planes
 
 _FEWEST, _MOST_HYPOTHESES = 32, 160
 _CONTRAST = 4.0 / 255.0  # a change of grey beyond this may be the edge of something
@@ -25,10 +23,6 @@ _REFINED = (1.0, 0.5)  # pixels between hypotheses about the depth so far
 _LEAST_SCORE = 0.5
 _SUREST, _UNSURE = 0.25, 1.0  # pixels: what no match is better than, and what is no match any more
 _STEADY = 1.5  # pixels by which refinement may still move
-_LABEL_JUMPS = (0.1, 2.0)
-_OFF_PLANE, _UNKNOWN = 0.6, 0.35  # prices of showing none of the planes, where a depth was measured and where not
-_HELD = 3.0  # pixels from a plane beyond which a measured depth counts fully against it
-_PLANE_POINTS = 40_000
 
 
 def swept(view: View, others: Sequence[View], near: float, far: float, device: str) -> Tensor:
@@ -68,38 +62,6 @@ def measured(
     sure &= ((inverse - before).abs() < _STEADY * matcher.pixel) & (inverse > 1.0 / far) & (inverse < 1.0 / near)
     sigma = torch.sqrt(sigma.square() + (_SUREST * matcher.pixel) ** 2)
     return DepthImage(_array(inverse * sure), _array(sigma), camera, view.T_world_cam)
-
-
-def completed(
-    view: View, others: Sequence[View], depth: DepthImage, around: Sequence[DepthImage], planes: int, device: str
-) -> DepthImage:
-    """``depth`` with pixels that have none put on the plane that they show most likely.
-
-    around: depths of views nearby, whose points help to find up to ``planes`` planes.
-    """
-    if not planes:
-        return depth
-    points, sigma_m = _points_around(depth, around)
-    found = find_planes(points, sigma_m, planes, least_share=0.01)
-    if not found:
-        return depth
-    camera = depth.camera
-    half = camera.width // 2, camera.height // 2
-    matcher = Matcher(view.shrunk(*half), [other.shrunk(*half) for other in others], _RADIUS, device)
-    labels = _labelled(matcher, depth, found)
-    shown = F.interpolate(labels[None, None].float(), depth.inverse.shape, mode="nearest")[0, 0].long().cpu().numpy()
-    seen = np.moveaxis(_rays(depth), 0, -1)
-    normals = np.stack([plane.normal for plane in found] + [np.zeros(3)])
-    spread = np.stack([plane.covariance for plane in found] + [np.zeros((3, 3))])
-    inverse = np.einsum("hwc,hwc->hw", seen, normals[shown])
-    variance = np.einsum("hwc,hwcd,hwd->hw", seen, spread[shown], seen) + (_SUREST * matcher.pixel) ** 2
-    use = (depth.inverse == 0) & (shown < len(found)) & (inverse > 0)
-    return DepthImage(
-        np.where(use, inverse, depth.inverse).astype(np.float32),
-        np.where(use, np.sqrt(variance), depth.sigma).astype(np.float32),
-        camera,
-        depth.T_world_cam,
-    )
 
 
 def median(image: Tensor) -> Tensor:
@@ -143,47 +105,6 @@ def _vertex(before: Tensor, peak: Tensor, after: Tensor) -> tuple[Tensor, Tensor
     after."""
     curvature = 2.0 * peak - before - after
     return torch.where(curvature > 1e-5, 0.5 * (after - before) / curvature.clamp_min(1e-5), 0.0), curvature
-
-
-def _points_around(depth: DepthImage, around: Sequence[DepthImage]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Measured points of all views in the first one's frame, (N, 3), and their standard deviations in metres."""
-    points, sigmas = [], []
-    each = _PLANE_POINTS // (len(around) + 1)
-    for image in (depth, *around):
-        there = image.inverse > 0
-        z = 1.0 / image.inverse[there].astype(np.float64)
-        step = max(1, len(z) // each)
-        T_view_image = invert(depth.T_world_cam) @ image.T_world_cam
-        points.append(transform(T_view_image, (_rays(image)[:, there] * z).T[::step]))
-        sigmas.append((image.sigma[there] * z**2)[::step])
-    return np.concatenate(points), np.concatenate(sigmas)
-
-
-def _labelled(matcher: Matcher, depth: DepthImage, planes: Sequence[Plane]) -> Tensor:
-    """(H, W) which plane each pixel of a small view shows; ``len(planes)`` = none.
-
-    A plane costs what it is off the measured depth; where there is none, what photographs agree less on it than on the
-    plane that they agree on most.
-    """
-    normals = torch.from_numpy(np.stack([plane.normal for plane in planes])).float().to(matcher.device)
-    on_plane = torch.einsum("kc,chw->khw", normals, matcher.rays)
-    known = torch.from_numpy(depth.inverse).to(matcher.device)[None]
-    share = F.adaptive_avg_pool2d((known > 0).float(), matcher.grey.shape)
-    mean = F.adaptive_avg_pool2d(known, matcher.grey.shape) / share.clamp_min(1e-6)
-    off = ((on_plane - mean).abs() / (_HELD * matcher.pixel)).clamp_max(1.0)
-    unlike = 1.0 - matcher.agreement(on_plane.clamp_min(1e-4))
-    worse = 0.7 * (unlike - unlike.amin(dim=0)).clamp_max(1.0)
-    costs = torch.where(share > 0.25, off, worse)
-    costs = torch.where(on_plane > 1e-3, costs, 2.0)
-    none = torch.where(share > 0.25, _OFF_PLANE, _UNKNOWN)
-    prices = jumps(matcher.grey, *_LABEL_JUMPS, _CONTRAST)
-    return aggregated(torch.cat((costs, none)).permute(1, 2, 0).contiguous(), torch.inf, *prices).argmin(dim=-1)
-
-
-def _rays(image: DepthImage) -> NDArray[np.float64]:
-    camera = image.camera
-    v, u = np.mgrid[: camera.height, : camera.width]
-    return np.stack(((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)))
 
 
 def _array(values: Tensor) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -20,29 +20,32 @@ from numpy.typing import NDArray
 from ...arrays import read_arrays
 from ...capture import read_ahead
 from ...capture.base import Capture
-from ...errors import ConfigError, FrameError, TrackingError
+from ...errors import ConfigError, FrameError, MapError, TrackingError
 from ...progress import Progress
 from ...registry import require_positive
 from ...types import Frame, Intrinsics
 from . import depth_network
-from .consistency import DepthImage, confirmed
-from .multi_view import completed, measured
+from .consistency import DepthImage
+from .multi_view import measured
 from .neighbours import APART, Chosen, neighbours
 from .photo_consistency import View
-from .scan_planes import ScanPlane, scan_planes, snapped
+from .points import Points, confirmed_points, merged
+from .surface_depth import Layout, surface_depth
+from .watertight import Surface, watertight
 
 __all__ = ["Options", "Scan", "StereoDepth", "View", "depth_map"]
 
 _AT_ONCE = 16  # frames
-_SCAN_PLANES = 60  # of the whole scan, at most
-_FILES_KEPT = 128  # in memory: images and depths of the frames around the one in work
+_FILES_KEPT = 64  # in memory: images and depths of the frames around the one in work
 _STORED: dict[str, dict[str, tuple[str, int]]] = {
     "view": {"grey": ("u", 2), "T_world_cam": ("f", 2), "size": ("i", 1), "camera": ("f", 1)},
     "guess": {"inverse": ("f", 2)},
-    **{stage: {"inverse": ("f", 2), "sigma": ("f", 2)} for stage in ("measured", "completed", "depth")},
+    **{stage: {"inverse": ("f", 2), "sigma": ("f", 2)} for stage in ("measured", "depth")},
 }
-_SAME_DEPTH = 0.01  # relative: up to it views agree, whatever their standard deviations
-_LOOKING_THROUGH = 0.5  # views that contradict, over those that agree
+_SURFACE = {"vertices": ("f", 2), "sigma_m": ("f", 1), "triangles": ("i", 2), "cell_m": ("f", 1)}
+_EACH_WAY = 8  # pixels: depths that are looked at for how deep the scan is
+_LEAST_POINTS = 100
+_Result = TypeVar("_Result")
 _SAME_SURFACE = 0.02  # relative: beyond it, depths of adjacent pixels belong to different things
 
 
@@ -54,13 +57,9 @@ class Options:
     """Longer side of the depth images in pixels; frames get them enlarged to their own size."""
     neighbours: int = 4
     """Views that each frame is compared with."""
-    planes: int = 12
-    """Planes looked for around each frame, on which surfaces without texture are put; 0 = leave these empty, and do
-    without the planes of the whole scan, too, which depths that cannot be told from them are moved to."""
     agreeing: int = 2
-    """Views whose depth must confirm a pixel's, of twice as many as each frame is compared with."""
-    vaguest: float = 0.025
-    """Standard deviation over depth beyond which a pixel is left empty; small images need more."""
+    """Views whose depth must confirm a pixel's, of twice as many as each frame is compared with, for it to become part
+    of the surface."""
     network: str | None = None
     """ONNX network that guesses (inverse) depth from one image, fitted to each frame's stereo depth; it fills what
     stereo leaves empty."""
@@ -68,11 +67,9 @@ class Options:
     """Where stereo is computed: "cpu", or a CUDA device of torch's."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "neighbours", "agreeing", "vaguest")
+        require_positive(self, "neighbours", "agreeing")
         if self.size < 64:
             raise ConfigError(f"'size' must be at least 64 pixels, got {self.size}.")
-        if self.planes < 0:
-            raise ConfigError(f"'planes' must not be negative, got {self.planes}.")
 
 
 class Scan(Protocol):
@@ -99,17 +96,18 @@ def depth_map(
     deviation. The depth lies between ``near`` and ``far``; H, W are those of a view of ``options.size``."""
     small, sources = _shrunk(view, options.size), [_shrunk(other, options.size) for other in others]
     depth = measured(small, sources, sources, near, far, options.device)
-    depth = completed(small, sources, depth, [], options.planes, options.device)
     return _metres(depth.inverse, depth.sigma)
 
 
 class StereoDepth:
-    """Depth of a scan's frames, one file a frame and stage in ``folder``: what is there is not computed again."""
+    """Depth of a scan's frames: what each measures becomes points that others confirm, these the surface of the scan,
+    and this the depth of each. One file a frame and stage in ``folder``, and one of the surface: what is there is not
+    computed again."""
 
     def __init__(self, folder: Path, options: Options):
         self.folder, self.options = folder, options
         self._lock = threading.Lock()
-        self._planes: list[ScanPlane] = []
+        self._layout: Layout | None = None
         self._read: OrderedDict[Path, dict[str, NDArray[np.generic]]] = OrderedDict()
 
     def compute(
@@ -140,17 +138,16 @@ class StereoDepth:
                 f"No depth can be had from the images of {capture.path}: no two of its frames see the same things from "
                 "different places. Move the camera sideways, do not only turn it."
             )
-        measure = functools.partial(self._measure, apart=apart)
-        for stage, step in (("measured", measure), ("completed", self._complete), ("depth", self._confirm)):
-            missing = [frame for frame in able if not self._path(stage, frame).exists()]
-            progress.stage(f"stereo: {stage}", len(missing))
-            if stage == "completed" and missing and self.options.planes:
-                self._planes = scan_planes((self._depth("measured", frame) for frame in able), _SCAN_PLANES)
-            for done, frame, depth in self._each(missing, functools.partial(step, chosen=chosen)):
-                self._write(
-                    stage, frame, inverse=depth.inverse.astype(np.float16), sigma=depth.sigma.astype(np.float16)
+        self._compute("measured", able, functools.partial(self._measure, chosen=chosen, apart=apart), progress)
+        if not self._surface_path.exists():
+            points = self._points(able, chosen, progress)
+            if len(points.points) < _LEAST_POINTS:
+                raise TrackingError(
+                    f"No depth can be had from the images of {capture.path}: hardly anything in them was found to be "
+                    "equally far away by several. They may be blurred, or show bare surfaces, or their poses be wrong."
                 )
-                progress.advance(done)
+            self._save(watertight(points, T[able, :3, 3]))
+        self._compute("depth", able, functools.partial(self._render, surface=self._surface()), progress)
 
     def depth(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """(H, W) depth in metres of a frame, 0 = none, and its standard deviation, at the size of ``prepared`` frames;
@@ -160,7 +157,17 @@ class StereoDepth:
         height, width = self._load("view", index)["size"].tolist()
         return _metres(*_enlarged(self._depth("depth", index), width, height))
 
-    def _each(self, frames: Sequence[int], step: Callable[[int], DepthImage]) -> Iterator[tuple[int, int, DepthImage]]:
+    def _compute(
+        self, stage: str, frames: Sequence[int], step: Callable[[int], DepthImage], progress: Progress
+    ) -> None:
+        """``step`` of the frames that have no file of the stage yet."""
+        missing = [frame for frame in frames if not self._path(stage, frame).exists()]
+        progress.stage(f"stereo: {stage}", len(missing))
+        for done, frame, depth in self._each(missing, step):
+            self._write(stage, frame, inverse=depth.inverse.astype(np.float16), sigma=depth.sigma.astype(np.float16))
+            progress.advance(done)
+
+    def _each(self, frames: Sequence[int], step: Callable[[int], _Result]) -> Iterator[tuple[int, int, _Result]]:
         """How many are done, a frame, and ``step`` of it. On a CPU each core has a frame of its own: their images are
         too small to be shared out."""
         workers = len(os.sched_getaffinity(0)) if self.options.device == "cpu" else 1
@@ -169,8 +176,8 @@ class StereoDepth:
         try:
             for start in range(0, len(frames), _AT_ONCE):  # so that results do not pile up
                 some = frames[start : start + _AT_ONCE]
-                for done, (frame, depth) in enumerate(zip(some, pool.map(step, some), strict=True), start=start + 1):
-                    yield done, frame, depth
+                for done, (frame, found) in enumerate(zip(some, pool.map(step, some), strict=True), start=start + 1):
+                    yield done, frame, found
         finally:
             pool.shutdown(cancel_futures=True)
             torch.set_num_threads(threads)
@@ -212,26 +219,47 @@ class StereoDepth:
         wide = [self._view(other) for other in apart[frame]] or others
         return measured(self._view(frame), others, wide, chosen.near[frame], chosen.far[frame], self.options.device)
 
-    def _complete(self, frame: int, chosen: Chosen) -> DepthImage:
-        options = self.options
-        partners = chosen.partners[frame][: options.neighbours]
-        others = [self._view(other) for other in partners]
-        around = [self._depth("measured", other) for other in partners if len(chosen.partners[other])]
-        own = self._depth("measured", frame)
-        found = completed(self._view(frame), others, own, around, options.planes, options.device)
-        return snapped(found, self._planes, float(own.sigma.min()))
+    def _points(self, frames: Sequence[int], chosen: Chosen, progress: Progress) -> Points:
+        def confirmed(frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            others = [self._depth("measured", i) for i in chosen.partners[frame] if len(chosen.partners[i])]
+            agreeing = max(1, min(self.options.agreeing, len(others)))
+            return confirmed_points(self._depth("measured", frame), others, agreeing, self.options.device)
 
-    def _confirm(self, frame: int, chosen: Chosen) -> DepthImage:
-        own, options = self._depth("completed", frame), self.options
-        others = [self._depth("completed", i) for i in chosen.partners[frame] if len(chosen.partners[i])]
-        found = confirmed(own, others, _SAME_DEPTH, options.device)
-        keep = found.agreeing >= max(1, min(options.agreeing, len(others)))
-        keep &= (found.through <= _LOOKING_THROUGH * found.agreeing) & (found.sigma < options.vaguest * found.inverse)
-        inverse, sigma = (found.inverse * keep).cpu().numpy(), found.sigma.cpu().numpy()
-        if options.network is not None:
-            guess = self._load("guess", frame)["inverse"].astype(np.float32)
-            inverse, sigma = depth_network.fused(inverse, sigma, guess)
-        return DepthImage(inverse, sigma, own.camera, own.T_world_cam)
+        def advancing() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+            for done, _, points in self._each(frames, confirmed):
+                progress.advance(done)
+                yield points
+
+        progress.stage("stereo: surface", len(frames))
+        some = [self._depth("measured", frame).inverse[::_EACH_WAY, ::_EACH_WAY] for frame in frames]
+        inverse = np.concatenate([image[image > 0] for image in some])
+        return merged(advancing(), 1.0 / float(np.median(inverse)) if len(inverse) else 1.0)
+
+    def _render(self, frame: int, surface: Surface) -> DepthImage:
+        view = self._view(frame)
+        depth = surface_depth(surface, self._layout, view.intrinsics, view.T_world_cam)
+        if self.options.network is None:
+            return depth
+        guess = self._load("guess", frame)["inverse"].astype(np.float32)
+        inverse, sigma = depth_network.fused(depth.inverse, depth.sigma, guess)
+        return DepthImage(inverse, sigma, view.intrinsics, view.T_world_cam)
+
+    @property
+    def _surface_path(self) -> Path:
+        return self.folder / "surface.npz"
+
+    def _surface(self) -> Surface:
+        stored = read_arrays(self._surface_path, _SURFACE)
+        vertices, triangles = stored["vertices"], stored["triangles"]
+        if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
+            raise MapError(f"{self._surface_path} is damaged: it has triangles of points that it does not have.")
+        return Surface(vertices, stored["sigma_m"], triangles, float(stored["cell_m"][0]))
+
+    def _save(self, surface: Surface) -> None:
+        _write_arrays(
+            self._surface_path, vertices=surface.vertices, sigma_m=surface.sigma_m, triangles=surface.triangles,
+            cell_m=np.array([surface.cell_m]),
+        )  # fmt: skip
 
     def _view(self, frame: int) -> View:
         stored = self._load("view", frame)
@@ -249,10 +277,7 @@ class StereoDepth:
         return self.folder / f"{frame:06d}.{stage}.npz"
 
     def _write(self, stage: str, frame: int, **arrays: NDArray[np.generic]) -> None:
-        path = self._path(stage, frame)
-        temporary = path.with_suffix(".tmp.npz")
-        np.savez(temporary, **arrays)  # type: ignore[arg-type]
-        temporary.replace(path)
+        _write_arrays(self._path(stage, frame), **arrays)
 
     def _load(self, stage: str, frame: int) -> dict[str, NDArray[np.generic]]:
         path = self._path(stage, frame)
@@ -263,6 +288,12 @@ class StereoDepth:
                     self._read.popitem(last=False)
             self._read.move_to_end(path)
             return self._read[path]
+
+
+def _write_arrays(path: Path, **arrays: NDArray[np.generic]) -> None:
+    temporary = path.with_suffix(".tmp.npz")
+    np.savez(temporary, **arrays)  # type: ignore[arg-type]
+    temporary.replace(path)
 
 
 def _shrunk(view: View, size: int) -> View:

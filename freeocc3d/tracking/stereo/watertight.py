@@ -38,11 +38,13 @@ class Hits:
 
 @dataclass(frozen=True)
 class Surface:
-    """vertices: (V, 3) float32 world.  sigma_m: (V,) float32 standard deviations.  triangles: (F, 3) int32."""
+    """vertices: (V, 3) float32 world.  sigma_m: (V,) float32 standard deviations.  triangles: (F, 3) int32.
+    cell_m: between vertices that were measured side by side."""
 
     vertices: NDArray[np.float32]
     sigma_m: NDArray[np.float32]
     triangles: NDArray[np.int32]
+    cell_m: float
 
     def met(self, origin: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
         """What (H, W, 3) directions from ``origin`` meet first."""
@@ -56,7 +58,9 @@ class Surface:
         if not hit.any():
             return Hits(*(np.zeros_like(times) for _ in range(3)))
         edge_m, sigma_m = self._of_triangles
-        return Hits(np.where(hit, times, 0.0), edge_m[triangle] * hit, sigma_m[triangle] * hit)
+        return Hits(
+            np.where(hit, times, 0.0), np.where(hit, edge_m[triangle], 0.0), np.where(hit, sigma_m[triangle], 0.0)
+        )
 
     @cached_property
     def _scene(self) -> Any:
@@ -82,8 +86,8 @@ def watertight(points: Points, centres: NDArray[np.float64]) -> Surface:
     soft = np.maximum(_SOFT * points.sigma_m, 0.5 * points.cell_m)
     seen = evidence(space, points.ray_point, (points.ray_camera + count).astype(np.int32), soft)
     free = cut(space, seen)
-    sigma_m = np.concatenate((points.sigma_m, np.full(len(centres), np.inf)))
-    return Surface(space.vertices.astype(np.float32), sigma_m.astype(np.float32), boundary(space, free))
+    sigma_m = np.concatenate((points.sigma_m, np.zeros(len(centres))))
+    return Surface(space.vertices.astype(np.float32), sigma_m.astype(np.float32), boundary(space, free), points.cell_m)
 
 
 def cut(space: Tetrahedra, seen: Evidence) -> NDArray[np.bool_]:
