@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 from textured import CAMERA, Rectangle, looking, render
 
 from freeocc3d.tracking.stereo import scan_depth
-from freeocc3d.tracking.stereo.multi_view import measured
+from freeocc3d.tracking.stereo.multi_view import measured, median, unfolded_median
 
 SLANTED = Rectangle((-3, -3, 1.5), (6, 0, 1.0), (0, 6, 0.6))
 PLACES = (0.0, -0.3, -0.15, 0.15, 0.3)
@@ -62,3 +63,10 @@ def test_depth_maps_have_the_size_asked_for(size: int) -> None:
     rows, columns = (np.round((np.arange(n) + 0.5) * step - 0.5).astype(int) for n in found.shape)
     truth = depth[np.ix_(rows, columns)]
     assert np.median(np.abs(found - truth)[there] / truth[there]) < 0.02
+
+
+def test_medians_are_those_of_a_plain_implementation() -> None:
+    image = torch.from_numpy(np.random.default_rng(0).random((13, 18), np.float32))
+    torch.testing.assert_close(median(image), unfolded_median(image))
+    padded = np.pad(image.numpy(), 2, mode="edge")
+    assert float(median(image)[4, 0]) == np.median(padded[4:9, 0:5])

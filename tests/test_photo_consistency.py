@@ -5,7 +5,7 @@ import torch
 from textured import CAMERA, Rectangle, looking, render
 
 from freeocc3d.geometry import back_project, invert, project, transform
-from freeocc3d.tracking.stereo.photo_consistency import NOISE, Matcher, best_half, box_mean
+from freeocc3d.tracking.stereo.photo_consistency import NOISE, Matcher, best_half, box_mean, pooled_mean
 
 WALL = [Rectangle((-3, -3, 2.0), (6, 0, 0.5), (0, 6, 0))]
 RADIUS = 2
@@ -79,3 +79,9 @@ def test_means_at_the_border_are_of_what_is_inside() -> None:
     means = box_mean(image, 1)[0]
     assert means[0, 0] == image[0, :2, :2].mean()
     assert means[2, 3] == image[0, 1:4, 2:5].mean()
+
+
+def test_means_are_those_that_pooling_gives() -> None:
+    images = torch.from_numpy(np.random.default_rng(0).random((3, 17, 23), np.float32)) - 0.5
+    for radius in (1, 2, 3):
+        torch.testing.assert_close(box_mean(images, radius), pooled_mean(images, radius))

@@ -133,6 +133,20 @@ def best_half(scores: Tensor) -> Tensor:
 
 def box_mean(images: Tensor, radius: int) -> Tensor:
     """(D, H, W): means over the part of (2 radius + 1)² pixels around each that lies in the image."""
+    if images.device.type != "cpu":
+        return pooled_mean(images, radius)
+    size = (2 * radius + 1,) * 2  # OpenCV's sums run along rows and columns: four times as fast as pooling
+    inside = np.ones(images.shape[1:], np.float32)
+    share = 1.0 / cv2.boxFilter(inside, -1, size, borderType=cv2.BORDER_CONSTANT)
+    means = np.empty(images.shape, np.float32)
+    for image, mean in zip(images.numpy(), means, strict=True):
+        cv2.boxFilter(image, -1, size, dst=mean, borderType=cv2.BORDER_CONSTANT)
+        mean *= share
+    return torch.from_numpy(means)
+
+
+def pooled_mean(images: Tensor, radius: int) -> Tensor:
+    """``box_mean`` by torch, on any device."""
     size = 2 * radius + 1
     rows = F.avg_pool2d(images[:, None], (1, size), 1, (0, radius), count_include_pad=False)
     return F.avg_pool2d(rows, (size, 1), 1, (radius, 0), count_include_pad=False)[:, 0]
