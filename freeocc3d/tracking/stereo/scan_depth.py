@@ -26,11 +26,13 @@ from ...registry import require_positive
 from ...types import Frame, Intrinsics
 from . import depth_network
 from .consistency import DepthImage
+from .layers import layout
+from .layout import Layout
 from .multi_view import measured
 from .neighbours import APART, Chosen, neighbours
 from .photo_consistency import View
 from .points import Points, confirmed_points, merged
-from .surface_depth import Layout, surface_depth
+from .surface_depth import surface_depth
 from .watertight import Surface, watertight
 
 __all__ = ["Options", "Scan", "StereoDepth", "View", "depth_map"]
@@ -107,7 +109,6 @@ class StereoDepth:
     def __init__(self, folder: Path, options: Options):
         self.folder, self.options = folder, options
         self._lock = threading.Lock()
-        self._layout: Layout | None = None
         self._read: OrderedDict[Path, dict[str, NDArray[np.generic]]] = OrderedDict()
 
     def compute(
@@ -146,8 +147,11 @@ class StereoDepth:
                     f"No depth can be had from the images of {capture.path}: hardly anything in them was found to be "
                     "equally far away by several. They may be blurred, or show bare surfaces, or their poses be wrong."
                 )
-            self._save(watertight(points, T[able, :3, 3]))
-        self._compute("depth", able, functools.partial(self._render, surface=self._surface()), progress)
+            surface = watertight(points, T[able, :3, 3])
+            self._save(surface, layout(points, T[able, :3, 3], surface.normals()))
+        self._compute(
+            "depth", able, functools.partial(self._render, surface=self._surface(), planes=self._layout()), progress
+        )
 
     def depth(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """(H, W) depth in metres of a frame, 0 = none, and its standard deviation, at the size of ``prepared`` frames;
@@ -235,9 +239,9 @@ class StereoDepth:
         inverse = np.concatenate([image[image > 0] for image in some])
         return merged(advancing(), 1.0 / float(np.median(inverse)) if len(inverse) else 1.0)
 
-    def _render(self, frame: int, surface: Surface) -> DepthImage:
+    def _render(self, frame: int, surface: Surface, planes: Layout) -> DepthImage:
         view = self._view(frame)
-        depth = surface_depth(surface, self._layout, view.intrinsics, view.T_world_cam)
+        depth = surface_depth(surface, planes, view.intrinsics, view.T_world_cam)
         if self.options.network is None:
             return depth
         guess = self._load("guess", frame)["inverse"].astype(np.float32)
@@ -255,7 +259,16 @@ class StereoDepth:
             raise MapError(f"{self._surface_path} is damaged: it has triangles of points that it does not have.")
         return Surface(vertices, stored["sigma_m"], triangles, float(stored["cell_m"][0]))
 
-    def _save(self, surface: Surface) -> None:
+    def _layout(self) -> Layout:
+        path = self.folder / "layout.npz"
+        try:
+            return Layout.from_arrays(read_arrays(path, Layout.EXPECTED))
+        except ValueError as error:
+            raise MapError(f"{path} is damaged: it has {error}.") from error
+
+    def _save(self, surface: Surface, planes: Layout) -> None:
+        """The surface last: where it is, both are."""
+        _write_arrays(self.folder / "layout.npz", **planes.to_arrays())
         _write_arrays(
             self._surface_path, vertices=surface.vertices, sigma_m=surface.sigma_m, triangles=surface.triangles,
             cell_m=np.array([surface.cell_m]),

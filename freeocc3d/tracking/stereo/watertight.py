@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from .points import Points
 from .tetrahedra import Evidence, Tetrahedra, evidence, tetrahedra
 
+_SIDE_BY_SIDE = 6.0  # cells
 _SOFT = 3.0  # standard deviations of a point within which its rays may still cross the surface
 _QUALITY = 1.0  # rays that a facet of the worst shape outweighs, for each of its sides
 _STEPS = 50.0  # of the whole numbers in which flows are computed, per ray
@@ -61,6 +62,14 @@ class Surface:
         return Hits(
             np.where(hit, times, 0.0), np.where(hit, edge_m[triangle], 0.0), np.where(hit, sigma_m[triangle], 0.0)
         )
+
+    def normals(self) -> NDArray[np.float64]:
+        """(N, 3) of the triangles whose corners were measured side by side."""
+        near = self._of_triangles[0] < _SIDE_BY_SIDE * self.cell_m
+        a, b, c = np.moveaxis(self.vertices[self.triangles[near]].astype(np.float64), 1, 0)
+        normals = np.cross(b - a, c - a)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.asarray((normals / np.maximum(length, 1e-12))[length[:, 0] > 1e-12])
 
     @cached_property
     def _scene(self) -> Any:

@@ -1,0 +1,121 @@
+"""The planes of a building: floors, ceilings, walls and what stands along them, as rays meet them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+_NEAR, _FAR, _FAR_OUTERMOST = 0.97, 1.05, 1.1  # times the surface's depth
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The points X of the world with ``normal`` · X = ``offset`` in those squares of the plane where a surface is
+    supposed.
+
+    normal: (3,) float64, of length 1.  offset, square: metres.  axes: (2, 3) orthonormal, along the plane.
+    support: (U, V) bool of squares of that edge, the lower corner of the first of which has the coordinates ``corner``
+    along the axes.  outermost: whether no other in its direction lies farther out; then it goes on wherever it is not
+    seen through.
+    """
+
+    normal: NDArray[np.float64]
+    offset: float
+    axes: NDArray[np.float64]
+    corner: NDArray[np.float64]
+    square: float
+    support: NDArray[np.bool_]
+    outermost: bool
+
+
+_ARRAYS = {
+    "normals": ("f", 2), "offsets": ("f", 1), "axes": ("f", 3), "corners": ("f", 2), "squares": ("f", 1),
+    "shapes": ("i", 2), "support": ("b", 1), "outermost": ("b", 1),
+}  # fmt: skip
+
+
+class Layout:
+    """Planes, as rays meet them."""
+
+    EXPECTED: ClassVar[dict[str, tuple[str, int]]] = _ARRAYS
+
+    def __init__(self, planes: Sequence[Plane]):
+        self.planes = tuple(planes)
+        self._arrays = self.to_arrays()
+        starts = np.cumsum([0, *self._arrays["shapes"].prod(axis=1)], dtype=np.int64)[:-1]
+        far = np.where(self._arrays["outermost"], _FAR_OUTERMOST, _FAR)
+        self._packed = (*(self._arrays[name] for name in _ARRAYS if name != "outermost"), starts, far)
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """The planes as arrays whose names and kinds are those of ``Layout.EXPECTED``."""
+        planes = self.planes
+        return {
+            "normals": np.array([plane.normal for plane in planes], np.float64).reshape(-1, 3),
+            "offsets": np.array([plane.offset for plane in planes], np.float64),
+            "axes": np.array([plane.axes for plane in planes], np.float64).reshape(-1, 2, 3),
+            "corners": np.array([plane.corner for plane in planes], np.float64).reshape(-1, 2),
+            "squares": np.array([plane.square for plane in planes], np.float64),
+            "shapes": np.array([plane.support.shape for plane in planes], np.int64).reshape(-1, 2),
+            "support": np.concatenate([plane.support.ravel() for plane in planes] or [np.zeros(0, bool)]),
+            "outermost": np.array([plane.outermost for plane in planes], bool),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> Layout:
+        """The inverse of ``to_arrays``. Raises ValueError if they do not fit each other."""
+        rows = [arrays[name] for name in ("normals", "offsets", "axes", "corners", "squares", "shapes", "outermost")]
+        sizes = arrays["shapes"].prod(axis=1)
+        if len({len(row) for row in rows}) > 1 or (sizes <= 0).any() or sizes.sum() != len(arrays["support"]):
+            raise ValueError("arrays of different planes")
+        normals, offsets, axes, corners, squares, shapes, outermost = rows
+        parts = np.split(arrays["support"], np.cumsum(sizes)[:-1]) if len(sizes) else []
+        return cls(
+            [
+                Plane(normal, float(offset), across, corner, float(square), part.reshape(shape), bool(out))
+                for normal, offset, across, corner, square, shape, part, out in zip(
+                    normals, offsets, axes, corners, squares, shapes, parts, outermost, strict=True
+                )
+            ]
+        )
+
+    def near(
+        self, origin: NDArray[np.float64], directions: NDArray[np.float64], times: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Where the plane of a wall may take the surface's place: (N,), how many times (N, 3) directions reach the
+        first plane that is supposed there, about as far away as the surface is, which they reach after (N,) ``times``;
+        0 = there is none. What lies before the surface is known to be free."""
+        return _nearest(origin, directions, times, *self._packed)
+
+
+@numba.njit(cache=True)
+def _nearest(origin, directions, times, normals, offsets, axes, corners, squares, shapes, support, starts, far):  # type: ignore[no-untyped-def]
+    found = np.zeros(len(directions))
+    for ray in range(len(directions)):
+        x, y, z = directions[ray]
+        best = np.inf
+        for k in range(len(normals)):
+            facing = normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * z
+            if abs(facing) < 1e-6:
+                continue
+            height = offsets[k] - (normals[k, 0] * origin[0] + normals[k, 1] * origin[1] + normals[k, 2] * origin[2])
+            t = height / facing
+            if not (_NEAR * times[ray] < t < far[k] * times[ray]) or t <= 0.0 or t >= best:
+                continue
+            px, py, pz = origin[0] + t * x, origin[1] + t * y, origin[2] + t * z
+            u = int(
+                np.floor((px * axes[k, 0, 0] + py * axes[k, 0, 1] + pz * axes[k, 0, 2] - corners[k, 0]) / squares[k])
+            )
+            v = int(
+                np.floor((px * axes[k, 1, 0] + py * axes[k, 1, 1] + pz * axes[k, 1, 2] - corners[k, 1]) / squares[k])
+            )
+            i, j = int(np.floor(u / squares[k])), int(np.floor(v / squares[k]))
+            if 0 <= i < shapes[k, 0] and 0 <= j < shapes[k, 1] and support[starts[k] + i * shapes[k, 1] + j]:
+                best = t
+        if best < np.inf:
+            found[ray] = best
+    return found
