@@ -53,6 +53,7 @@ def of_map(
         splatting,
         registry.build_options(carve, settings["carving"]),
         origin=truth.origin,
+        least_scale=_least_scale(settings, alignment, truth),
     )
     voxels = occupancy.voxels(OCCUPIED)
     inside = ((voxels >= 0) & (voxels < truth.shape)).all(axis=1)
@@ -191,6 +192,13 @@ def _splatting(settings: Config, truth: GroundTruth) -> splat.Options:
     here = {**settings["occupancy"], "device": "cpu", "voxel_size": truth.voxel_size}
     options: splat.Options = registry.build_options(splat, here)
     return options
+
+
+def _least_scale(settings: Config, alignment: Alignment, truth: GroundTruth) -> float:
+    """What the map's Gaussians are widened to on the truth's lattice, metres."""
+    cell_size = settings["gaussians"]["cell_size"] or 0.5 * settings["occupancy"]["voxel_size"]
+    options: anchors.Options = registry.build_options(anchors, settings["gaussians"])
+    return anchors.least_scale(options, alignment.scale * cell_size, truth.voxel_size)
 
 
 def _words(

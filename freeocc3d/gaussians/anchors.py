@@ -72,6 +72,13 @@ class Options:
             raise ConfigError(f"'initialisation' must be ray_aligned or isotropic, got '{self.initialisation}'.")
 
 
+def least_scale(options: Options, cell_size: float, voxel_size: float) -> float:
+    """Standard deviation in metres that Gaussians of cells of ``cell_size`` must at least have to be shown by voxels of
+    ``voxel_size``: that of cells of half a voxel, if theirs are smaller; 0 where they are not."""
+    usual = 0.5 * voxel_size
+    return options.coverage * usual if cell_size < usual else 0.0
+
+
 class AnchoredCells:
     """Collects keyframes; ``gaussians`` turns what was collected into anchored Gaussians.
 
