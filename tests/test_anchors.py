@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from scenes import CAMERA, lifted, wall_frame
+from scenes import CAMERA, lifted, wall_frame, with_sigma
 
 from freeocc3d.gaussians import anchors, edges
 from freeocc3d.geometry import depth_sigma, invert, project, quats_to_rotations, rotations_to_quats, transform
 from freeocc3d.occupancy import reference, splat
-from freeocc3d.types import Frame
+from freeocc3d.types import Frame, Intrinsics
 
 CELL = 0.04
 
@@ -146,6 +146,14 @@ def test_cells_smaller_than_the_pixels_spacing_keep_the_surface() -> None:
     g = lifted([wall_frame(2.0)], [np.eye(4)], cell=0.005)
     assert len(g) > 0.95 * CAMERA.width * CAMERA.height
     assert g.scales[:, 0].min() == pytest.approx(0.7 * 2.0 / CAMERA.fx, rel=1e-3)
+
+
+def test_every_pixel_counts_whose_depth_says_how_uncertain_it_is() -> None:
+    wide = Intrinsics(640, 480, 520.0, 520.0, 319.5, 239.5)
+    frame, cells = wall_frame(2.0, camera=wide), anchors.AnchoredCells(anchors.Options(), CELL, np.eye(4)[None])
+    assert cells.stride(frame) == 2
+    assert cells.stride(with_sigma(frame)) == 1
+    assert anchors.AnchoredCells(anchors.Options(pixel_stride=3), CELL, np.eye(4)[None]).stride(with_sigma(frame)) == 3
 
 
 def test_a_frame_without_depth_adds_nothing() -> None:

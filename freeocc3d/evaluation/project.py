@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -184,7 +183,7 @@ def _scaled(scan_map: Map, alignment: Alignment) -> Iterator[PosedFrame]:
     """Keyframes in the true frame, depth in its metres; a similarity scales the cameras' frames as well."""
     poses = alignment.poses(scan_map.trajectory.T_world_keyframe)
     for row, (frame, T) in enumerate(zip(scan_map.keyframes, poses, strict=True)):
-        yield PosedFrame(replace(frame, depth_m=frame.depth_m * np.float32(alignment.scale)), T, row)
+        yield PosedFrame(frame.scaled(alignment.scale), T, row)
 
 
 def _splatting(settings: Config, truth: GroundTruth) -> splat.Options:

@@ -54,7 +54,7 @@ class GivenTracker(Tracker):
     def completed(self, frame: Frame) -> Frame:
         frame = self.as_pinhole(frame)
         found = None if self._depth is None else self._depth.depth(frame.index)
-        return frame if found is None else replace(frame, depth_m=found[0])
+        return frame if found is None else replace(frame, depth_m=found[0], depth_sigma_m=found[1])
 
     def track(self, frame: Frame) -> Tracked:
         given = self.T_world_cam[frame.index]
