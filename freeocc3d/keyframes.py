@@ -1,5 +1,5 @@
 """Keyframes on disk: colour (JPEG), depth (16-bit PNG, millimetres), its standard deviation where it has one of its own
-(16-bit PNG, tenths of them) and intrinsics, enough to build every later layer without the capture. They are written
+(16-bit PNG, halves of them) and intrinsics, enough to build every later layer without the capture. They are written
 while the camera is tracked, and read one at a time."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .errors import MapError
 from .types import Frame, Intrinsics
 
 INDEX = "keyframes.json"
-_UNITS_PER_METRE, _SIGMA_UNITS_PER_METRE = 1000.0, 10000.0
+_UNITS_PER_METRE, _SIGMA_UNITS_PER_METRE = 1000.0, 2000.0
 _SIGMA = "sigma"
 """Key of the entries that have a third image."""
 _JPEG_QUALITY = 95

@@ -23,20 +23,20 @@ def kept(tmp_path: Path) -> Keyframes:
     return keyframes
 
 
-def test_depth_comes_back_to_half_a_millimetre_and_its_sigma_to_a_twentieth(kept: Keyframes) -> None:
+def test_depth_comes_back_to_half_a_millimetre_and_its_sigma_to_a_quarter(kept: Keyframes) -> None:
     sensor, stereo = Keyframes.load(kept.folder)
     assert sensor.depth_sigma_m is None
     np.testing.assert_allclose(sensor.depth_m, 2.0, atol=5e-4)
     known = stereo.depth_m > 0
     np.testing.assert_array_equal(known, wall_frame(1.5).depth_m * (np.arange(120) >= 50)[:, None] > 0)
     expected = with_sigma(wall_frame(1.5, 7)).depth_sigma_m
-    np.testing.assert_allclose(stereo.depth_sigma_m[known], expected[known], atol=6e-5)
+    np.testing.assert_allclose(stereo.depth_sigma_m[known], expected[known], atol=3e-4)
 
 
 def test_a_sigma_below_what_is_kept_is_not_zero(tmp_path: Path) -> None:
     keyframes = Keyframes(tmp_path)
     keyframes.append(with_sigma(wall_frame(1.0), 1e-7, 2e-7))
-    np.testing.assert_allclose(keyframes[0].depth_sigma_m, 1e-4)
+    np.testing.assert_allclose(keyframes[0].depth_sigma_m, 5e-4)
 
 
 def test_both_are_scaled(kept: Keyframes, tmp_path: Path) -> None:
@@ -45,7 +45,7 @@ def test_both_are_scaled(kept: Keyframes, tmp_path: Path) -> None:
         np.testing.assert_allclose(half.depth_m, 0.5 * frame.depth_m, atol=6e-4)
         np.testing.assert_array_equal(half.color, frame.color)
         assert (half.depth_sigma_m is None) == (frame.depth_sigma_m is None)
-    np.testing.assert_allclose(half.depth_sigma_m, 0.5 * frame.depth_sigma_m, atol=6e-5)
+    np.testing.assert_allclose(half.depth_sigma_m, 0.5 * frame.depth_sigma_m, atol=3e-4)
 
 
 def test_an_image_that_is_gone_is_named_and_one_that_no_index_lists_is_removed(kept: Keyframes) -> None:
