@@ -1,5 +1,6 @@
-"""Keyframes on disk: colour (JPEG), depth (16-bit PNG, millimetres) and intrinsics, enough to build every later layer
-without the capture. They are written while the camera is tracked, and read one at a time."""
+"""Keyframes on disk: colour (JPEG), depth (16-bit PNG, millimetres), its standard deviation where it has one of its own
+(16-bit PNG, halves of them) and intrinsics, enough to build every later layer without the capture. They are written
+while the camera is tracked, and read one at a time."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ from .errors import MapError
 from .types import Frame, Intrinsics
 
 INDEX = "keyframes.json"
-_UNITS_PER_METRE = 1000.0
+_UNITS_PER_METRE, _SIGMA_UNITS_PER_METRE = 1000.0, 2000.0
+_SIGMA = "sigma"
+"""Key of the entries that have a third image."""
 _JPEG_QUALITY = 95
 
 
@@ -43,23 +46,23 @@ class Keyframes(Sequence[Frame]):
         self.folder.mkdir(parents=True, exist_ok=True)
         bgr = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
         color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-        color_path, depth_path = self._paths(frame.index)
-        color_path.write_bytes(color.tobytes())
-        depth_path.write_bytes(_encoded_depth(frame.depth_m))
+        self._paths(frame.index)[0].write_bytes(color.tobytes())
+        self._write_depth(frame)
         camera = frame.intrinsics
         self._entries.append(
             {"frame": frame.index, "timestamp": frame.timestamp, "width": camera.width, "height": camera.height,
-             "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+             "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+             **({} if frame.depth_sigma_m is None else {_SIGMA: 1.0})}
         )  # fmt: skip
 
     def write_scaled(self, folder: Path, factor: float) -> None:
         """Write them to another folder with depth times ``factor``; colour is copied. Raises OSError, MapError."""
         folder.mkdir(parents=True, exist_ok=True)
         written = Keyframes(folder)
-        for row, entry in enumerate(self._entries):
-            color_path, depth_path = self._paths(int(entry["frame"]))
+        for entry, frame in zip(self._entries, self, strict=True):
+            color_path = self._paths(frame.index)[0]
             (folder / color_path.name).write_bytes(color_path.read_bytes())
-            (folder / depth_path.name).write_bytes(_encoded_depth(self.depth_m(row) * np.float32(factor)))
+            written._write_depth(frame.scaled(factor))
             written._entries.append(entry)
         written.save_index()
 
@@ -77,7 +80,7 @@ class Keyframes(Sequence[Frame]):
     def drop_unlisted(self) -> None:
         """Remove images that a run left which was interrupted after its last checkpoint."""
         listed = {path for entry in self._entries for path in self._paths(int(entry["frame"]))}
-        for path in [*self.folder.glob("*.color.jpg"), *self.folder.glob("*.depth.png")]:
+        for path in [*self.folder.glob("*.color.jpg"), *self.folder.glob("*.depth*.png")]:
             if path not in listed:
                 path.unlink()
 
@@ -109,32 +112,41 @@ class Keyframes(Sequence[Frame]):
 
     def depth_m(self, row: int) -> NDArray[np.float32]:
         """(H, W) depth of one, whose colour is not decoded; 0 = no measurement."""
-        return self._read_depth(self._entries[row])
+        return self._read_units(self._entries[row], 1) / np.float32(_UNITS_PER_METRE)
 
     def _read(self, entry: dict[str, float]) -> Frame:
         index = int(entry["frame"])
         camera = _camera(entry)
         color_path = self._paths(index)[0]
         color = _decode(color_path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        depth_m = self._read_depth(entry)
+        depth_m = self._read_units(entry, 1) / np.float32(_UNITS_PER_METRE)
+        sigma_m = self._read_units(entry, 2) / np.float32(_SIGMA_UNITS_PER_METRE) if _SIGMA in entry else None
         if color.shape != (*depth_m.shape, 3):
             raise MapError(f"{color_path} does not have the size that {INDEX} states.")
-        return Frame(index, entry["timestamp"], cv2.cvtColor(color, cv2.COLOR_BGR2RGB), depth_m, camera)
+        return Frame(index, entry["timestamp"], cv2.cvtColor(color, cv2.COLOR_BGR2RGB), depth_m, camera, sigma_m)
 
-    def _read_depth(self, entry: dict[str, float]) -> NDArray[np.float32]:
-        camera, path = _camera(entry), self._paths(int(entry["frame"]))[1]
+    def _read_units(self, entry: dict[str, float], image: int) -> NDArray[np.float32]:
+        camera, path = _camera(entry), self._paths(int(entry["frame"]))[image]
         units = _decode(path, cv2.IMREAD_UNCHANGED)
         if units.shape != (camera.height, camera.width):
             raise MapError(f"{path} does not have the size that {INDEX} states.")
-        return np.asarray(units.astype(np.float32) / np.float32(_UNITS_PER_METRE))
+        return units.astype(np.float32)
 
-    def _paths(self, index: int) -> tuple[Path, Path]:
-        """Colour and depth image of a frame."""
-        return self.folder / f"{index:06d}.color.jpg", self.folder / f"{index:06d}.depth.png"
+    def _write_depth(self, frame: Frame) -> None:
+        _, depth_path, sigma_path = self._paths(frame.index)
+        depth_path.write_bytes(_encoded(frame.depth_m * _UNITS_PER_METRE))
+        if frame.depth_sigma_m is not None:
+            sigma = np.maximum(frame.depth_sigma_m * np.float32(_SIGMA_UNITS_PER_METRE), 1)  # 0 would weigh infinitely
+            sigma_path.write_bytes(_encoded(np.where(frame.depth_m > 0, sigma, 0)))
+
+    def _paths(self, index: int) -> tuple[Path, Path, Path]:
+        """Colour and depth image of a frame, and that of the depth's standard deviation."""
+        name = self.folder / f"{index:06d}"
+        return name.with_suffix(".color.jpg"), name.with_suffix(".depth.png"), name.with_suffix(".depth_sigma.png")
 
 
-def _encoded_depth(depth_m: NDArray[np.float32]) -> bytes:
-    units = np.clip(np.rint(depth_m * _UNITS_PER_METRE), 0, 65535).astype(np.uint16)
+def _encoded(values: NDArray[np.float32]) -> bytes:
+    units = np.clip(np.rint(values), 0, 65535).astype(np.uint16)
     return bytes(cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
 
 

@@ -45,6 +45,8 @@ from .work import WorkFolder
 
 _CHECKPOINT_FRAMES = 50
 _FEW_TRACKED = 0.5
+_FINE = 0.01
+"""Edge of cells over the usual depth, where the scale is unknown: about what stereo can tell apart."""
 _MEASURED_VIEWS = 24
 """Keyframes, at most, that are rendered to say how well the Gaussians show what was captured."""
 
@@ -160,7 +162,10 @@ class Mapper:
     @property
     def cell_size(self) -> float:
         """Edge in metres of the cells that hold one Gaussian each."""
-        return float(self.settings["gaussians"]["cell_size"] or 0.5 * self.settings["occupancy"]["voxel_size"])
+        usual = 0.5 * self.settings["occupancy"]["voxel_size"]
+        if not self.tracker.metric:  # half a voxel may turn out to be much in metres
+            usual = min(usual, _FINE * capture_base.NOMINAL_DEPTH)
+        return float(self.settings["gaussians"]["cell_size"] or usual)
 
     @property
     def fit_options(self) -> fit.Options:
@@ -208,6 +213,9 @@ class Mapper:
             _options(splat, self.settings["occupancy"]),
             carving,
             progress=progress.advance,
+            least_scale=anchors.least_scale(
+                _options(anchors, self.settings["gaussians"]), self.cell_size, self.settings["occupancy"]["voxel_size"]
+            ),
         )
 
     def refine_occupancy(
@@ -498,7 +506,10 @@ def _save(
         codec = Codec.fit(features)
         store.write_occupancy(folder, occupancy, codec, features)
         store.write_tum(folder / store.TRAJECTORY, trajectory)
-        (folder / store.CONFIG).write_text(config.dump(mapper.settings), encoding="utf-8")
+        settings = mapper.settings
+        if not mapper.tracker.metric:  # says how fine its Gaussians are when the map is put on other lattices
+            settings = {**settings, "gaussians": {**settings["gaussians"], "cell_size": mapper.cell_size}}
+        (folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
         metric = mapper.tracker.metric
         manifest = _manifest(mapper, trajectory, gaussians, occupancy, encoder, submaps)
         up = np.array(manifest["up"])

@@ -235,7 +235,7 @@ def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussi
     shown = []
     for row in np.unique(np.linspace(0, len(keyframes) - 1, renders.SHOWN).astype(int)).tolist():
         frame = keyframes[row]
-        frame = dataclasses.replace(frame, depth_m=frame.depth_m * np.float32(factor))
+        frame = frame.scaled(factor)
         view = images.view_of(frame, trajectory.T_world_keyframe[row], width, rasterizer.device)
         shown.append((int(trajectory.keyframes[row]), view))
     renders.render_picture(folder / store.RENDER_PICTURE, gaussians, shown, rasterizer, capture)

@@ -55,6 +55,8 @@ class Frame:
     color: (H, W, 3) uint8 RGB.
     depth_m: (H, W) float32 metres, registered to ``color``'s pixels; 0 = no measurement.
     intrinsics: of ``color`` and ``depth_m``, which have the same size.
+    depth_sigma_m: (H, W) float32 standard deviation of ``depth_m``, metres, more than 0 where that is; None = that of
+    a sensor (``geometry.depth_sigma``).
     """
 
     index: int
@@ -62,6 +64,16 @@ class Frame:
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     intrinsics: Intrinsics
+    depth_sigma_m: NDArray[np.float32] | None = None
+
+    def scaled(self, factor: float) -> Frame:
+        """The frame with every length times ``factor``."""
+        sigma = self.depth_sigma_m
+        return replace(
+            self,
+            depth_m=self.depth_m * np.float32(factor),
+            depth_sigma_m=None if sigma is None else sigma * np.float32(factor),
+        )
 
 
 @dataclass(frozen=True)

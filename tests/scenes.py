@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,12 @@ def wall_frame(distance: float, index: int = 0, camera: Intrinsics = CAMERA, see
     if seed is not None:
         depth += np.random.default_rng(seed).normal(0, 0.0019 * distance**2, depth.shape).astype(np.float32)
     return Frame(index, float(index), color.astype(np.uint8), depth, camera)
+
+
+def with_sigma(frame: Frame, low: float = 0.005, high: float = 0.05) -> Frame:
+    """The frame with depth whose standard deviations are its own, and differ from pixel to pixel."""
+    rng = np.random.default_rng(frame.index)
+    return replace(frame, depth_sigma_m=rng.uniform(low, high, frame.depth_m.shape).astype(np.float32))
 
 
 def dense(occupancy: Occupancy, values: np.ndarray, lo: object, hi: object, fill: object) -> np.ndarray:

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from scenes import CAMERA, lifted, wall_frame
+from scenes import CAMERA, lifted, wall_frame, with_sigma
 
 from freeocc3d.gaussians import anchors, edges
 from freeocc3d.geometry import depth_sigma, invert, project, quats_to_rotations, rotations_to_quats, transform
 from freeocc3d.occupancy import reference, splat
-from freeocc3d.types import Frame
+from freeocc3d.types import Frame, Intrinsics
 
 CELL = 0.04
 
@@ -84,13 +84,16 @@ def test_far_measurements_that_lie_wider_apart_than_cells_get_wider_gaussians() 
     assert np.median(far.scales[:, 0]) == pytest.approx(0.7 * 9.0 / CAMERA.fx, rel=1e-3)
 
 
-def test_at_the_default_coverage_a_wall_reaches_one_half_at_six_tenths_of_a_voxel() -> None:
+@pytest.mark.parametrize("finer", [1.0, 0.7, 0.5])
+def test_at_the_default_coverage_a_wall_reaches_one_half_at_six_tenths_of_a_voxel(finer: float) -> None:
+    """Whatever the cells: finer ones hold more Gaussians, each of which says less on the lattice."""
     V = 2 * CELL
-    g = lifted([wall_frame(2.0 + 0.5 * CELL)], [np.eye(4)])
+    g = lifted([wall_frame(2.0 + 0.5 * CELL)], [np.eye(4)], cell=finer * CELL)
+    least = anchors.least_scale(anchors.Options(), finer * CELL, V)
     wall = float(g.means[0, 2])
     x, y = (np.random.default_rng(0).uniform(-0.5, 0.5, 200) for _ in range(2))
     points = {offset: np.stack((x, y, np.full(200, wall + offset * V)), axis=1) for offset in (0.0, 0.6, 1.0)}
-    alpha = {offset: reference.probability(g, at, splat.Options()).mean() for offset, at in points.items()}
+    alpha = {offset: reference.probability(g, at, splat.Options(), least).mean() for offset, at in points.items()}
     assert alpha[0.0] > 0.9
     assert alpha[0.6] == pytest.approx(0.5, abs=0.05)
     assert alpha[1.0] < 0.05
@@ -143,6 +146,14 @@ def test_cells_smaller_than_the_pixels_spacing_keep_the_surface() -> None:
     g = lifted([wall_frame(2.0)], [np.eye(4)], cell=0.005)
     assert len(g) > 0.95 * CAMERA.width * CAMERA.height
     assert g.scales[:, 0].min() == pytest.approx(0.7 * 2.0 / CAMERA.fx, rel=1e-3)
+
+
+def test_every_pixel_counts_whose_depth_says_how_uncertain_it_is() -> None:
+    wide = Intrinsics(640, 480, 520.0, 520.0, 319.5, 239.5)
+    frame, cells = wall_frame(2.0, camera=wide), anchors.AnchoredCells(anchors.Options(), CELL, np.eye(4)[None])
+    assert cells.stride(frame) == 2
+    assert cells.stride(with_sigma(frame)) == 1
+    assert anchors.AnchoredCells(anchors.Options(pixel_stride=3), CELL, np.eye(4)[None]).stride(with_sigma(frame)) == 3
 
 
 def test_a_frame_without_depth_adds_nothing() -> None:

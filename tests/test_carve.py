@@ -1,6 +1,9 @@
 """Free space from depth: a wall, a thin post, missing depth."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from scenes import CAMERA, wall_frame
 
 from freeocc3d.geometry import project
@@ -97,8 +100,25 @@ def test_the_margin_grows_with_the_depths_uncertainty() -> None:
         assert (free[before] == free_there).all()
 
 
-def test_no_block_is_missed_however_small_blocks_are() -> None:
+def test_a_depth_that_says_how_uncertain_it_is_has_that_margin() -> None:
+    frame = wall_frame(2.0)
+    for sigma, free_there, hit_there in ((0.01, 1, 0), (0.1, 0, 1)):
+        sure = replace(frame, depth_sigma_m=np.full_like(frame.depth_m, sigma))
+        free, hits, centers = evidence_of(sure)
+        near_axis = np.abs(centers[..., :2]).max(axis=-1) < 0.2
+        before = near_axis & (np.abs(centers[..., 2] - 1.8) < 0.04)
+        assert before.any()
+        assert (free[before] == free_there).all()
+        assert (hits[before] == hit_there).all()
+
+
+@pytest.mark.parametrize("sigma", [None, 0.2])
+def test_no_block_is_missed_however_small_blocks_are(sigma: float | None) -> None:
     frame = wall_frame(4.0)
+    if sigma is not None:
+        frame = replace(frame, depth_sigma_m=np.full_like(frame.depth_m, sigma))
+        behind = carve.Evidence(ORIGIN, 0.02, OPTIONS).visible_blocks(frame, np.eye(4))
+        assert grid.unpack(behind)[:, 2].max() == int((4.0 + 3 * sigma) / 0.16)
     for voxel_size in (0.08, 0.02):
         found = set(carve.Evidence(ORIGIN, voxel_size, OPTIONS).visible_blocks(frame, np.eye(4)).tolist())
         edge = 8 * voxel_size

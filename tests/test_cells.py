@@ -1,7 +1,10 @@
 """Sums by cells: the compiled ones against plain NumPy, and what they may not depend on."""
 
+from dataclasses import replace
+
 import numpy as np
-from scenes import CAMERA, wall_frame
+import pytest
+from scenes import CAMERA, wall_frame, with_sigma
 
 from freeocc3d.gaussians.cells import Cells, CellSums, cells_reference
 from freeocc3d.types import PosedFrame
@@ -26,8 +29,10 @@ def summed(frames: list[PosedFrame], cell: float = 0.05, step: int = 2) -> Cells
     return sums.cells()
 
 
-def test_the_kernel_agrees_with_plain_numpy() -> None:
+@pytest.mark.parametrize("own_sigma", [False, True])
+def test_the_kernel_agrees_with_plain_numpy(own_sigma: bool) -> None:
     (posed,) = looks(1)
+    posed = posed._replace(frame=with_sigma(posed.frame)) if own_sigma else posed
     for step, edge in ((1, 0.02), (3, 0.2)):
         sums = CellSums(0.05)
         sums.add_frame(posed, step, edge)
@@ -53,6 +58,15 @@ def test_the_nearest_measurement_says_which_keyframe() -> None:
     seen_near = np.isin(both.key, summed([near]).key)
     assert (both.keyframe[seen_near] == 0).mean() > 0.95  # noise puts some pixels of the far one nearer
     assert (both.keyframe[~seen_near] == 2).all()
+
+
+def test_a_surer_measurement_outweighs_a_nearer_one() -> None:
+    near, far = looks(2)
+    sure = replace(far.frame, depth_sigma_m=np.full_like(far.frame.depth_m, 1e-4))
+    both = summed([near, far._replace(frame=sure)])
+    seen_far = np.isin(both.key, summed([far]).key)
+    assert (both.keyframe[seen_far] == 1).all()
+    assert (both.keyframe[~seen_far] == 0).all()
 
 
 def test_means_that_are_added_again_stay_what_they_are() -> None:

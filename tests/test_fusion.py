@@ -1,7 +1,8 @@
 """Denoising: the kernel against plain NumPy, noise that averages out, and points that are no surface."""
 
 import numpy as np
-from scenes import CAMERA, lifted, posed, wall_frame
+import pytest
+from scenes import CAMERA, lifted, posed, wall_frame, with_sigma
 
 from freeocc3d.gaussians import anchors, fusion
 from freeocc3d.geometry import quats_to_rotations
@@ -24,8 +25,10 @@ def views(count: int, seed: int = 0) -> tuple[list[Frame], np.ndarray]:
     return frames, poses
 
 
-def test_the_kernel_agrees_with_plain_numpy() -> None:
+@pytest.mark.parametrize("own_sigma", [False, True])
+def test_the_kernel_agrees_with_plain_numpy(own_sigma: bool) -> None:
     frames, poses = views(8)
+    frames = [with_sigma(frame) for frame in frames] if own_sigma else frames
     points = np.random.default_rng(1).uniform((-1, -1, 1.5), (1, 1, 2.5), (4000, 3))
     directions = np.random.default_rng(2).normal((0, 0, 0.3), 1, points.shape)  # some were measured from behind
     looks = posed(frames, poses)

@@ -73,6 +73,14 @@ def test_a_map_on_its_own_lattice_is_the_map(room: Any) -> None:
     assert agreement(on_lattice, expected) > 0.99
 
 
+def test_a_map_of_finer_cells_claims_the_same_voxels(room: Any, tmp_path: Path) -> None:
+    cells = {"gaussians": {"cell_size": 0.02}, "capture": {"stop": 30, "synthetic": {"width": 160, "height": 120}}}
+    fine = freeocc3d.reconstruct("builtin:room", tmp_path / "fine", cells)
+    assert len(fine.gaussians) > 2.5 * len(room.gaussians)
+    same, claimed = (of_room(scan_map, Alignment.identity(), lattice()) for scan_map in (room, fine))
+    assert agreement(same, claimed) > 0.85
+
+
 def test_the_rooms_map_agrees_with_its_truth(room: Any) -> None:
     capture = evaluate.capture_of(room)
     arrays = capture.ground_truth()  # type: ignore[attr-defined]

@@ -17,10 +17,10 @@ V = 0.08
 LOCAL = np.stack((np.arange(512) // 64, np.arange(512) // 8 % 8, np.arange(512) % 8), axis=1)
 
 
-def project(g: Gaussians, origin=(0.0, 0.0, 0.0), **options):
+def project(g: Gaussians, origin=(0.0, 0.0, 0.0), least=0.0, **options):
     """Bins, block keys, probabilities (B, 512) and voxel centres (B * 512, 3)."""
     origin = np.asarray(origin, float)
-    bins = splat.bin_gaussians(g, origin, splat.Options(voxel_size=V, **options))
+    bins = splat.bin_gaussians(g, origin, splat.Options(voxel_size=V, **options), least_scale=least)
     keys = grid.unpack(bins.packed)
     centers = origin + ((keys[:, None] * 8 + LOCAL).reshape(-1, 3) + 0.5) * V
     return bins, keys, splat.probability(bins, keys), centers
@@ -78,13 +78,26 @@ def test_released_fills_the_box_around_a_gaussian_evenly() -> None:
 
 
 @pytest.mark.parametrize("projection", ["probabilistic", "poisson"])
-@pytest.mark.parametrize("origin", [(0, 0, 0), (0.013, -0.021, 0.3)])
-def test_probability_equals_the_reference_on_random_gaussians(origin, projection) -> None:
+@pytest.mark.parametrize(("origin", "least"), [((0, 0, 0), 0.0), ((0.013, -0.021, 0.3), 0.0), ((0, 0, 0), 0.03)])
+def test_probability_equals_the_reference_on_random_gaussians(origin, least, projection) -> None:
     g = random_gaussians(400, seed=1)
-    _, _, alpha, centers = project(g, origin, projection=projection)
-    expected = reference.probability(g, centers, splat.Options(projection=projection))
+    _, _, alpha, centers = project(g, origin, least, projection=projection)
+    expected = reference.probability(g, centers, splat.Options(projection=projection), least)
     np.testing.assert_allclose(alpha.reshape(-1), expected, atol=2e-6)
     assert expected.max() > 0.6
+
+
+def test_gaussians_finer_than_the_lattice_shows_are_widened_and_weighted_by_their_area() -> None:
+    center = np.array([0.5, 0.5, 0.5]) * V
+    g = gaussians(center, (0.02, 0.02, 0.06))
+    beside = center + (V, 0, 0)
+    assert alpha_at(g, beside) < 1e-6
+    share = (0.02 / 0.04) ** (4 / 3)
+    assert alpha_at(g, beside, least=0.04) == pytest.approx(share * np.exp(-0.5 * (V / 0.04) ** 2), rel=1e-3)
+    for wide in (gaussians(center, 0.04), g[:0]):  # nothing is changed that is wide enough
+        np.testing.assert_array_equal(project(wide)[2], project(wide, least=0.04)[2])
+    for projection in ("integrated", "released"):
+        np.testing.assert_array_equal(*(project(g, least=least, projection=projection)[2] for least in (0.0, 0.03)))
 
 
 def test_what_the_cutoff_leaves_out_is_as_small_as_stated() -> None:
@@ -203,7 +216,7 @@ def test_torch_projects_as_the_kernels_do(device: str, projection: str, monkeypa
     if device == "cuda:0" and not torch.cuda.is_available():
         pytest.skip("needs a GPU")
     g = random_gaussians(200, seed=6)
-    bins, keys, alpha, _ = project(g, (0.3, -1.2, 0.0), projection=projection)
+    bins, keys, alpha, _ = project(g, (0.3, -1.2, 0.0), 0.03, projection=projection)
     there = replace(bins, device=device)
     monkeypatch.setattr(splat_torch, "_PAIRS", 1000)
     np.testing.assert_allclose(splat.probability(there, keys), alpha, atol=3e-6)

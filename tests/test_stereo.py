@@ -87,6 +87,8 @@ def test_the_room_is_measured(computed) -> None:
     frame = tracker.completed(capture[10])
     assert frame.depth_m.shape == frame.color.shape[:2]
     assert frame.depth_m.dtype == np.float32
+    assert frame.depth_sigma_m.dtype == np.float32
+    assert (frame.depth_sigma_m[frame.depth_m > 0] > 0).all()
     assert tracker.track(frame).status == "keyframe"
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from freeocc3d import pipeline, scale
+from freeocc3d import config, pipeline, scale
 from freeocc3d.capture import open_capture
+from freeocc3d.capture.base import NOMINAL_DEPTH
 from freeocc3d.geometry import back_project, rotations_to_quats, transform
 from freeocc3d.store import Map
 
@@ -65,6 +66,9 @@ def test_a_video_becomes_a_map_whose_scale_is_said_to_be_unknown_and_can_be_give
     assert scan_map.manifest["capture"]["format"] == "video"
     assert scan_map.manifest["scale"] == {"metric": False, "by": "none", "factor": 1.0}
     assert scale.UNKNOWN in scan_map.report["warnings"]
+    cell = config.load(scan_map.path / "config.yaml")["gaussians"]["cell_size"]
+    assert cell == pytest.approx(0.01 * NOMINAL_DEPTH)
+    assert np.median(scan_map.gaussians.scales[:, 0]) == pytest.approx(0.7 * cell, rel=1e-3)
     assert not any("what camera" in text for text in scan_map.report["warnings"])
     assert scan_map.trajectory.has_pose.all()
     assert scale.by_poses(scan_map, str(scan / "metric.txt")) == pytest.approx(UNIT_M, rel=1e-3)
@@ -75,6 +79,7 @@ def test_with_a_scale_given_from_the_start_the_map_is_metric(scan: Path, tmp_pat
     scan_map = made(scan, tmp_path / "map", scale=UNIT_M)
     assert scan_map.manifest["scale"] == {"metric": True, "by": "given", "factor": UNIT_M}
     assert scale.UNKNOWN not in scan_map.report["warnings"]
+    assert config.load(scan_map.path / "config.yaml")["gaussians"]["cell_size"] is None
     room = open_capture("builtin:room", None, ROOM)
     centers = scan_map.trajectory.T_world_cam[:, :3, 3]
     np.testing.assert_allclose(centers, [room.pose(index)[:3, 3] for index in range(60)], atol=1e-5)

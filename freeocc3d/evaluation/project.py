@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +52,7 @@ def of_map(
         splatting,
         registry.build_options(carve, settings["carving"]),
         origin=truth.origin,
+        least_scale=_least_scale(settings, alignment, truth),
     )
     voxels = occupancy.voxels(OCCUPIED)
     inside = ((voxels >= 0) & (voxels < truth.shape)).all(axis=1)
@@ -183,7 +183,7 @@ def _scaled(scan_map: Map, alignment: Alignment) -> Iterator[PosedFrame]:
     """Keyframes in the true frame, depth in its metres; a similarity scales the cameras' frames as well."""
     poses = alignment.poses(scan_map.trajectory.T_world_keyframe)
     for row, (frame, T) in enumerate(zip(scan_map.keyframes, poses, strict=True)):
-        yield PosedFrame(replace(frame, depth_m=frame.depth_m * np.float32(alignment.scale)), T, row)
+        yield PosedFrame(frame.scaled(alignment.scale), T, row)
 
 
 def _splatting(settings: Config, truth: GroundTruth) -> splat.Options:
@@ -191,6 +191,13 @@ def _splatting(settings: Config, truth: GroundTruth) -> splat.Options:
     here = {**settings["occupancy"], "device": "cpu", "voxel_size": truth.voxel_size}
     options: splat.Options = registry.build_options(splat, here)
     return options
+
+
+def _least_scale(settings: Config, alignment: Alignment, truth: GroundTruth) -> float:
+    """What the map's Gaussians are widened to on the truth's lattice, metres."""
+    cell_size = settings["gaussians"]["cell_size"] or 0.5 * settings["occupancy"]["voxel_size"]
+    options: anchors.Options = registry.build_options(anchors, settings["gaussians"])
+    return anchors.least_scale(options, alignment.scale * cell_size, truth.voxel_size)
 
 
 def _words(

@@ -29,10 +29,11 @@ class Options:
     """Layer 2: how keyframe depth becomes Gaussians."""
 
     cell_size: float | None = None
-    """Edge of the cells that hold one Gaussian each, metres; null = half the voxel size."""
+    """Edge of the cells that hold one Gaussian each, metres; null = half the voxel size, and no more than a hundredth
+    of the usual depth where the scale is unknown, for voxels may turn out to be large there."""
     pixel_stride: int | None = None
     """Every n-th pixel of a keyframe, in both directions, is lifted; null = as many as leave 320 columns, more where
-    cells are small."""
+    cells are small, and all of depth by stereo."""
     every: int = 1
     """Every n-th tracked frame shows the surface, besides the keyframes; 0 = keyframes alone, as in the paper, which
     loses two to nine points of IoU on the shipped captures."""
@@ -70,6 +71,13 @@ class Options:
             raise ConfigError("'uncertainty' and 'every' must not be negative.")
         if self.initialisation not in ("ray_aligned", "isotropic"):
             raise ConfigError(f"'initialisation' must be ray_aligned or isotropic, got '{self.initialisation}'.")
+
+
+def least_scale(options: Options, cell_size: float, voxel_size: float) -> float:
+    """Standard deviation in metres that Gaussians of cells of ``cell_size`` must at least have to be shown by voxels of
+    ``voxel_size``: that of cells of half a voxel, if theirs are smaller; 0 where they are not."""
+    usual = 0.5 * voxel_size
+    return options.coverage * usual if cell_size < usual else 0.0
 
 
 class AnchoredCells:
@@ -126,9 +134,11 @@ class AnchoredCells:
 
     def stride(self, frame: Frame) -> int:
         """Every how many-th pixel of a frame is taken: the option, or as many as leave 320 columns, more where cells
-        are small: about two to a cell's edge."""
+        are small: about two to a cell's edge. All are where depth says itself how uncertain it is."""
         if self.options.pixel_stride is not None:
             return self.options.pixel_stride
+        if frame.depth_sigma_m is not None:
+            return 1
         measured = frame.depth_m[::4, ::4]
         measured = measured[measured > 0]
         usual = float(np.median(measured)) if len(measured) else 1.0

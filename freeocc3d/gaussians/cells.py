@@ -10,14 +10,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..geometry import AXIAL_NOISE, back_project, depth_sigma, transform
+from ..geometry import back_project, transform
 from ..hashing import build_table, slot
 from ..types import PosedFrame
 from .edges import at_edge, away_from_edges
+from .noise import said, sigma_at, sigma_image
 
 _PER_AXIS = 1 << 20
 """Cells on either side of the world's origin, along each axis."""
-_A, _B, _NEAREST = AXIAL_NOISE
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class CellSums:
         height, width = frame.depth_m.shape
         self._make_room(-(-height // step) * -(-width // step))
         self._used = _add_frame(
-            frame.depth_m, frame.color, step, edge, T, (camera.fx, camera.fy, camera.cx, camera.cy), keyframe,
-            self.cell_size, self._used, *self._arrays(),
+            frame.depth_m, said(frame), frame.color, step, edge, T, (camera.fx, camera.fy, camera.cx, camera.cy),
+            keyframe, self.cell_size, self._used, *self._arrays(),
         )  # fmt: skip
 
     def add(self, cells: Cells) -> None:
@@ -122,7 +122,7 @@ def cells_reference(posed: PosedFrame, step: int, edge: float, cell_size: float)
     depth = frame.depth_m[v, u]
     points = transform(T, back_project(np.stack((u, v), axis=1), depth, frame.intrinsics).astype(np.float64))
     key, cell = np.unique(cell_keys(points, cell_size), return_inverse=True)
-    weight = 1.0 / depth_sigma(depth).astype(np.float64) ** 2
+    weight = 1.0 / sigma_image(frame)[v, u].astype(np.float64) ** 2
     total = np.bincount(cell, weight)
     order = np.lexsort((-np.arange(len(cell)), weight, cell))
     best = order[np.flatnonzero(np.diff(cell[order], append=-1))]  # the first of the greatest weights in each cell
@@ -152,7 +152,7 @@ def _row_of(key, used, table, rows, keys):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _add_frame(  # type: ignore[no-untyped-def]
-    depth_m, color, step, edge, T, camera, keyframe, cell_size,
+    depth_m, sigma_m, color, step, edge, T, camera, keyframe, cell_size,
     used, table, rows, keys, sums, pixels, best, best_keyframe, footprint,
 ):  # fmt: skip
     fx, fy, cx, cy = camera
@@ -169,7 +169,7 @@ def _add_frame(  # type: ignore[no-untyped-def]
             j = np.int64(math.floor(wy / cell_size)) + _PER_AXIS
             k = np.int64(math.floor(wz / cell_size)) + _PER_AXIS
             row, used = _row_of((i << 42) | (j << 21) | k, used, table, rows, keys)
-            sigma = _A + _B * (depth - _NEAREST) ** 2
+            sigma = sigma_at(sigma_m, v, u, depth)
             w = 1.0 / (sigma * sigma)
             sums[row, 0] += w
             sums[row, 1] += w * wx

@@ -23,14 +23,14 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ..geometry import AXIAL_NOISE, depth_sigma, invert
+from ..geometry import invert
 from ..types import PosedFrame
 from .edges import at_edge, away_from_edges
+from .noise import said, sigma_at, sigma_image
 
 _REACH_M, _REACH_PER_M = 0.03, 0.01
 """A depth image shows a point if it ends within this of it, and this times the squared depth: noise and the poses'
 errors. Twice or half of either moves IoU by less than one point on the shipped captures."""
-_A, _B, _NEAREST = AXIAL_NOISE
 
 
 @dataclass
@@ -64,7 +64,7 @@ def denoised(
         camera, depth_m = frame.intrinsics, frame.depth_m
         T_cam_world = invert(T_world_cam)
         _look(
-            points, directions, depth_m, edge, T_cam_world[:3, :3].copy(), T_cam_world[:3, 3].copy(),
+            points, directions, depth_m, said(frame), edge, T_cam_world[:3, :3].copy(), T_cam_world[:3, 3].copy(),
             (camera.fx, camera.fy, camera.cx, camera.cy), row, moved, weights, shown, through, best, keyframe,
         )  # fmt: skip
     points = points + moved / np.where(weights > 0, weights, 1.0)[:, None]
@@ -76,6 +76,7 @@ def _look(
     points: NDArray[np.float64],
     directions: NDArray[np.float64],
     depth_m: NDArray[np.float32],
+    sigma_m: NDArray[np.float32],
     edge: float,
     R: NDArray[np.float64],
     t: NDArray[np.float64],
@@ -115,7 +116,7 @@ def _look(
             )
             if ray[0] * directions[n, 0] + ray[1] * directions[n, 1] + ray[2] * directions[n, 2] <= 0:
                 continue  # the other side
-            sigma = _A + _B * (depth - _NEAREST) ** 2
+            sigma = sigma_at(sigma_m, line, column, depth)
             w = 1.0 / (sigma * sigma)
             step = w * beyond / z
             for i in range(3):
@@ -144,6 +145,6 @@ def look_reference(
         depth = np.where(inside, depth_m[line, column], 0)
         beyond, reach = depth - z, _REACH_M + _REACH_PER_M * z**2
         shown = (depth > 0) & (np.abs(beyond) <= reach) & ((ray * directions).sum(axis=1) > 0)
-        weight = np.where(shown, 1.0 / depth_sigma(depth_m)[line, column].astype(np.float64) ** 2, 0.0)
+        weight = np.where(shown, 1.0 / sigma_image(posed.frame)[line, column].astype(np.float64) ** 2, 0.0)
         offset = np.where(shown, weight * beyond / z, 0.0)[:, None] * ray
         return offset, weight, (depth > 0) & (beyond > reach)

@@ -21,12 +21,13 @@ def build_occupancy(
     origin: NDArray[np.float64] | None = None,
     blocks: tuple[int, int, int] | None = None,
     progress: Callable[[int], None] = lambda done: None,
+    least_scale: float = 0.0,
 ) -> Occupancy:
     """The occupancy map of N Gaussians with features (N, D) and of depth images.
 
     origin: (3,) lower corner of voxel (0, 0, 0); the world's origin by default.  blocks: only the blocks (0, 0, 0) …
     blocks - 1 are made, and all of them; those that anything touches by default.  progress: called with the number of
-    frames looked at.
+    frames looked at.  least_scale: metres that Gaussians are widened to, should they be finer than the lattice shows.
     """
     origin = np.zeros(3) if origin is None else np.asarray(origin, np.float64)
     size = splatting.voxel_size
@@ -34,7 +35,7 @@ def build_occupancy(
     if blocks is not None:
         shape = (BLOCK * blocks[0], BLOCK * blocks[1], BLOCK * blocks[2])
         within = pack(np.stack(np.unravel_index(np.arange(np.prod(blocks)), blocks), axis=1))
-    bins = splat.bin_gaussians(gaussians, origin, splatting, shape)
+    bins = splat.bin_gaussians(gaussians, origin, splatting, shape, least_scale)
 
     evidence = carve.Evidence(origin, size, carving, within)
     for done, posed in enumerate(frames, start=1):

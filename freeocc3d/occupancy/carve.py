@@ -28,7 +28,8 @@ class Options:
     """A voxel is seen through when the depth behind its centre is greater by this many voxel edges (and by the
     depth's uncertainty)."""
     noise: float = 0.0019
-    """Growth of a depth's standard deviation with its square, 1/m; three of them are added to the margin."""
+    """Growth of a depth's standard deviation with its square, 1/m, where nothing else says how great it is; three of
+    them are added to the margin."""
     hit: float = 0.85
     """Log-odds that a depth image which ends in a voxel adds: OctoMap's, a probability of 0.7."""
     miss: float = 0.4
@@ -129,7 +130,10 @@ class Evidence:
         measured = reach[np.ix_(rows, columns)]
         v, u = np.nonzero(measured)
         pixels = np.stack((columns[u], rows[v]), axis=1)
-        z = measured[v, u] + 0.5 * self.voxel_size + 3 * self.options.noise * measured[v, u] ** 2
+        spread = 3 * self.options.noise * measured[v, u] ** 2
+        if frame.depth_sigma_m is not None:
+            spread = 3 * frame.depth_sigma_m[rows[v], columns[u]]
+        z = measured[v, u] + 0.5 * self.voxel_size + spread
         points = transform(T_world_cam, back_project(pixels, z.astype(np.float32), camera).astype(np.float64))
         return blocks_along_rays(points, T_world_cam[:3, 3], self.origin, self.voxel_size)
 
@@ -173,6 +177,7 @@ class Evidence:
             (T_cam_world[:3, :3] @ self.origin + T_cam_world[:3, 3]).astype(np.float32),
             np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32),
             frame.depth_m,
+            np.zeros((0, 0), np.float32) if frame.depth_sigma_m is None else frame.depth_sigma_m,
             np.float32(self.voxel_size),
             np.float32(self.options.margin * self.voxel_size),
             np.float32(3 * self.options.noise),
@@ -190,6 +195,7 @@ def _count(
     t: NDArray[np.float32],
     camera: NDArray[np.float32],
     depth_m: NDArray[np.float32],
+    sigma_m: NDArray[np.float32],
     voxel_size: np.float32,
     margin: np.float32,
     noise: np.float32,
@@ -218,7 +224,8 @@ def _count(
             depth = depth_m[row, column]
             if depth == 0:
                 continue
-            far = margin + noise * z * z
+            spread = np.float32(3) * sigma_m[row, column] if len(sigma_m) else noise * z * z
+            far = margin + spread
             if abs(depth) - z > far:
                 du, dv = int(fx * half / z), int(fy * half / z)
                 if (
@@ -228,7 +235,7 @@ def _count(
                     and _beyond(depth_m, row + dv, column, z + far)
                 ):
                     free[row_of_block, voxel] += change
-            elif depth > 0 and abs(depth - z) <= half + noise * z * z:
+            elif depth > 0 and abs(depth - z) <= half + spread:
                 hits[row_of_block, voxel] += change
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,9 +12,11 @@ from ..types import Gaussians
 from .splat import Options
 
 
-def contributions(gaussians: Gaussians, points: NDArray[np.float64], options: Options) -> NDArray[np.float64]:
+def contributions(
+    gaussians: Gaussians, points: NDArray[np.float64], options: Options, least_scale: float = 0.0
+) -> NDArray[np.float64]:
     """(P, N) c_k at voxels whose centres are the (P, 3) world points; cutoff included, except for "released", whose
-    neighbourhood is a box of the lattice: there it is all space."""
+    neighbourhood is a box of the lattice: there it is all space. least_scale: s_min, which those two do without."""
     if options.projection == "integrated":
         return _masses(gaussians, points, options)
     o = gaussians.opacities.astype(np.float64)
@@ -21,14 +25,18 @@ def contributions(gaussians: Gaussians, points: NDArray[np.float64], options: Op
         offset = points[:, None] - gaussians.means.astype(np.float64)[None]
         squared = ((np.einsum("pni,nij->pnj", offset, R) * gaussians.scales) ** 2).sum(axis=2)
         return np.asarray(1 - np.exp(-o * np.exp(-0.5 * squared)))
-    squared = _squared_distances(gaussians, points)
-    phi = np.where(squared <= options.cutoff**2, np.exp(-0.5 * squared), 0.0)
+    wide = replace(gaussians, scales=np.maximum(gaussians.scales, least_scale))
+    squared = _squared_distances(wide, points)
+    volumes = (g.scales.astype(np.float64).prod(axis=1) for g in (gaussians, wide))
+    phi = np.where(squared <= options.cutoff**2, np.exp(-0.5 * squared), 0.0) * np.divide(*volumes) ** (2 / 3)
     return phi if options.projection == "probabilistic" else np.asarray(1 - np.exp(-o * phi))
 
 
-def probability(gaussians: Gaussians, points: NDArray[np.float64], options: Options) -> NDArray[np.float64]:
+def probability(
+    gaussians: Gaussians, points: NDArray[np.float64], options: Options, least_scale: float = 0.0
+) -> NDArray[np.float64]:
     """(P,) alpha of voxels, given by their centres: equation (B)."""
-    return np.asarray(1.0 - np.prod(1.0 - contributions(gaussians, points, options), axis=1))
+    return np.asarray(1.0 - np.prod(1.0 - contributions(gaussians, points, options, least_scale), axis=1))
 
 
 def posterior_mean(

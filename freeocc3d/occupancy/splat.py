@@ -21,6 +21,11 @@ H(x) is all k with a Mahalanobis distance of x to G_k of at most the cutoff; wha
 exp(-cutoff^2 / 2) each, 0.011 at the default of 3. Integrated: all whose bounding box at the cutoff touches V(x); what
 that leaves out is less than 6 Phi(-cutoff) of a Gaussian's mass, 0.008. Released: all whose voxel is, along each axis,
 at most ceil(cutoff s_max / voxel) voxels away.
+
+Gaussians that are finer than the lattice can show would fall between the voxels' centres. A deviation s_ki below a
+given s_min becomes s_min, and phi_k is multiplied by (prod_i s_ki / max(s_ki, s_min))^(2/3), the areas' ratio, so that
+what a surface of Gaussians adds up to stays as it is. Such a limit is Mip-Splatting's (Z. Yu et al., CVPR 2024, Sec.
+5.1); that its weight goes with the area is due to occupancy, whose Gaussians stand side by side on surfaces.
 """
 
 from __future__ import annotations
@@ -86,11 +91,12 @@ class Bins:
     """Gaussians sorted into the voxel blocks that their neighbourhoods touch.
 
     packed: (B,) ascending packed block keys.  start: (B + 1,) and gaussian: (P,) list block b's Gaussians as
-    ``gaussian[start[b]:start[b + 1]]``.  means: (N, 3) float32 in voxels, relative to the lattice's origin.
-    form: (N, 6) float32 upper triangle of a matrix: Sigma^-1 in voxels^-2; integrated: Sigma in voxels^2; released:
-    Sigma in metres^2, times what turns voxels into metres twice.  lo, hi: (N, 3) int32 first and last voxel of the
-    neighbourhood's box.  opacities: (N,) float32.  log_weight: (N,) float32 log of the part of w_k that is the same at
-    all voxels, up to a common constant.  mode, squared_cutoff: of the projection.  device: where they run.
+    ``gaussian[start[b]:start[b + 1]]``.  means: (N, 3) float32 in voxels, relative to the lattice's origin. form: (N,
+    6) float32 upper triangle of a matrix: Sigma^-1 in voxels^-2; integrated: Sigma in voxels^2; released: Sigma in
+    metres^2, times what turns voxels into metres twice.  lo, hi: (N, 3) int32 first and last voxel of the
+    neighbourhood's box.  opacities: (N,) float32.  share: (N,) float32, what phi is multiplied by.  log_weight: (N,)
+    float32 log of the part of w_k that is the same at all voxels, up to a common constant.  mode, squared_cutoff: of
+    the projection.  device: where they run.
     """
 
     packed: NDArray[np.int64]
@@ -101,6 +107,7 @@ class Bins:
     lo: NDArray[np.int32]
     hi: NDArray[np.int32]
     opacities: NDArray[np.float32]
+    share: NDArray[np.float32]
     log_weight: NDArray[np.float32]
     mode: int
     squared_cutoff: np.float32
@@ -120,14 +127,17 @@ def bin_gaussians(
     origin: NDArray[np.float64],
     options: Options,
     shape: tuple[int, int, int] | None = None,
+    least_scale: float = 0.0,
 ) -> Bins:
     """Sort Gaussians into blocks of the lattice whose voxel (0, 0, 0) has its lower corner at ``origin``.
 
     shape: only the voxels (0, 0, 0) … shape - 1 are evaluated, however far a Gaussian reaches; all by default.
+    least_scale: s_min, metres.
     """
     mode = _MODES[options.projection]
+    scales, share = widened(gaussians.scales, least_scale, options)
     means, form, log_weight, lo, hi = _prepared(
-        gaussians.means, gaussians.scales, gaussians.quats_wxyz, gaussians.opacities, origin, options.voxel_size,
+        gaussians.means, scales, gaussians.quats_wxyz, gaussians.opacities, origin, options.voxel_size,
         options.cutoff, mode,
     )  # fmt: skip
     if shape is not None:
@@ -135,9 +145,20 @@ def bin_gaussians(
     packed, start, gaussian = _sort_by_block(lo, hi)
     squared_cutoff = np.float32(np.inf if mode == _RELEASED else options.cutoff**2)
     return Bins(
-        packed, start, gaussian, means, form, lo, hi, gaussians.opacities, log_weight, mode, squared_cutoff,
-        options.device,
+        packed, start, gaussian, means, form, lo, hi, gaussians.opacities, share, log_weight, mode,
+        squared_cutoff, options.device,
     )  # fmt: skip
+
+
+def widened(
+    scales: NDArray[np.float32], least_scale: float, options: Options
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(N, 3) deviations of at least s_min, metres, and the (N,) shares that the phi are multiplied by. A mass within
+    a voxel needs no such thing, nor does what is dilated."""
+    if least_scale == 0 or _MODES[options.projection] not in (_PROBABILISTIC, _POISSON):
+        return scales, np.ones(len(scales), np.float32)
+    wide = np.maximum(scales, np.float32(least_scale))
+    return wide, np.asarray((scales / wide).prod(axis=1) ** np.float32(2 / 3), np.float32)
 
 
 def probability(bins: Bins, keys: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -149,7 +170,7 @@ def probability(bins: Bins, keys: NDArray[np.int32]) -> NDArray[np.float32]:
     listed = keys, bins.start, bins.gaussian, bins.means, bins.form, bins.lo, bins.hi
     if bins.mode == _INTEGRATED:
         return _probability_by_mass(*listed)
-    return _probability(*listed, bins.opacities, bins.squared_cutoff, bins.mode != _PROBABILISTIC)
+    return _probability(*listed, bins.opacities, bins.share, bins.squared_cutoff, bins.mode != _PROBABILISTIC)
 
 
 def posterior_mean(
@@ -299,6 +320,7 @@ def _probability(
     lo: NDArray[np.int32],
     hi: NDArray[np.int32],
     opacities: NDArray[np.float32],
+    share: NDArray[np.float32],
     squared_cutoff: np.float32,
     poisson: bool,
 ) -> NDArray[np.float32]:
@@ -321,7 +343,7 @@ def _probability(
                         dz = np.float32(z0 + k) + half - means[g, 2]
                         squared = constant + dz * (linear + pzz * dz)
                         if squared <= squared_cutoff:
-                            phi = math.exp(-half * squared)
+                            phi = share[g] * math.exp(-half * squared)
                             left = math.exp(-opacities[g] * phi) if poisson else one - phi  # (A)
                             survival[(i * BLOCK + j) * BLOCK + k] *= left
         for voxel in range(BLOCK**3):

@@ -39,9 +39,9 @@ def probability(bins: Bins, keys: NDArray[np.int32], poisson: bool) -> NDArray[n
     """As ``splat.probability``."""
     device = torch.device(bins.device)
     logarithms = torch.zeros(len(keys) * BLOCK**3, dtype=torch.float32, device=device)
-    opacities = torch.from_numpy(bins.opacities).to(device)
+    opacities, share = (torch.from_numpy(array).to(device) for array in (bins.opacities, bins.share))
     for gaussian, voxel, squared in _pairs(bins, keys, device):
-        phi = torch.exp(-0.5 * squared)
+        phi = share[gaussian] * torch.exp(-0.5 * squared)
         left = -opacities[gaussian] * phi if poisson else torch.log1p(-phi)  # (A)
         logarithms.index_add_(0, voxel, left)
     return (-torch.expm1(logarithms)).reshape(-1, BLOCK**3).cpu().numpy()  # (B)

@@ -21,6 +21,7 @@ from .stereo.scan_depth import Scan, StereoDepth
 from .stereo.triangulation import triangulated
 
 _FARTHEST = 2000.0
+_SUREST_M = 5e-4  # a standard deviation of 0 would weigh infinitely
 _LEAST_COVERED = 0.05  # share of the pixels with a depth, or a frame shows nothing
 
 
@@ -54,7 +55,9 @@ class GivenTracker(Tracker):
     def completed(self, frame: Frame) -> Frame:
         frame = self.as_pinhole(frame)
         found = None if self._depth is None else self._depth.depth(frame.index)
-        return frame if found is None else replace(frame, depth_m=found[0])
+        if found is None:
+            return frame
+        return replace(frame, depth_m=found[0], depth_sigma_m=np.maximum(found[1], np.float32(_SUREST_M)))
 
     def track(self, frame: Frame) -> Tracked:
         given = self.T_world_cam[frame.index]
