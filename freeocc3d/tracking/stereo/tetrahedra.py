@@ -9,7 +9,10 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-BEHIND = 3.0  # standard deviations behind a point, where there is matter
+BEHIND = 3.0
+"""Standard deviations behind a point, where there is matter."""
+
+_CERTAIN = 7.0  # standard deviations before a point, where there is none
 
 
 @dataclass(frozen=True)
@@ -58,110 +61,113 @@ def evidence(
     around = (order // 4).astype(np.int32)
     first = np.searchsorted(space.corners.reshape(-1)[order], np.arange(len(space.vertices) + 1))
     found = Evidence(np.zeros(count + 1), np.zeros(count + 1), np.zeros((count, 4)))
-    centred = space.vertices - space.vertices.mean(axis=0)
+    vertices = space.vertices - space.vertices.mean(axis=0)
     _march(
-        centred, space.corners, space.beside, first, around, ray_point, ray_camera, sigma_m,
-        found.free, found.full, found.facets,
+        vertices, space.corners, space.beside, planes(vertices, space.corners), first, around, ray_point, ray_camera,
+        sigma_m, found.free, found.full, found.facets,
     )  # fmt: skip
     return found
 
 
 @njit(cache=True, nogil=True)
-def _march(vertices, corners, beside, first, around, ray_point, ray_camera, sigma_m, free, full, facets):  # type: ignore[no-untyped-def]
-    way = np.empty(3)
-    for ray in range(len(ray_point)):
-        point, camera = ray_point[ray], ray_camera[ray]
-        length = 0.0
-        for c in range(3):
-            way[c] = vertices[camera, c] - vertices[point, c]
-            length += way[c] ** 2
-        length = np.sqrt(length)
-        sigma = sigma_m[point]
-        way /= length
-        last = _walk(vertices, corners, beside, first, around, point, way, length, camera, sigma, facets)
-        free[last] += 1.0
-        way *= -1.0
-        last = _walk(vertices, corners, beside, first, around, point, way, BEHIND * sigma, -1, sigma, facets)
-        full[last] += 1.0
-
-
-@njit(cache=True, nogil=True)
-def _walk(vertices, corners, beside, first, around, point, way, length, camera, sigma, facets):  # type: ignore[no-untyped-def]
-    """From a vertex through cells until one holds the ``camera`` (-1: it is behind), or the ``length`` is gone; returns
-    the last one. Prices go to the facets that are crossed, as seen from the camera's side."""
-    outside = len(corners)
-    here, out = _first_cell(vertices, corners, first, around, point, way)
-    for _ in range(outside):  # no ray meets a tetrahedron twice
-        if here == outside:
-            break
-        for k in range(4):
-            if corners[here, k] == camera:
-                return here
-        distance = _distance(vertices, corners, here, out, point, way)[0]
-        if distance >= length:
-            break
-        after, back = beside[here, out], -1
-        if after < outside:
-            for k in range(4):
-                if beside[after, k] == here:
-                    back = k
-        price = 1.0 - np.exp(-0.5 * (distance / sigma) ** 2)
-        if camera < 0:
-            facets[here, out] += price
-        elif after < outside:
-            facets[after, back] += price
-        here = after
-        if here < outside:
-            out = _way_out(vertices, corners, here, back, point, way)
-    return here
-
-
-@njit(cache=True, nogil=True)
-def _way_out(vertices, corners, cell, entered, point, way):  # type: ignore[no-untyped-def]
-    """By which facet a way leaves a tetrahedron: the nearest of those that it does not enter by. That there is one even
-    where rounding says that the way misses the tetrahedron is why sides of edges are not compared instead."""
-    out, nearest = (entered + 1) & 3, np.inf
-    for facet in range(4):
-        if facet != entered:
-            distance, leaving = _distance(vertices, corners, cell, facet, point, way)
-            if leaving > 0.0 and distance < nearest:
-                out, nearest = facet, distance
+def planes(vertices, corners):  # type: ignore[no-untyped-def]
+    """(T, 4, 4) of each facet (opposite a corner) its unit normal, which points outwards, and its offset along it."""
+    out = np.empty((*corners.shape, 4))
+    for cell in range(len(corners)):
+        for facet in range(4):
+            a = vertices[corners[cell, (facet + 1) & 3]]
+            u, v = vertices[corners[cell, (facet + 2) & 3]] - a, vertices[corners[cell, (facet + 3) & 3]] - a
+            normal = np.cross(u, v)
+            normal /= max(np.sqrt((normal * normal).sum()), 1e-300)
+            if (normal * (vertices[corners[cell, facet]] - a)).sum() > 0.0:
+                normal = -normal
+            out[cell, facet, :3] = normal
+            out[cell, facet, 3] = (normal * a).sum()
     return out
 
 
 @njit(cache=True, nogil=True)
-def _first_cell(vertices, corners, first, around, point, way):  # type: ignore[no-untyped-def]
+def _march(vertices, corners, beside, facets, first, around, ray_point, ray_camera, sigma_m, free, full, prices):  # type: ignore[no-untyped-def]
+    way = np.empty(3)
+    for ray in range(len(ray_point)):
+        point, camera = ray_point[ray], ray_camera[ray]
+        start, sigma = vertices[point], sigma_m[point]
+        way[:] = vertices[camera] - start
+        length = np.sqrt((way * way).sum())
+        way /= length
+        cell, out = _first_cell(corners, facets, first, around, point, way)
+        free[_walk(corners, beside, facets, cell, out, start, way, length, camera, sigma, prices)] += 1.0
+        way *= -1.0
+        cell, out = _first_cell(corners, facets, first, around, point, way)
+        full[_walk(corners, beside, facets, cell, out, start, way, BEHIND * sigma, -1, sigma, prices)] += 1.0
+
+
+@njit(cache=True, nogil=True)
+def _walk(corners, beside, facets, cell, out, start, way, length, camera, sigma, prices):  # type: ignore[no-untyped-def]
+    """From a corner of a cell out by the facet opposite and on, until a cell holds the ``camera`` (-1: it is behind) or
+    the ``length`` is gone; returns that cell. Prices go to the facets that are crossed, seen from the camera's side."""
+    outside = len(corners)
+    distance = _distance(facets, cell, out, start, way) if cell < outside else 0.0
+    for _ in range(outside):  # no ray meets a tetrahedron twice
+        if cell == outside or distance >= length:
+            break
+        if camera in (corners[cell, 0], corners[cell, 1], corners[cell, 2], corners[cell, 3]):
+            break
+        after, back = beside[cell, out], 0
+        price = 1.0 - np.exp(-0.5 * (distance / sigma) ** 2) if distance < _CERTAIN * sigma else 1.0
+        if camera < 0:
+            prices[cell, out] += price
+        if after < outside:
+            while beside[after, back] != cell:
+                back += 1
+            if camera >= 0:
+                prices[after, back] += price
+            out, distance = _way_out(facets, after, back, start, way)
+        cell = after
+    return cell
+
+
+@njit(cache=True, nogil=True)
+def _way_out(facets, cell, entered, start, way):  # type: ignore[no-untyped-def]
+    """By which facet a way leaves a tetrahedron, and how far away: the nearest of those that it does not enter by. That
+    there is one even where rounding has the way miss the tetrahedron is why sides of edges are not compared instead."""
+    out, nearest = (entered + 1) & 3, np.inf
+    for facet in range(4):
+        if facet != entered and _leaving(facets, cell, facet, way) > 0.0:
+            distance = _distance(facets, cell, facet, start, way)
+            if distance < nearest:
+                out, nearest = facet, distance
+    return out, nearest
+
+
+@njit(cache=True, nogil=True)
+def _first_cell(corners, facets, first, around, point, way):  # type: ignore[no-untyped-def]
     """The cell around a vertex into which a way goes, and which of its corners the vertex is. Of a way along a facet
     rounding may say that it leaves the tetrahedra on both sides: where it does so least, it goes."""
-    best, which, least = len(corners), -1, 1e-9
+    best, which, least = len(corners), 0, 1e-9
     for row in range(first[point], first[point + 1]):
         cell = around[row]
-        worst, own = -np.inf, -1
+        worst, own = -np.inf, 0
         for k in range(4):
             if corners[cell, k] == point:
                 own = k
             else:
-                worst = max(worst, _distance(vertices, corners, cell, k, point, way)[1])
+                worst = max(worst, _leaving(facets, cell, k, way))
         if worst < least:
             best, which, least = cell, own, worst
     return best, which
 
 
 @njit(cache=True, nogil=True)
-def _distance(vertices, corners, cell, facet, point, way):  # type: ignore[no-untyped-def]
-    """How far the way from a vertex is to the plane of a facet (opposite that corner), and the sine by which it leaves
-    the tetrahedron there, negative if it enters."""
-    a, b, c = (vertices[corners[cell, (facet + 1) & 3]], vertices[corners[cell, (facet + 2) & 3]],
-               vertices[corners[cell, (facet + 3) & 3]])  # fmt: skip
-    apex, start = vertices[corners[cell, facet]], vertices[point]
-    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    size = np.sqrt(nx * nx + ny * ny + nz * nz)
-    if (apex[0] - a[0]) * nx + (apex[1] - a[1]) * ny + (apex[2] - a[2]) * nz > 0.0:
-        size = -size  # normals point outwards
-    facing = way[0] * nx + way[1] * ny + way[2] * nz
-    if size == 0.0 or facing == 0.0:
-        return np.inf, 0.0
-    height = (a[0] - start[0]) * nx + (a[1] - start[1]) * ny + (a[2] - start[2]) * nz
-    return height / facing, facing / size
+def _leaving(facets, cell, facet, way):  # type: ignore[no-untyped-def]
+    """The sine by which a way leaves a tetrahedron through a facet's plane; negative if it enters."""
+    return facets[cell, facet, 0] * way[0] + facets[cell, facet, 1] * way[1] + facets[cell, facet, 2] * way[2]
+
+
+@njit(cache=True, nogil=True)
+def _distance(facets, cell, facet, start, way):  # type: ignore[no-untyped-def]
+    """How far away a way that leaves by a facet meets it."""
+    height = facets[cell, facet, 3]  # slices are avoided: counting references to them takes longer than this
+    for k in range(3):
+        height -= facets[cell, facet, k] * start[k]
+    return height / _leaving(facets, cell, facet, way)
