@@ -9,7 +9,7 @@ CVPR 2009.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -35,8 +35,19 @@ _MOST_SQUARES = 1 << 24  # a plane of more is some stray points far apart
 _TURNS_DEG = (-0.5, -0.25, 0.0, 0.25, 0.5)  # walls' directions about the steepest one
 _TILT = 0.003  # radians: standard deviation of a plane's normal before its points are asked
 _DEPENDENT = 50.0  # points per independent measurement
-_BEHIND = 0.04  # share of the points that may lie behind the outermost wall
+_BEHIND = 0.01  # share of the points that may lie behind the outermost wall
 _OUTERMOST = 60  # squares that it must hold
+
+
+@dataclass(frozen=True)
+class _Bounded:
+    """A plane where its points support it; the squares in which it is not seen through; how many hold points; which
+    points it takes."""
+
+    plane: Plane
+    free: NDArray[np.bool_]
+    held: int
+    taken: NDArray[np.bool_]
 
 
 def layout(points: Points, centres: NDArray[np.float64], normals: NDArray[np.float64]) -> Layout:
@@ -48,7 +59,7 @@ def layout(points: Points, centres: NDArray[np.float64], normals: NDArray[np.flo
     if len(points.points) < _LEAST_POINTS or not len(normals):
         return Layout(())
     axes = directions(points, normals)
-    return Layout(_outermost(_layers(points, centres, axes), points, centres, axes))
+    return Layout(_outermost(points, centres, axes) + _layers(points, centres, axes))
 
 
 def directions(points: Points, normals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -126,8 +137,8 @@ def _fitted(X: NDArray[np.float64], normal: NDArray[np.float64], offset: float, 
     return normal
 
 
-def _layers(points: Points, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[tuple[Plane, Plane]]:
-    """Planes, those that hold most points first, each as its points support it and as far as nothing speaks against it.
+def _layers(points: Points, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
+    """Planes, those that hold most points first; what one holds the next ones do without.
 
     Source: P. Hough, Method and Means for Recognizing Complex Patterns, 1962.
     """
@@ -146,21 +157,22 @@ def _layers(points: Points, centres: NDArray[np.float64], axes: NDArray[np.float
     layers = int(layer.max()) + 2
     count = np.stack([np.bincount(column, minlength=layers) for column in layer.T]).astype(float)
     left = np.ones(len(X), bool)
-    found: list[tuple[Plane, Plane]] = []
+    found: list[Plane] = []
     while len(found) < _MOST_PLANES:
         thick = count[:, :-1] + count[:, 1:]
         row, at = np.unravel_index(int(np.argmax(thick)), thick.shape)
         if thick[row, at] < _LEAST_POINTS:
             break
-        count[group == group[row], max(at - 1, 0) : at + 2] = -np.inf  # never the same again
         plane = _tilted(
             X, points.sigma_m, left, normals[row], lowest + (at + 1) * thickness + mean @ normals[row], cell
         )
         bounded = None if plane is None else _bounded(points, centres, *plane)
+        alike = group == group[row] if bounded is not None else np.arange(len(group)) == row
+        count[alike, max(at - 1, 0) : at + 2] = -np.inf  # never the same again
         if bounded is None:
             continue
-        found.append(bounded[0])
-        gone = np.flatnonzero(left & bounded[1])
+        found.append(bounded.plane)
+        gone = np.flatnonzero(left & bounded.taken)
         for k in range(len(normals)):
             count[k] -= np.bincount(layer[gone, k], minlength=layers)
         left[gone] = False
@@ -192,8 +204,8 @@ def _tilted(
 
 def _bounded(
     points: Points, centres: NDArray[np.float64], normal: NDArray[np.float64], offset: float
-) -> tuple[tuple[Plane, Plane], NDArray[np.bool_]] | None:
-    """The plane where its points support it, and where nothing is seen through it; which points it takes."""
+) -> _Bounded | None:
+    """The plane where its points support it; None if these are few or scattered."""
     X, cell = points.points, points.cell_m
     square = _SQUARE * cell
     height = X @ normal - offset
@@ -243,8 +255,8 @@ def _bounded(
     taken = np.zeros(len(X), bool)
     rows = np.flatnonzero(near)[inside]
     taken[rows] = cv2.dilate(held.astype(np.uint8), around)[tuple(index[inside].T)] > 0
-    bounded = Plane(normal, offset, axes, corner, square, support, False)
-    return (bounded, Plane(normal, offset, axes, corner, square, ~free | held, bool(held.sum() >= _OUTERMOST))), taken
+    plane = Plane(normal, offset, axes, corner, square, support, outermost=False)
+    return _Bounded(plane, ~free | held, int(np.count_nonzero(held)), taken)
 
 
 def _pieces(held: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -271,24 +283,22 @@ def _disc(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
 
 
-def _outermost(
-    layers: Sequence[tuple[Plane, Plane]], points: Points, centres: NDArray[np.float64], axes: NDArray[np.float64]
-) -> list[Plane]:
-    """The planes, of which those farthest out go on wherever they are not seen through: there is nothing behind."""
-    middle, planes = centres.mean(axis=0), [bounded for bounded, _ in layers]
-    for axis in axes:
-        for sign in (1.0, -1.0):
-            best, farthest = None, 0.0
-            for row, (_, whole) in enumerate(layers):
-                alike = float(whole.normal @ axis)
-                if abs(alike) < 0.99 or not whole.outermost:
-                    continue
-                out = sign * np.sign(alike) * (whole.offset - float(whole.normal @ middle))
-                side = np.sign(whole.offset - float(whole.normal @ middle))
-                behind = np.mean((points.points @ whole.normal - whole.offset) * side > 3.0 * points.cell_m)
-                outside = np.mean((centres @ whole.normal - whole.offset) * side > 0)
-                if out > farthest and behind < _BEHIND and outside < 0.01:
-                    best, farthest = row, out
-            if best is not None:
-                planes[best] = layers[best][1]
+def _outermost(points: Points, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
+    """The floor, the ceiling and the walls that have hardly anything behind them: of the layers of which that is true,
+    those that hold most. They go on wherever they are not seen through."""
+    X, cell = points.points, points.cell_m
+    everything, planes = np.ones(len(X), bool), []
+    for outwards in np.concatenate((axes, -axes)):
+        height = X @ outwards
+        lowest = float(height.min())
+        count = np.bincount(_layer(height, _LAYER * cell)).astype(float)
+        count[:-1] += count[1:]
+        offsets = lowest + (np.arange(len(count)) + 1) * _LAYER * cell
+        behind = 1.0 - np.searchsorted(np.sort(height), offsets + _SEEN_THROUGH * cell) / len(X)
+        count[(behind > _BEHIND) | (offsets < (centres @ outwards).max())] = 0.0
+        best = int(np.argmax(count))
+        plane = _tilted(X, points.sigma_m, everything, outwards, offsets[best], cell) if count[best] else None
+        bounded = None if plane is None else _bounded(points, centres, *plane)
+        if bounded is not None and bounded.held >= _OUTERMOST:
+            planes.append(replace(bounded.plane, support=bounded.free, outermost=True))
     return planes

@@ -107,12 +107,8 @@ def _nearest(origin, directions, times, normals, offsets, axes, corners, squares
             if not (_NEAR * times[ray] < t < far[k] * times[ray]) or t <= 0.0 or t >= best:
                 continue
             px, py, pz = origin[0] + t * x, origin[1] + t * y, origin[2] + t * z
-            u = int(
-                np.floor((px * axes[k, 0, 0] + py * axes[k, 0, 1] + pz * axes[k, 0, 2] - corners[k, 0]) / squares[k])
-            )
-            v = int(
-                np.floor((px * axes[k, 1, 0] + py * axes[k, 1, 1] + pz * axes[k, 1, 2] - corners[k, 1]) / squares[k])
-            )
+            u = axes[k, 0, 0] * px + axes[k, 0, 1] * py + axes[k, 0, 2] * pz - corners[k, 0]
+            v = axes[k, 1, 0] * px + axes[k, 1, 1] * py + axes[k, 1, 2] * pz - corners[k, 1]
             i, j = int(np.floor(u / squares[k])), int(np.floor(v / squares[k]))
             if 0 <= i < shapes[k, 0] and 0 <= j < shapes[k, 1] and support[starts[k] + i * shapes[k, 1] + j]:
                 best = t

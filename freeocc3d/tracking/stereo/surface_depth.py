@@ -21,6 +21,7 @@ def surface_depth(surface: Surface, layout: Layout, camera: Intrinsics, T_world_
     directions = np.moveaxis(rays(camera).numpy().astype(np.float64), 0, -1) @ T_world_cam[:3, :3].T
     met = surface.met(origin, directions)
     times = met.times.astype(np.float64)
+    times[times < surface.cell_m] = 0.0  # a surface through the camera itself
     measured = (times > 0) & (met.edge_m < _MEASURED * surface.cell_m)
     depth = np.where(measured, times, 0.0)
     depth[~measured] = layout.near(origin, directions[~measured], times[~measured])
