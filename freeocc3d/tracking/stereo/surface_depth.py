@@ -12,19 +12,25 @@ from .photo_consistency import rays
 from .watertight import Surface
 
 _MEASURED = 6.0  # cells: triangles with longer edges span what nothing was measured of
-_SUREST, _LAYOUT_SIGMA = 1.0 / 300.0, 0.01  # standard deviations over depth
+_SPANNED, _FACING = 40.0, 0.4  # cells: no gap is spanned by longer edges, nor by what is seen at a cosine below that
+_SUREST, _LAYOUT_SIGMA, _SPANNED_SIGMA = 0.005, 0.01, 0.04  # standard deviations over depth
 
 
 def surface_depth(surface: Surface, layout: Layout, camera: Intrinsics, T_world_cam: NDArray[np.float64]) -> DepthImage:
-    """The surface as a camera sees it, where it was measured; where it only spans a gap, the layout's plane near it."""
+    """The surface as a camera sees it, where it was measured; where it only spans a gap, the layout's plane near it, or
+    else what spans the gap, if that is small."""
     origin = T_world_cam[:3, 3]
     directions = np.moveaxis(rays(camera).numpy().astype(np.float64), 0, -1) @ T_world_cam[:3, :3].T
     met = surface.met(origin, directions)
     times = met.times.astype(np.float64)
     times[times < surface.cell_m] = 0.0  # a surface through the camera itself
     measured = (times > 0) & (met.edge_m < _MEASURED * surface.cell_m)
-    depth = np.where(measured, times, 0.0)
-    depth[~measured] = layout.near(origin, directions[~measured], times[~measured])
+    spanned = (times > 0) & (met.edge_m < _SPANNED * surface.cell_m) & (met.cosine > _FACING)
+    depth = np.where(measured | spanned, times, 0.0)
+    plane = np.zeros_like(depth)
+    plane[~measured] = layout.near(origin, directions[~measured], times[~measured])
+    depth = np.where(plane > 0, plane, depth)
     inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
-    sigma = np.where(measured, np.maximum(met.sigma_m * inverse, _SUREST), _LAYOUT_SIGMA) * inverse
+    sigma = np.where(plane > 0, _LAYOUT_SIGMA, np.maximum(met.sigma_m * inverse, _SUREST))
+    sigma = np.where(measured | (plane > 0), sigma, _SPANNED_SIGMA) * inverse
     return DepthImage(inverse.astype(np.float32), sigma.astype(np.float32), camera, T_world_cam)

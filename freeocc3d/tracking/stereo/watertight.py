@@ -29,12 +29,13 @@ _LARGEST = (1 << 30) - 1  # the solver adds two capacities in 32 bits
 
 @dataclass(frozen=True)
 class Hits:
-    """Per ray: how many times its direction reaches the surface (0 = never), the longest edge of the triangle that is
-    met there, metres, and the median of the standard deviations of its corners."""
+    """Per ray: how many times its direction reaches the surface (0 = never); of the triangle that is met there, the
+    longest edge and the median of the corners' standard deviations, metres, and the cosine between normal and ray."""
 
     times: NDArray[np.float32]
     edge_m: NDArray[np.float32]
     sigma_m: NDArray[np.float32]
+    cosine: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,12 @@ class Surface:
         hit = np.isfinite(times)
         triangle = np.where(hit, found["primitive_ids"].numpy(), 0).astype(np.int64)
         if not hit.any():
-            return Hits(*(np.zeros_like(times) for _ in range(3)))
+            return Hits(*(np.zeros_like(times) for _ in range(4)))
         edge_m, sigma_m = self._of_triangles
-        return Hits(
-            np.where(hit, times, 0.0), np.where(hit, edge_m[triangle], 0.0), np.where(hit, sigma_m[triangle], 0.0)
-        )
+        normals = found["primitive_normals"].numpy()
+        lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(directions, axis=-1)
+        cosine = np.abs((normals * directions).sum(axis=-1)) / np.maximum(lengths, 1e-12)
+        return Hits(*(np.where(hit, a, 0.0) for a in (times, edge_m[triangle], sigma_m[triangle], cosine)))
 
     def normals(self) -> NDArray[np.float64]:
         """(N, 3) of the triangles whose corners were measured side by side."""
