@@ -32,7 +32,7 @@ from .multi_view import measured
 from .neighbours import APART, Chosen, neighbours
 from .photo_consistency import View
 from .points import Points, confirmed_points, merged
-from .surface_depth import surface_depth
+from .surface_depth import own_where_alike, surface_depth
 from .watertight import Surface, watertight
 
 __all__ = ["Options", "Scan", "StereoDepth", "View", "depth_map"]
@@ -242,6 +242,7 @@ class StereoDepth:
     def _render(self, frame: int, surface: Surface, planes: Layout) -> DepthImage:
         view = self._view(frame)
         depth = surface_depth(surface, planes, view.intrinsics, view.T_world_cam)
+        depth = own_where_alike(self._depth("measured", frame), depth)
         if self.options.network is None:
             return depth
         guess = self._load("guess", frame)["inverse"].astype(np.float32)

@@ -13,6 +13,7 @@ from .watertight import Surface
 
 _MEASURED = 6.0  # cells: triangles with longer edges span what nothing was measured of
 _SPANNED, _FACING = 40.0, 0.4  # cells: no gap is spanned by longer edges, nor by what is seen at a cosine below that
+_ALIKE = 0.2  # relative
 _SUREST, _LAYOUT_SIGMA, _SPANNED_SIGMA = 0.005, 0.01, 0.04  # standard deviations over depth
 
 
@@ -34,3 +35,12 @@ def surface_depth(surface: Surface, layout: Layout, camera: Intrinsics, T_world_
     sigma = np.where(plane > 0, _LAYOUT_SIGMA, np.maximum(met.sigma_m * inverse, _SUREST))
     sigma = np.where(measured | (plane > 0), sigma, _SPANNED_SIGMA) * inverse
     return DepthImage(inverse.astype(np.float32), sigma.astype(np.float32), camera, T_world_cam)
+
+
+def own_where_alike(own: DepthImage, surface: DepthImage) -> DepthImage:
+    """What a view measured itself where the ``surface`` does not contradict it, as this merges what is closer together
+    than its cells and puts it where the poses of all views say, not this one's; elsewhere the surface."""
+    use = (own.inverse > 0) & (np.abs(own.inverse - surface.inverse) < _ALIKE * surface.inverse)
+    inverse = np.where(use, own.inverse, surface.inverse)
+    sigma = np.where(use, np.maximum(own.sigma, surface.sigma), surface.sigma)
+    return DepthImage(inverse, sigma, surface.camera, surface.T_world_cam)
