@@ -121,7 +121,8 @@ def _peaks(X: NDArray[np.float64], axis: NDArray[np.float64], thickness: float) 
     """The same, of what stands out from its surroundings alone: a floor seen edge-on says nothing about its azimuth."""
     count = np.bincount(_layer(X @ axis, thickness)).astype(float)
     count += np.append(count[1:], 0.0)
-    return float((np.maximum(count - np.convolve(count, np.full(15, 1 / 15.0), "same"), 0.0) ** 2).sum())
+    around = np.convolve(count, np.full(15, 1 / 15.0))[7 : 7 + len(count)]  # as many, however few layers
+    return float((np.maximum(count - around, 0.0) ** 2).sum())
 
 
 def _fitted(X: NDArray[np.float64], normal: NDArray[np.float64], offset: float, cell: float) -> NDArray[np.float64]:
