@@ -31,8 +31,8 @@ def _plain(costs, step, down, right):
     return total
 
 
-@pytest.mark.parametrize("step", [0.1, np.inf])
-def test_sum_of_the_least_paths(step: float) -> None:
+def test_sum_of_the_least_paths() -> None:
+    step = 0.1
     rng = np.random.default_rng(1)
     costs = rng.random((7, 9, 5)).astype(np.float32)
     down, right = rng.random((2, 7, 9)).astype(np.float32)

@@ -116,8 +116,31 @@ def test_a_damaged_surface_is_told(computed, tmp_path: Path) -> None:
     np.savez(path, **{**arrays, "triangles": arrays["triangles"] + len(arrays["vertices"])})
     with pytest.raises(MapError, match=r"surface.npz is damaged"):
         _tracker(capture, tmp_path)
+    np.savez(path, **{**arrays, "sigma_m": arrays["sigma_m"][:-1]})
+    with pytest.raises(MapError, match=r"surface.npz is damaged: its arrays"):
+        _tracker(capture, tmp_path)
     path.write_bytes(b"")
     with pytest.raises(MapError, match=r"surface.npz is damaged"):
+        _tracker(capture, tmp_path)
+
+
+def test_a_damaged_layout_is_told(computed, tmp_path: Path) -> None:
+    capture, folder, _ = computed
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "depth" / "000010.depth.npz").unlink()
+    path = tmp_path / "depth" / "layout.npz"
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    assert len(arrays["offsets"]) > 0
+    for name, damaged in (("support", arrays["support"][:-1]), ("offsets", arrays["offsets"][:-1])):
+        np.savez(path, **{**arrays, name: damaged})
+        with pytest.raises(MapError, match=r"layout.npz is damaged: it has"):
+            _tracker(capture, tmp_path)
+    np.savez(path, **{name: array for name, array in arrays.items() if name != "outermost"})
+    with pytest.raises(MapError, match=r"layout.npz is damaged"):
+        _tracker(capture, tmp_path)
+    path.unlink()
+    with pytest.raises(MapError, match=r"layout.npz is missing"):
         _tracker(capture, tmp_path)
 
 

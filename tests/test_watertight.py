@@ -176,3 +176,25 @@ def test_many_rays_do_not_overflow_the_solver() -> None:
     assert free[::3].all()
     assert not free[1::3].any()
     assert len(boundary(space, free)) > 0
+
+
+def test_points_of_a_grid_make_a_surface_too() -> None:
+    """Flat tetrahedra, ways within planes of facets, and a camera at a point: divisions by zero."""
+    grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    for centres in ([(2, 2, 9), (9, 3, 3), (3, 3, -4)], [(2.5, 2.5, 2.5), (1.5, 1, 2.5)], [(2, 2, 2), (1.5, 1, 2.5)]):
+        sees = np.indices((len(grid), len(centres))).reshape(2, -1).astype(np.int32)
+        surface = watertight(Points(grid, np.full(len(grid), 0.01), *sees, cell_m=0.1), np.array(centres, float))
+        edges = np.sort(np.concatenate([surface.triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+        assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()  # flat ones have no orientation
+        assert len(edges) > 100
+        assert np.isfinite(surface.normals()).all()
+
+
+def test_all_cameras_at_one_place_and_a_point_far_away_do_no_harm() -> None:
+    ball = np.concatenate((_sphere(1000), [(1e4, -1e4, 1e4)]))
+    centres = np.array([(0.1, 0.0, 0.2)] * 4)
+    sees = np.indices((len(ball), len(centres))).reshape(2, -1).astype(np.int32)
+    surface = watertight(Points(ball, np.full(len(ball), 0.005), *sees, cell_m=0.1), centres)
+    assert _closed(surface)
+    met = surface.met(centres[0], _sphere(50)[None] - centres[0])
+    assert np.median(np.abs(met.times - 1.0)) < 0.01

@@ -33,6 +33,7 @@ _REACH = 34  # squares that a plane may go on beyond its points
 _MOST_SQUARES = 1 << 24  # a plane of more is some stray points far apart
 
 _TURNS_DEG = (-0.5, -0.25, 0.0, 0.25, 0.5)  # walls' directions about the steepest one
+_LEAST_ALIKE = 0.9  # cosine between the normals of a plane before and after it is fitted
 _TILT = 0.003  # radians: standard deviation of a plane's normal before its points are asked
 _DEPENDENT = 50.0  # points per independent measurement
 _BEHIND = 0.01  # share of the points that may lie behind the outermost wall
@@ -121,7 +122,8 @@ def _peaks(X: NDArray[np.float64], axis: NDArray[np.float64], thickness: float) 
     """The same, of what stands out from its surroundings alone: a floor seen edge-on says nothing about its azimuth."""
     count = np.bincount(_layer(X @ axis, thickness)).astype(float)
     count += np.append(count[1:], 0.0)
-    return float((np.maximum(count - np.convolve(count, np.full(15, 1 / 15.0), "same"), 0.0) ** 2).sum())
+    around = np.convolve(count, np.full(15, 1 / 15.0))[7 : 7 + len(count)]  # as many, however few layers
+    return float((np.maximum(count - around, 0.0) ** 2).sum())
 
 
 def _fitted(X: NDArray[np.float64], normal: NDArray[np.float64], offset: float, cell: float) -> NDArray[np.float64]:
@@ -132,6 +134,8 @@ def _fitted(X: NDArray[np.float64], normal: NDArray[np.float64], offset: float, 
             break
         mean = held.mean(axis=0)
         found = np.linalg.eigh((held - mean).T @ (held - mean))[1][:, 0]
+        if abs(found @ normal) < _LEAST_ALIKE:
+            break  # they lie in a line
         normal = found * np.sign(found @ normal)
         offset = float(normal @ mean)
     return normal

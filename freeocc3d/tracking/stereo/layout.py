@@ -33,23 +33,27 @@ class Plane:
     outermost: bool
 
 
-_ARRAYS = {
-    "normals": ("f", 2), "offsets": ("f", 1), "axes": ("f", 3), "corners": ("f", 2), "squares": ("f", 1),
-    "shapes": ("i", 2), "support": ("b", 1), "outermost": ("b", 1),
+_ROWS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "normals": ("f", (3,)), "offsets": ("f", ()), "axes": ("f", (2, 3)), "corners": ("f", (2,)), "squares": ("f", ()),
+    "shapes": ("i", (2,)), "outermost": ("b", ()),
 }  # fmt: skip
 
 
 class Layout:
     """Planes, as rays meet them."""
 
-    EXPECTED: ClassVar[dict[str, tuple[str, int]]] = _ARRAYS
+    EXPECTED: ClassVar[dict[str, tuple[str, int]]] = {
+        **{name: (kind, 1 + len(shape)) for name, (kind, shape) in _ROWS.items()},
+        "support": ("b", 1),
+    }
 
     def __init__(self, planes: Sequence[Plane]):
         self.planes = tuple(planes)
-        self._arrays = self.to_arrays()
-        starts = np.cumsum([0, *self._arrays["shapes"].prod(axis=1)], dtype=np.int64)[:-1]
-        far = np.where(self._arrays["outermost"], _FAR_OUTERMOST, _FAR)
-        self._packed = (*(self._arrays[name] for name in _ARRAYS if name != "outermost"), starts, far)
+        arrays = self.to_arrays()
+        starts = np.cumsum([0, *arrays["shapes"].prod(axis=1)], dtype=np.int64)[:-1]
+        far = np.where(arrays["outermost"], _FAR_OUTERMOST, _FAR)
+        names = ("normals", "offsets", "axes", "corners", "squares", "shapes", "support")
+        self._packed = (*(arrays[name] for name in names), starts, far)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """The planes as arrays whose names and kinds are those of ``Layout.EXPECTED``."""
@@ -68,12 +72,15 @@ class Layout:
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> Layout:
         """The inverse of ``to_arrays``. Raises ValueError if they do not fit each other."""
-        rows = [arrays[name] for name in ("normals", "offsets", "axes", "corners", "squares", "shapes", "outermost")]
-        sizes = arrays["shapes"].prod(axis=1)
-        if len({len(row) for row in rows}) > 1 or (sizes <= 0).any() or sizes.sum() != len(arrays["support"]):
-            raise ValueError("arrays of different planes")
+        count, rows = len(arrays["offsets"]), [arrays[name] for name in _ROWS]
+        fit = all(row.shape == (count, *shape) for row, (_, shape) in zip(rows, _ROWS.values(), strict=True))
+        if not fit or not all(np.isfinite(row).all() for row in rows) or not (arrays["squares"] > 0).all():
+            raise ValueError("arrays that are not those of planes")
+        sizes = arrays["shapes"].astype(np.float64).prod(axis=1)  # whole numbers would overflow
+        if (arrays["shapes"] <= 0).any() or sizes.sum() != len(arrays["support"]):
+            raise ValueError("planes of other sizes than their squares")
         normals, offsets, axes, corners, squares, shapes, outermost = rows
-        parts = np.split(arrays["support"], np.cumsum(sizes)[:-1]) if len(sizes) else []
+        parts = np.split(arrays["support"], np.cumsum(sizes.astype(np.int64))[:-1]) if count else []
         return cls(
             [
                 Plane(normal, float(offset), across, corner, float(square), part.reshape(shape), bool(out))

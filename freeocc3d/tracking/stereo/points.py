@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from .consistency import DepthImage, confirmed
 from .photo_consistency import rays
 
-SAME_DEPTH = 0.01
-"""Relative: up to it views agree, whatever their standard deviations."""
-
+_SAME_DEPTH = 0.01  # relative: up to it views agree, whatever their standard deviations
 _LOOKING_THROUGH = 0.5  # views that contradict, over those that agree
 _CELL = 0.01  # of the scan's depth
 _LEAST_VIEWS = 2
@@ -40,7 +38,7 @@ def confirmed_points(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(N, 3) world points of a view that ``agreeing`` of the ``others`` see at the same depth, and few at a greater
     one; their (N,) standard deviations in metres."""
-    found = confirmed(view, others, SAME_DEPTH, device)
+    found = confirmed(view, others, _SAME_DEPTH, device)
     keep = (found.agreeing >= agreeing) & (found.through <= _LOOKING_THROUGH * found.agreeing)
     there = keep.cpu().numpy() & (view.inverse > 0)
     z = 1.0 / found.inverse.cpu().numpy()[there].astype(np.float64)

@@ -256,6 +256,9 @@ class StereoDepth:
     def _surface(self) -> Surface:
         stored = read_arrays(self._surface_path, _SURFACE)
         vertices, triangles = stored["vertices"], stored["triangles"]
+        shapes = tuple(stored[name].shape for name in ("vertices", "sigma_m", "triangles", "cell_m"))
+        if shapes != ((len(vertices), 3), (len(vertices),), (len(triangles), 3), (1,)):
+            raise MapError(f"{self._surface_path} is damaged: its arrays do not fit each other.")
         if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
             raise MapError(f"{self._surface_path} is damaged: it has triangles of points that it does not have.")
         return Surface(vertices, stored["sigma_m"], triangles, float(stored["cell_m"][0]))

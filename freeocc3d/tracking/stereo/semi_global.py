@@ -13,9 +13,9 @@ from torch import Tensor
 def aggregated(costs: Tensor, step: float, jump_down: Tensor, jump_right: Tensor) -> Tensor:
     """Sum of the least costs of paths that end in a pixel, over eight directions.
 
-    costs: (H, W, L) of giving a pixel one of L ordered labels.  step: price of going on with the label beside; infinite
-    where labels have no order.  jump_down, jump_right: (H, W) price of any other change between a pixel and the one
-    above, or to the left (a low one where an edge of the image speaks for it).  Returns (H, W, L).
+    costs: (H, W, L) of giving a pixel one of L ordered labels.  step: price of going on with the label beside.
+    jump_down, jump_right: (H, W) price of any other change between a pixel and the one above, or to the left (a low one
+    where an edge of the image speaks for it).  Returns (H, W, L).
     """
     total = _swept(costs, step, jump_down, diagonal=True)
     turned = _swept(costs.transpose(0, 1).contiguous(), step, jump_right.t().contiguous(), diagonal=False)

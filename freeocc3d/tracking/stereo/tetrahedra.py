@@ -94,6 +94,8 @@ def _march(vertices, corners, beside, facets, first, around, ray_point, ray_came
         start, sigma = vertices[point], sigma_m[point]
         way[:] = vertices[camera] - start
         length = np.sqrt((way * way).sum())
+        if length == 0.0:
+            continue
         way /= length
         cell, out = _first_cell(corners, facets, first, around, point, way)
         free[_walk(corners, beside, facets, cell, out, start, way, length, camera, sigma, prices)] += 1.0
@@ -166,8 +168,11 @@ def _leaving(facets, cell, facet, way):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _distance(facets, cell, facet, start, way):  # type: ignore[no-untyped-def]
-    """How far away a way that leaves by a facet meets it."""
+    """How far away a way that leaves by a facet meets it; 0 for one within its plane, as in a flat tetrahedron."""
+    leaving = _leaving(facets, cell, facet, way)
+    if leaving == 0.0:
+        return 0.0
     height = facets[cell, facet, 3]  # slices are avoided: counting references to them takes longer than this
     for k in range(3):
         height -= facets[cell, facet, k] * start[k]
-    return height / _leaving(facets, cell, facet, way)
+    return height / leaving

@@ -62,7 +62,7 @@ class Surface:
         edge_m, sigma_m = self._of_triangles
         normals = found["primitive_normals"].numpy()
         lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(directions, axis=-1)
-        cosine = np.abs((normals * directions).sum(axis=-1)) / np.maximum(lengths, 1e-12)
+        cosine = (np.abs((normals * directions).sum(axis=-1)) / np.maximum(lengths, 1e-12)).astype(np.float32)
         return Hits(*(np.where(hit, a, 0.0) for a in (times, edge_m[triangle], sigma_m[triangle], cosine)))
 
     def normals(self) -> NDArray[np.float64]:
