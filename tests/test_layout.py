@@ -139,6 +139,7 @@ def test_the_directions_are_the_rooms(room) -> None:
     assert sorted(cosine.argmax(axis=1)) == [0, 1, 2]
     assert np.degrees(np.arccos(np.minimum(cosine.max(axis=1), 1.0))).max() < 0.15
     assert cosine[0].argmax() == 2  # the floor holds most points
+    assert np.degrees(np.arccos(min(cosine[0, 2], 1.0))) < 0.02
 
 
 @pytest.mark.parametrize(("axis", "at"), _WALLS)
@@ -316,3 +317,11 @@ def test_one_point_far_away_changes_little(room, far: float) -> None:
                   np.append(given.ray_camera, np.int32(0)), _CELL)  # fmt: skip
     planes = layout(more, centres, room.normals).planes
     assert sum(plane.outermost for plane in planes) == 6
+
+
+def test_planes_of_pieces_far_apart_take_no_memory() -> None:
+    points = np.random.default_rng(9).random((16000, 3)) * (5.0, 4.0, 0.0)
+    points[8000:] += 3000.0, 2000.0, 0.0
+    centres = np.array([(2.5, 2.0, 1.5), (2.0, 2.0, 1.5)])
+    for plane in layout(_measured(points, centres), centres, np.eye(3)[2:]).planes:
+        assert plane.support.size <= 1 << 24
