@@ -32,7 +32,13 @@ _GAP_OF_PIECE = 0.3  # gaps up to this share of a piece's length are closed
 _REACH = 34  # squares that a plane may go on beyond its points
 _MOST_SQUARES = 1 << 24  # a plane of more is some stray points far apart
 
-_TURNS_DEG = (-0.5, -0.25, 0.0, 0.25, 0.5)  # walls' directions about the steepest one
+_TURNS_DEG = (
+    -0.5,
+    -0.25,
+    0.0,
+    0.25,
+    0.5,
+)  # of the second and third direction about the first, for walls that are not quite at right angles
 _LEAST_ALIKE = 0.9  # cosine between the normals of a plane before and after it is fitted
 _TILT = 0.003  # radians: standard deviation of a plane's normal before its points are asked
 _DEPENDENT = 50.0  # points per independent measurement

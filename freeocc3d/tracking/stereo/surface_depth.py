@@ -9,9 +9,8 @@ from ...types import Intrinsics
 from .consistency import DepthImage
 from .layout import Layout
 from .photo_consistency import rays
-from .watertight import Surface
+from .watertight import SIDE_BY_SIDE, Surface
 
-_MEASURED = 6.0  # cells: triangles with longer edges span what nothing was measured of
 _SPANNED, _FACING = 40.0, 0.4  # cells: no gap is spanned by longer edges, nor by what is seen at a cosine below that
 _ALIKE = 0.2  # relative
 _SUREST, _LAYOUT_SIGMA, _SPANNED_SIGMA = 0.005, 0.01, 0.04  # standard deviations over depth
@@ -25,7 +24,7 @@ def surface_depth(surface: Surface, layout: Layout, camera: Intrinsics, T_world_
     met = surface.met(origin, directions)
     times = met.times.astype(np.float64)
     times[times < surface.cell_m] = 0.0  # a surface through the camera itself
-    measured = (times > 0) & (met.edge_m < _MEASURED * surface.cell_m)
+    measured = (times > 0) & (met.edge_m < SIDE_BY_SIDE * surface.cell_m)
     spanned = (times > 0) & (met.edge_m < _SPANNED * surface.cell_m) & (met.cosine > _FACING)
     depth = np.where(measured | spanned, times, 0.0)
     plane = np.zeros_like(depth)

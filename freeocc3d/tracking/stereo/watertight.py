@@ -20,7 +20,9 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from .points import Points
 from .tetrahedra import Evidence, Tetrahedra, evidence, tetrahedra
 
-_SIDE_BY_SIDE = 6.0  # cells
+SIDE_BY_SIDE = 6.0
+"""Cells: triangles with longer edges span what nothing was measured of."""
+
 _SOFT = 3.0  # standard deviations of a point within which its rays may still cross the surface
 _QUALITY = 1.0  # rays that a facet of the worst shape outweighs, for each of its sides
 _STEPS = 50.0  # of the whole numbers in which flows are computed, per ray
@@ -67,7 +69,7 @@ class Surface:
 
     def normals(self) -> NDArray[np.float64]:
         """(N, 3) of the triangles whose corners were measured side by side."""
-        near = self._of_triangles[0] < _SIDE_BY_SIDE * self.cell_m
+        near = self._of_triangles[0] < SIDE_BY_SIDE * self.cell_m
         a, b, c = np.moveaxis(self.vertices[self.triangles[near]].astype(np.float64), 1, 0)
         normals = np.cross(b - a, c - a)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
