@@ -4,6 +4,25 @@ import freeocc3d
 scan_map = freeocc3d.reconstruct("scans/kitchen", "maps/kitchen")
 for region in scan_map.query("red cup").regions:
     print(region.centroid, region.score)
+
+Its rooms, in the order in which a frame passes through them; each imports from those before it alone:
+
+    core        what every room uses: types, errors, transforms, voxel keys, arrays on disk
+    settings    options of every stage, YAML in and out, the registry of backends
+    capture     INPUT    captured scans, opened and decoded frame by frame
+    tracking    LAYER 1  camera poses
+    depth       LAYER 1  dense depth for scans without any
+    gaussians   LAYER 2  3D Gaussians anchored at measured points
+    language    LAYER 3  features that words can be compared with
+    occupancy   LAYER 4  sparse voxels: occupied, free, unknown
+    storage     the map folder and the work folder
+    query       asking a map: words, classes, pictures, places
+    viewer      pictures and pages of maps
+    export      writers of other programs' files
+    editing     new maps from saved maps
+    evaluation  scores against the truth
+    pipeline    the four layers together
+    cli         the command line
 """
 
 from __future__ import annotations
@@ -12,8 +31,8 @@ import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .pipeline import reconstruct
-    from .store import load_map
+    from .pipeline.run import reconstruct
+    from .storage.store import load_map
 
 __version__ = "0.1.0"
 
@@ -26,11 +45,11 @@ __all__ = ["__version__", "load_map", "reconstruct"]
 def __getattr__(name: str) -> Any:
     """The two calls are imported when first used, so that asking for the version imports nothing."""
     if name == "reconstruct":
-        from .pipeline import reconstruct
+        from .pipeline.run import reconstruct
 
         return reconstruct
     if name == "load_map":
-        from .store import load_map
+        from .storage.store import load_map
 
         return load_map
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from freeocc3d.capture import open_capture
 from freeocc3d.capture.base import Capture, Options
-from freeocc3d.types import Frame, Intrinsics
+from freeocc3d.core.types import Frame, Intrinsics
 
 
 class Photographs(Capture):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from freeocc3d.core.types import Frame, Gaussians, Intrinsics, Occupancy, PosedFrame
 from freeocc3d.gaussians import anchors
-from freeocc3d.types import Frame, Gaussians, Intrinsics, Occupancy, PosedFrame
 
 CAMERA = Intrinsics(160, 120, 130.0, 130.0, 79.5, 59.5)
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from freeocc3d.geometry import invert
-from freeocc3d.tracking.stereo.scan_depth import View
-from freeocc3d.types import Intrinsics
+from freeocc3d.core.transforms import invert
+from freeocc3d.core.types import Intrinsics
+from freeocc3d.depth.multi_view_stereo import View
 
 CAMERA = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
 

@@ -49,7 +49,7 @@ SEGMENTER = {
 
 def absent_names(names: list[str], present: list[str]) -> list[str]:
     """The names that name nothing of what is present, in alphabetical order."""
-    from freeocc3d.language.vocabulary import matching_names
+    from freeocc3d.language.synonyms import matching_names
 
     return sorted({name for name in names if not matching_names(name, present)[0]})
 
@@ -61,8 +61,8 @@ def spread(names: list[str]) -> list[str]:
 
 def measure_words(capture: str) -> Figures:
     """Shares of absent names, and of the present classes' names, that return a region."""
-    from freeocc3d.pipeline import reconstruct
-    from freeocc3d.progress import Progress
+    from freeocc3d.core.progress import Progress
+    from freeocc3d.pipeline.run import reconstruct
 
     if not MODELS.is_dir():
         raise SystemExit(f"there are no names to ask for: {MODELS} is missing")

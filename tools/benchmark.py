@@ -146,14 +146,14 @@ def _frames(capture: Path) -> int:
 def score_map(map: str, capture: str, out: str) -> Figures:
     """ATE and RPE against the capture's poses; IoU and mIoU where it brings a ground truth. Leaves the aligned poses of
     all frames in ``out``."""
-    from freeocc3d.evaluation import evaluate
-    from freeocc3d.evaluation.align import align, estimated_poses, true_poses
+    from freeocc3d.evaluation import scoring
     from freeocc3d.evaluation.ground_truth import load_ground_truth
-    from freeocc3d.evaluation.trajectory import trajectory_errors
-    from freeocc3d.store import load_map
+    from freeocc3d.evaluation.trajectory_alignment import align, estimated_poses, true_poses
+    from freeocc3d.evaluation.trajectory_errors import trajectory_errors
+    from freeocc3d.storage.store import load_map
 
     loaded = load_map(map)
-    estimated, true = estimated_poses(loaded.trajectory), true_poses(evaluate.capture_of(loaded))
+    estimated, true = estimated_poses(loaded.trajectory), true_poses(scoring.capture_of(loaded))
     how = "se3" if loaded.metric else "sim3"
     alignment = align(estimated, true, how)
     errors = trajectory_errors(estimated, true, alignment)
@@ -163,9 +163,9 @@ def score_map(map: str, capture: str, out: str) -> Figures:
     truth_path = Path(capture) / "ground_truth.npz"
     if truth_path.is_file():
         truth = load_ground_truth(truth_path)
-        classes = evaluate.common_classes([truth])
-        scene = evaluate.score_map(loaded, truth, classes, true, how)
-        scored = evaluate.Evaluation((scene,), classes.classes, how)
+        classes = scoring.common_classes([truth])
+        scene = scoring.score_map(loaded, truth, classes, true, how)
+        scored = scoring.Evaluation((scene,), classes.classes, how)
         figures |= _scores(scored.scores, scored.miou(), scored.classes_in_miou)
     return figures
 
@@ -202,8 +202,8 @@ def dense_slam(capture: str, frames: int | None, out: str) -> Figures:
     import peers
 
     from freeocc3d.capture import open_capture
-    from freeocc3d.evaluation.align import Poses, align, true_poses
-    from freeocc3d.evaluation.trajectory import trajectory_errors
+    from freeocc3d.evaluation.trajectory_alignment import Poses, align, true_poses
+    from freeocc3d.evaluation.trajectory_errors import trajectory_errors
 
     opened = open_capture(capture)
     used = range(len(opened))[:frames]
@@ -263,9 +263,9 @@ def occupancy(kind: str, capture: str, frames: int | None, poses: str | None, tr
     import peers
 
     from freeocc3d.capture import open_capture
-    from freeocc3d.evaluation.align import true_poses
+    from freeocc3d.evaluation.confusion import Prediction, Scores, confusion
     from freeocc3d.evaluation.ground_truth import load_ground_truth
-    from freeocc3d.evaluation.iou import Prediction, Scores, confusion
+    from freeocc3d.evaluation.trajectory_alignment import true_poses
 
     opened, expected = open_capture(capture), load_ground_truth(truth)
     if poses is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from freeocc3d.errors import ModelError
+from freeocc3d.core.errors import ModelError
 
 _SIGLIP_PUNCTUATION = r"[!\"#$%&'()*+,\-./:;<=>?@\[\\\]^_`{|}~]"
 

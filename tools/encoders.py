@@ -29,10 +29,10 @@ def measure_encoders() -> Figures:
     import export_encoder
     import numpy as np
 
-    from freeocc3d.language import models
+    from freeocc3d.core.types import Frame, Intrinsics
+    from freeocc3d.language import model_packages
     from freeocc3d.language.encoders import clip
-    from freeocc3d.language.words import TextNetwork
-    from freeocc3d.types import Frame, Intrinsics
+    from freeocc3d.language.text_networks import TextNetwork
 
     rgb = np.random.default_rng(0).integers(0, 256, (FRAME[0] // 32, FRAME[1] // 32, 3), dtype=np.uint8)
     rgb = np.ascontiguousarray(rgb.repeat(32, axis=0).repeat(32, axis=1))
@@ -46,7 +46,7 @@ def measure_encoders() -> Figures:
         for precision in export_encoder.PRECISIONS:
             path = Path(folder) / precision
             export_encoder.export(checkpoint, path, precision, "random weights", "none", precision)
-            package = models.read(path)
+            package = model_packages.read(path)
             encoder = clip.load(clip.Options(model=str(path)))
             text = TextNetwork(package)
             patches, words = encoder.patches(rgb), text.embed(list(WORDS))
@@ -93,8 +93,8 @@ def measure_edges() -> Figures:
     import numpy as np
 
     from freeocc3d.capture import open_capture
-    from freeocc3d.language.dense import resampled, unit
-    from freeocc3d.language.upsample import upsample
+    from freeocc3d.language.guided_upsampling import upsample
+    from freeocc3d.language.patch_features import resampled, unit
 
     capture = open_capture("builtin:room")
     names = unit(np.random.default_rng(0).normal(size=(len(capture.classes), 64)).astype(np.float32))

@@ -31,8 +31,8 @@ import yaml
 from encoder_tokenizers import clip_tokenizer, end_token, read_tokenizer, siglip_tokenizer
 from torch import Tensor, nn
 
-from freeocc3d.errors import FreeOccError, ModelError
-from freeocc3d.language import models
+from freeocc3d.core.errors import FreeOccError, ModelError
+from freeocc3d.language import model_packages
 
 PRECISIONS = ("fp32", "fp16", "int8")
 _OPSET = 18
@@ -77,7 +77,7 @@ def export(checkpoint: Checkpoint, folder: Path, name: str, source: str, licence
             parts["tokenizer"] = "tokenizer.json"
             (made / parts["tokenizer"]).write_text(checkpoint.tokenizer, encoding="utf-8")
         manifest = {
-            "format": models.FORMAT,
+            "format": model_packages.FORMAT,
             "name": name,
             "kind": checkpoint.kind,
             **checkpoint.facts,
@@ -85,10 +85,10 @@ def export(checkpoint: Checkpoint, folder: Path, name: str, source: str, licence
             "licence": licence,
             "source": source,
             "parts": parts,
-            "files": {file: models.sha256(made / file) for file in parts.values()},
+            "files": {file: model_packages.sha256(made / file) for file in parts.values()},
         }
-        (made / models.MANIFESTS[0]).write_text(yaml.safe_dump(manifest, sort_keys=False), encoding="utf-8")
-        package = models.read(made)
+        (made / model_packages.MANIFESTS[0]).write_text(yaml.safe_dump(manifest, sort_keys=False), encoding="utf-8")
+        package = model_packages.read(made)
         for part in checkpoint.networks:
             package.session(part)  # what is written can be run
         os.replace(made, folder)
@@ -262,9 +262,9 @@ def _local(source: str) -> Path:
     """The folder of a checkpoint, fetched from the hub where it is no folder here."""
     if Path(source).is_dir():
         return Path(source)
-    from freeocc3d.language import hub
+    from freeocc3d.language import model_hub
 
-    return hub.pull(source)
+    return model_hub.pull(source)
 
 
 def _from_transformers(folder: Path) -> nn.Module:
@@ -354,11 +354,11 @@ def main() -> None:
         parser.error("--text and --text-head belong together")
     logging.getLogger().setLevel(logging.ERROR)  # the exporter counts the operators that it skips
     plain = Path(given.output).name == given.output
-    folder = models.models_folder() / given.output if plain else Path(given.output)
+    folder = model_packages.models_folder() / given.output if plain else Path(given.output)
     try:
         checkpoint = read_checkpoint(given.source, given.tokenizer, given.text, given.text_head)
         export(checkpoint, folder, folder.name, given.source, given.licence or _licence(given.source), given.precision)
-        package = models.read(folder)
+        package = model_packages.read(folder)
     except FreeOccError as error:
         raise SystemExit(f"export_encoder: {' '.join(str(error).split())}") from None
     print(f"{folder}: {package.kind}, {package.dimension} dimensions, {package.precision}, {package.bytes:,} bytes")

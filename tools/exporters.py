@@ -67,7 +67,7 @@ def measure_exports(capture: str) -> Figures:
 
 def measure_map(map_path: str) -> Figures:
     """Seconds, peak bytes and bytes written of each of EXPORTS; OctoMap's own file; the plan's agreement."""
-    from freeocc3d.store import load_map
+    from freeocc3d.storage.store import load_map
 
     loaded = load_map(map_path)
     words = ", ".join(f"{word}{how}" for word, how in zip(loaded.vocabulary, (":40%", ":0.5", ":1:60%"), strict=False))
@@ -115,8 +115,8 @@ def _octomaps_own(made: Any, path: Path) -> bool:
         import pyoctomap
     except ImportError:
         return False
-    from freeocc3d.export.frames import placed
-    from freeocc3d.types import FREE, OCCUPIED
+    from freeocc3d.core.types import FREE, OCCUPIED
+    from freeocc3d.export.export_frames import placed
 
     there = placed(made, "gravity", origin=np.zeros(3)).occupancy
     tree = pyoctomap.OcTree(there.voxel_size)

@@ -22,7 +22,7 @@ def measure_splat() -> Figures:
     import numpy as np
 
     from freeocc3d.occupancy import splat
-    from freeocc3d.occupancy.grid import unpack
+    from freeocc3d.occupancy.voxel_blocks import unpack
 
     options, origin = splat.Options(voxel_size=SPLAT_VOXEL_SIZE_M), np.zeros(3)
 
@@ -64,8 +64,8 @@ def surface_gaussians(count: int) -> Any:
     directions; in the order of the patches, as neighbours in a map are neighbours in memory."""
     import numpy as np
 
-    from freeocc3d.geometry import quats_to_rotations
-    from freeocc3d.types import Gaussians
+    from freeocc3d.core.transforms import quats_to_rotations
+    from freeocc3d.core.types import Gaussians
 
     rng = np.random.default_rng(0)
     patch = np.arange(count) // 2500
@@ -108,7 +108,7 @@ def exps_per_second() -> float:
 
 def measure_query(map_path: Path) -> Figures:
     """Seconds to load a map with its first answer, and the median of those after it."""
-    from freeocc3d.store import load_map
+    from freeocc3d.storage.store import load_map
 
     mark = time.perf_counter()
     loaded = load_map(map_path)

@@ -25,7 +25,7 @@ def measure_lifting() -> Figures:
     sum is read and written."""
     import numpy as np
 
-    from freeocc3d.language.fusion import FeatureFusion
+    from freeocc3d.language.feature_fusion import FeatureFusion
     from freeocc3d.language.visibility import Seen
 
     rng = np.random.default_rng(0)
@@ -49,12 +49,12 @@ def measure_lifting() -> Figures:
 def measure_fusion(map_path: Path) -> Figures:
     """mIoU of a map of class images, as a share of that of the nearest true labels at the same voxels, and what is left
     when a share of each keyframe's regions shows a class at random: ours, plain averages, the last keyframe's word."""
-    from freeocc3d.evaluation import evaluate
+    from freeocc3d.evaluation import scoring
     from freeocc3d.language.encoders.labels import LabelsEncoder
-    from freeocc3d.store import load_map
+    from freeocc3d.storage.store import load_map
 
     scan_map = load_map(map_path)
-    capture = evaluate.capture_of(scan_map)
+    capture = scoring.capture_of(scan_map)
     scene = _Scene(scan_map, Path(str(scan_map.manifest["capture"]["path"])) / "ground_truth.npz")
 
     def encoder(kind: str | None, seed: int) -> LabelsEncoder:
@@ -119,17 +119,17 @@ class _Scene:
         import numpy as np
         from scipy.spatial import cKDTree
 
-        from freeocc3d import config, registry
-        from freeocc3d.evaluation import evaluate
+        from freeocc3d.core.types import OCCUPIED, UNKNOWN
+        from freeocc3d.evaluation import scoring
         from freeocc3d.evaluation.ground_truth import load_ground_truth
-        from freeocc3d.language import lift
+        from freeocc3d.language import lifting
         from freeocc3d.occupancy import build, carve, splat
-        from freeocc3d.types import OCCUPIED, UNKNOWN
+        from freeocc3d.settings import config, registry
 
         settings = config.load(scan_map.path / "config.yaml")
-        self.options = registry.build_options(lift, config.options(settings, "language"))
+        self.options = registry.build_options(lifting, config.options(settings, "language"))
         self.truth = load_ground_truth(truth_path)
-        self.classes = evaluate.common_classes([self.truth])
+        self.classes = scoring.common_classes([self.truth])
         self.words = scan_map.text_encoder.encode_words(list(self.truth.classes[1:]))
         self.gaussians, self.scan_map = scan_map.gaussians, scan_map
         labels = self.truth.labels
@@ -152,7 +152,7 @@ class _Scene:
         self.ceiling = self.miou(labels[tuple(nearest.T)])
 
     def keyframes(self) -> Iterator[Any]:
-        from freeocc3d.types import PosedFrame
+        from freeocc3d.core.types import PosedFrame
 
         poses = self.scan_map.trajectory.T_world_keyframe
         for row, (frame, T) in enumerate(zip(self.scan_map.keyframes, poses, strict=True)):
@@ -162,7 +162,7 @@ class _Scene:
         """mIoU by way of fusing."""
         import numpy as np
 
-        from freeocc3d.language.fusion import FeatureFusion
+        from freeocc3d.language.feature_fusion import FeatureFusion
         from freeocc3d.language.visibility import seen
 
         count = len(self.gaussians)
@@ -181,18 +181,18 @@ class _Scene:
         """mIoU over the classes present of the voxels' nearest words."""
         import numpy as np
 
-        from freeocc3d import query
         from freeocc3d.occupancy import build, splat
-        from freeocc3d.occupancy.grid import unpack
+        from freeocc3d.occupancy.voxel_blocks import unpack
+        from freeocc3d.query import word_query
 
         means = splat.posterior_mean(self.bins, unpack(self.bins.packed), self.slots, features)
-        nearest = query.nearest_word(build.normalized(means)[self.inside], self.words)
+        nearest = word_query.nearest_word(build.normalized(means)[self.inside], self.words)
         return self.miou((nearest + 1).astype(np.uint8))
 
     def miou(self, labels: Any) -> float:
         import numpy as np
 
-        from freeocc3d.evaluation.iou import Prediction, Scores, confusion
+        from freeocc3d.evaluation.confusion import Prediction, Scores, confusion
 
         predicted, occupied = np.zeros(self.truth.shape, np.uint8), np.zeros(self.truth.shape, bool)
         predicted[self.at], occupied[self.at] = labels, True
@@ -208,8 +208,8 @@ def _slots(occupancy: Any, bins: Any) -> Any:
     """(B, 512) row of each occupied voxel in the bins' blocks."""
     import numpy as np
 
-    from freeocc3d.occupancy.grid import pack
-    from freeocc3d.types import OCCUPIED
+    from freeocc3d.core.types import OCCUPIED
+    from freeocc3d.occupancy.voxel_blocks import pack
 
     occupied = occupancy.state == OCCUPIED
     slots = np.full(occupied.shape, -1, np.int32)

@@ -21,7 +21,7 @@ def measure_mono(capture: str) -> Figures:
 
     from freeocc3d.capture import open_capture
     from freeocc3d.capture.base import Options
-    from freeocc3d.tracking.sfm.structure import Recipe, reconstruct
+    from freeocc3d.tracking.sfm.structure_from_motion import Recipe, reconstruct
 
     opened = open_capture(capture, Options(depth=False))
     frames = range(0, len(opened), stride(len(opened)))
@@ -110,7 +110,7 @@ def _scores(T_world_cam: Any, true: Any) -> Figures:
     """Of (N, 4, 4) poses against true ones: share that is placed, and ATE of the camera centres after Sim(3)."""
     import numpy as np
 
-    from freeocc3d.geometry import umeyama
+    from freeocc3d.core.transforms import umeyama
 
     placed = np.isfinite(T_world_cam).all(axis=(1, 2))
     both = placed & np.isfinite(true).all(axis=(1, 2))

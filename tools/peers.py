@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from freeocc3d.capture import Capture
-from freeocc3d.errors import DependencyError, FrameError
-from freeocc3d.geometry import back_project, invert, transform
-from freeocc3d.types import Frame
+from freeocc3d.core.errors import DependencyError, FrameError
+from freeocc3d.core.transforms import back_project, invert, transform
+from freeocc3d.core.types import Frame
 
 SLAM_VOXEL_SIZE_M = 0.01
 SLAM_DEPTH_MIN_M, SLAM_DEPTH_MAX_M = 0.1, 6.0

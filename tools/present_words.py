@@ -36,8 +36,8 @@ COLD_STARTS = 5
 
 def measure_present(capture: str) -> Figures:
     """IoU of each class, absent words that return something, and seconds of queries."""
-    from freeocc3d.pipeline import reconstruct
-    from freeocc3d.progress import Progress
+    from freeocc3d.core.progress import Progress
+    from freeocc3d.pipeline.run import reconstruct
 
     settings = {"language": {"encoder": "labels"}, "tracking": {"backend": "known"}, "fitting": {"passes": 0}}
     with tempfile.TemporaryDirectory() as folder:
@@ -54,10 +54,11 @@ def classes_found(scan_map: Any, truth_path: Path) -> Figures:
     iou: of the answer.  occupied: share of the class's voxels that the map holds occupied at all.  iou_occupied: of the
     answer among voxels that both hold occupied: what is left to language.
     """
-    from freeocc3d import config, query, registry
+    from freeocc3d.core.types import UNKNOWN, PosedFrame
     from freeocc3d.evaluation.ground_truth import load_ground_truth
     from freeocc3d.occupancy import build, carve, splat
-    from freeocc3d.types import UNKNOWN, PosedFrame
+    from freeocc3d.query import word_query
+    from freeocc3d.settings import config, registry
 
     truth = load_ground_truth(truth_path)
     settings = config.load(scan_map.path / "config.yaml")
@@ -78,9 +79,9 @@ def classes_found(scan_map: Any, truth_path: Path) -> Figures:
 
     count = np.bincount(truth.labels.ravel(), minlength=256)
     names = [name for k, name in enumerate(truth.classes) if k and count[k] >= LEAST]
-    options = query.Options(top_k=max(len(voxels), 1))
+    options = word_query.Options(top_k=max(len(voxels), 1))
     rows: Figures = {}
-    for result in query.query(occupancy, scan_map.text_encoder, names, options):
+    for result in word_query.query(occupancy, scan_map.text_encoder, names, options):
         meant = [k + 1 for k in scan_map.text_encoder.matching(result.word)[0]]
         found = np.zeros(len(voxels), bool)
         found[np.concatenate([np.zeros(0, np.int64), *(region.rows for region in result.regions)])] = True
@@ -94,7 +95,7 @@ def classes_found(scan_map: Any, truth_path: Path) -> Figures:
             "iou_occupied": float(right.sum() / max(((found & (true != 0)) | held).sum(), 1)),
         }
     absent = [word for word in ABSENT if word not in truth.classes]
-    answered = [r.word for r in query.query(occupancy, scan_map.text_encoder, absent, options) if r.matched]
+    answered = [r.word for r in word_query.query(occupancy, scan_map.text_encoder, absent, options) if r.matched]
     return {"classes": rows, "absent": absent, "absent_answered": answered}
 
 
@@ -102,7 +103,7 @@ def seconds(map_path: Path) -> Figures:
     """Of a process that answers one word, in text, in JSON and with all details; and of one word after the other, each
     for the first time, in a loaded map: median, longest, and median of the processor's time, on which other programs
     have no part."""
-    from freeocc3d.store import load_map
+    from freeocc3d.storage.store import load_map
 
     loaded = load_map(map_path)
     words = loaded.text_encoder.contrast_words()

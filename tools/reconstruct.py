@@ -3,7 +3,7 @@
 
 import sys
 
-from freeocc3d.cli import main
+from freeocc3d.cli.main import main
 
 if __name__ == "__main__":
     main(["reconstruct", *sys.argv[1:]])

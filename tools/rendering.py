@@ -20,7 +20,7 @@ def surfaces_in_view(count: int, width: int, height: int) -> tuple[list[Any], An
     import numpy as np
     import torch
 
-    from freeocc3d.types import Intrinsics
+    from freeocc3d.core.types import Intrinsics
 
     rng = np.random.default_rng(0)
     f = 0.85 * width

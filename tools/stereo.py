@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from freeocc3d.capture import open_capture, used_frames
 from freeocc3d.capture.base import Capture, Options
-from freeocc3d.capture.registration import Grid
-from freeocc3d.progress import Progress
-from freeocc3d.tracking import calibration, known
-from freeocc3d.tracking.stereo import scan_depth
-from freeocc3d.tracking.stereo.triangulation import triangulated
-from freeocc3d.types import Frame
+from freeocc3d.capture.depth_registration import Grid
+from freeocc3d.core.progress import Progress
+from freeocc3d.core.types import Frame
+from freeocc3d.depth import multi_view_stereo
+from freeocc3d.depth.sparse_points import triangulated
+from freeocc3d.tracking.rgbd import focal_calibration
+from freeocc3d.tracking.trackers import known
 
 Figures = dict[str, Any]
 
@@ -37,7 +38,7 @@ def measure_stereo(capture: str, frames: int | None = None) -> Figures:
     stride = 5 if _spacing(opened) < _CLOSE else 3
     opened = open_capture(capture, Options(stride=stride))
     used = list(used_frames(opened))
-    ratio = calibration.color_focal(opened, used_frames(opened))
+    ratio = focal_calibration.color_focal(opened, used_frames(opened))
 
     def colour(frame: Frame) -> Frame:
         camera = frame.intrinsics
@@ -46,7 +47,7 @@ def measure_stereo(capture: str, frames: int | None = None) -> Figures:
     compared = used if frames is None else used[:: max(1, len(used) // frames)][:frames]
     T_world_cam = known.load(known.Options(), opened).T_world_cam
     with tempfile.TemporaryDirectory() as folder:
-        depth = scan_depth.StereoDepth(Path(folder), scan_depth.Options())
+        depth = multi_view_stereo.StereoDepth(Path(folder), multi_view_stereo.Options())
         started, cpu = time.perf_counter(), time.process_time()
         scan = triangulated(opened, T_world_cam, used, Progress(), colour)
         depth.compute(opened, scan, _with_others(compared, used), Progress(), colour)

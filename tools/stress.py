@@ -12,12 +12,13 @@ import numpy as np
 
 from freeocc3d.capture import open_capture, used_frames
 from freeocc3d.capture.base import Capture, Options
-from freeocc3d.capture.readahead import read_ahead
-from freeocc3d.capture.reregistered import Reregistered
-from freeocc3d.evaluation.align import Poses, align
-from freeocc3d.evaluation.trajectory import trajectory_errors
-from freeocc3d.tracking import calibration, rgbd
-from freeocc3d.types import Frame, Trajectory
+from freeocc3d.capture.focal_correction import Reregistered
+from freeocc3d.capture.read_ahead import read_ahead
+from freeocc3d.core.types import Frame, Trajectory
+from freeocc3d.evaluation.trajectory_alignment import Poses, align
+from freeocc3d.evaluation.trajectory_errors import trajectory_errors
+from freeocc3d.tracking.rgbd import focal_calibration
+from freeocc3d.tracking.trackers import rgbd
 
 Figures = dict[str, Any]
 Change = Callable[[int, Frame], Frame]
@@ -79,7 +80,7 @@ def _left_missing(position: int, frame: Frame) -> Frame:
 def opened(capture: str) -> Capture:
     """A capture as the pipeline would give it to layer 1, which is not told its poses."""
     plain = open_capture(capture, Options())
-    ratio = calibration.color_focal(plain, used_frames(plain))
+    ratio = focal_calibration.color_focal(plain, used_frames(plain))
     return plain if ratio == 1 else Reregistered(plain, ratio)
 
 
@@ -150,7 +151,7 @@ def lengths(capture: str) -> Figures:
         plain = open_capture(capture, Options(stop=count))
         if len(plain) < count:
             break
-        ratio = calibration.color_focal(plain, used_frames(plain))
+        ratio = focal_calibration.color_focal(plain, used_frames(plain))
         calibrated = time.perf_counter() - mark
         scan = plain if ratio == 1 else Reregistered(plain, ratio)
         tracker, _, seconds = tracked([(scan, Shown(range(count)))])

@@ -63,10 +63,10 @@ def _insertion() -> Figures:
 
     from freeocc3d.capture import open_capture
     from freeocc3d.capture.base import Options
-    from freeocc3d.gaussians.cells import CellSums
-    from freeocc3d.geometry import back_project, transform
+    from freeocc3d.core.transforms import back_project, transform
+    from freeocc3d.core.types import PosedFrame
+    from freeocc3d.gaussians.surface_cells import CellSums
     from freeocc3d.occupancy import carve
-    from freeocc3d.types import PosedFrame
 
     room = open_capture("builtin:room", Options(), {"synthetic": {"width": 640, "height": 480}})
     looks = [PosedFrame(room[index], room.pose(index), 0) for index in range(0, len(room), 6)]
@@ -110,7 +110,7 @@ def _codes() -> Figures:
     asked for 20 words."""
     import numpy as np
 
-    from freeocc3d.language.codec import Codec
+    from freeocc3d.language.feature_codec import Codec
 
     rng = np.random.default_rng(0)
     points = np.concatenate(
@@ -154,9 +154,9 @@ def _update() -> Figures:
     """Seconds to take one more keyframe's Gaussians into a map of a hundred, over those of making it anew."""
     import numpy as np
 
+    from freeocc3d.core.types import Frame, Intrinsics
     from freeocc3d.occupancy import carve, splat
     from freeocc3d.occupancy.incremental import IncrementalOccupancy
-    from freeocc3d.types import Frame, Intrinsics
 
     camera = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5)
     gaussians = surface_gaussians(100 * 2500)
@@ -190,10 +190,10 @@ def _asked() -> Figures:
     names are contrast words: every voxel reaches the threshold for every word, as with CLIP's raw similarities."""
     import numpy as np
 
-    from freeocc3d import query
-    from freeocc3d.language.codec import Codec, CodedFeatures
+    from freeocc3d.core.types import OCCUPIED, UNKNOWN, Occupancy
     from freeocc3d.language.encoders.base import TextEncoder, TextFeatures
-    from freeocc3d.types import OCCUPIED, UNKNOWN, Occupancy
+    from freeocc3d.language.feature_codec import Codec, CodedFeatures
+    from freeocc3d.query import word_query
 
     rng = np.random.default_rng(0)
     things = rng.normal(size=(40, FEATURES)).astype(np.float32) + 2.0  # similar to each other, as names are
@@ -224,7 +224,7 @@ def _asked() -> Figures:
     times = []
     for _ in range(4):  # the first compiles
         mark = time.perf_counter()
-        results = query.query(floor, Words(), words)
+        results = word_query.query(floor, Words(), words)
         times.append(time.perf_counter() - mark)
     found = {int(row) for result in results for region in result.regions for row in region.rows}
     return {"voxels": len(voxels), "seconds": statistics.median(times[1:]), "matched": len(found)}
@@ -235,8 +235,9 @@ def _adaptive() -> Figures:
     the blocks that voxels of 1 cm wherever there is a surface would take."""
     import numpy as np
 
-    from freeocc3d import adaptive, pipeline
-    from freeocc3d.types import OCCUPIED
+    from freeocc3d.core.types import OCCUPIED
+    from freeocc3d.editing import adaptive_voxels
+    from freeocc3d.pipeline import run as pipeline
 
     settings = {
         "capture": {"stride": 4},
@@ -245,9 +246,9 @@ def _adaptive() -> Figures:
     }
     with tempfile.TemporaryDirectory() as folder:
         room = pipeline.reconstruct("builtin:room", Path(folder) / "room", settings)
-        adaptive.refine_where_needed(room, 0.04, Path(folder) / "compiled")
+        adaptive_voxels.refine_where_needed(room, 0.04, Path(folder) / "compiled")
         mark = time.perf_counter()
-        fine = adaptive.refine_where_needed(room, 0.01, Path(folder) / "fine")
+        fine = adaptive_voxels.refine_where_needed(room, 0.01, Path(folder) / "fine")
         seconds = time.perf_counter() - mark
         made = fine.occupancy
         occupied = np.count_nonzero(made.state == OCCUPIED, axis=1)

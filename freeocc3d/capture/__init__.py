@@ -2,8 +2,8 @@
 
 from .base import Capture, Options
 from .opening import check_depth_scale, open_capture, used_frames
-from .readahead import read_ahead
-from .trajectories import PoseFile, associate, read_trajectory
+from .read_ahead import read_ahead
+from .trajectory_files import PoseFile, associate, read_trajectory
 
 __all__ = [
     "Capture",

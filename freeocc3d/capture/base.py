@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Frame
+from ..core.types import Frame
 
 NOMINAL_DEPTH = 2.0
 """The median depth that scans of unknown scale are given, as rooms have it in metres: voxels and tolerances, which are

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CaptureError, FrameError
-from ..types import Frame
+from ..core.errors import CaptureError, FrameError
+from ..core.types import Frame
 from .base import Capture, Options
-from .images import Size, image_size, metres, read_classes, read_color, read_depth
-from .registration import Grid
+from .depth_registration import Grid
+from .image_files import Size, image_size, metres, read_classes, read_color, read_depth
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from .. import registry
-from ..errors import CaptureError, ConfigError, FrameError
+from ..core.errors import CaptureError, ConfigError, FrameError
+from ..settings import registry
 from .base import Capture, Options
 
 VIDEO = "video"
@@ -134,8 +134,12 @@ def _check(options: Options) -> None:
 
 
 def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mapping[str, Any]]) -> Capture:
-    module = registry.load("capture", name)
-    extra = [registry.build_options(module, own.get(name) or {})] if registry.backends("capture")[name].options else []
+    module = registry.load("capture.readers", name)
+    extra = (
+        [registry.build_options(module, own.get(name) or {})]
+        if registry.backends("capture.readers")[name].options
+        else []
+    )
     opened: Capture = module.Reader(path, options, *extra)
     if options.scale is not None and opened.has_depth:
         raise ConfigError(
@@ -163,8 +167,8 @@ def _recognise(folder: Path) -> str:
 
 def _readers() -> dict[str, type[Capture]]:
     """Readers by name; those whose packages are not installed cannot recognise anything."""
-    names = [name for name, backend in registry.backends("capture").items() if not backend.missing]
-    return {name: registry.load("capture", name).Reader for name in names}
+    names = [name for name, backend in registry.backends("capture.readers").items() if not backend.missing]
+    return {name: registry.load("capture.readers", name).Reader for name in names}
 
 
 def _below(folder: Path, readers: Mapping[str, type[Capture]]) -> str:

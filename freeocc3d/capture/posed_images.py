@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CaptureError, FrameError
-from ..geometry import invert, project, transform
-from ..types import Frame
+from ..core.errors import CaptureError, FrameError
+from ..core.transforms import invert, project, transform
+from ..core.types import Frame
 from .base import NOMINAL_DEPTH, Capture, Options
-from .calibration import given, seen_at
-from .images import metres, read_color, read_depth
-from .rectified import Lens, Rectified
+from .camera_files import given, seen_at
+from .image_files import metres, read_color, read_depth
+from .undistortion import Lens, Rectified
 
 UNITS_PER_METRE = 1000.0
 """Of stored depth, unless ``capture.depth_scale`` says otherwise."""

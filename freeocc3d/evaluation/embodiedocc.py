@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FreeOccError
-from ..types import UNKNOWN
-from .classes import EMBODIEDOCC
+from ..core.errors import FreeOccError
+from ..core.types import UNKNOWN
 from .ground_truth import GroundTruth
-from .unpickle import load_pickle, short
+from .restricted_unpickler import load_pickle, short
+from .scored_classes import EMBODIEDOCC
 
 EMBODIEDOCC_CLASSES = ("free", *EMBODIEDOCC)
 """Names of the labels 0 … 11 of Occ-ScanNet and EmbodiedOcc-ScanNet."""

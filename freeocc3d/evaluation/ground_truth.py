@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FreeOccError, MapError
-from ..files import write_whole
-from ..store import read_arrays
-from ..types import UNKNOWN
+from ..core.atomic_files import write_whole
+from ..core.errors import FreeOccError, MapError
+from ..core.types import UNKNOWN
+from ..storage.store import read_arrays
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .. import registry
-from ..files import write_whole
-from ..store import Map
+from ..core.atomic_files import write_whole
+from ..settings import registry
+from ..storage.store import Map
 
 
 def export_map(

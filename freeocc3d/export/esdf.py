@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConfigError, ExportError
-from ..store import Map
-from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
-from .distances import LONGEST, signed
-from .frames import Placed, check_box, check_frame, placed, world_of
-from .vdb import write_vdb
+from ..core.errors import ConfigError, ExportError
+from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
+from ..storage.store import Map
+from .distance_transform import LONGEST, signed
+from .export_frames import Placed, check_box, check_frame, placed, world_of
+from .openvdb_files import write_vdb
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ExportError
-from ..store import Map
-from .frames import check_frame, to_frame, write_description
+from ..core.errors import ExportError
+from ..storage.store import Map
+from .export_frames import check_frame, to_frame, write_description
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -32,7 +32,7 @@ class Options:
 def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the Gaussians. Raises ExportError for a map without any."""
     from ..gaussians.anchors import aligned
-    from ..gaussians.standard_ply import write_standard_ply
+    from ..gaussians.splat_ply import write_standard_ply
 
     gaussians = scan_map.gaussians
     if len(gaussians) == 0:

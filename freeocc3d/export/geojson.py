@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ExportError
-from ..geometry import transform
-from ..regions import Region
-from ..store import Map
-from .frames import check_upright, to_frame
+from ..core.errors import ExportError
+from ..core.transforms import transform
+from ..query.regions import Region
+from ..storage.store import Map
+from .export_frames import check_upright, to_frame
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..errors import ConfigError, ExportError
-from ..geometry import invert
-from ..occupancy.faces import exposed_faces
-from ..store import Map
-from .frames import Placed, check_box, check_frame, placed
+from ..core.errors import ConfigError, ExportError
+from ..core.transforms import invert
+from ..occupancy.surface_faces import exposed_faces
+from ..storage.store import Map
+from .export_frames import Placed, check_box, check_frame, placed
 from .ply import COLORS, colors_of
 
 REQUIRES: tuple[str, ...] = ()

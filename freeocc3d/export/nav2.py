@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConfigError, ExportError
-from ..registry import require_positive
-from ..store import Map
-from ..types import FREE, OCCUPIED, UNKNOWN, Occupancy
-from .cost_layers import parsed, write_layers
-from .frames import check_box, check_upright, floor_z, placed, write_description
-from .map_server import PLAN, Grid, write_map
+from ..core.errors import ConfigError, ExportError
+from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
+from ..settings.registry import require_positive
+from ..storage.store import Map
+from .export_frames import check_box, check_upright, floor_z, placed, write_description
+from .keepout_masks import parsed, write_layers
+from .map_server_files import PLAN, Grid, write_map
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConfigError, ExportError
-from ..store import Map
-from ..types import FREE, OCCUPIED, UNKNOWN, Occupancy
-from .frames import check_box, check_frame, placed, world_of
+from ..core.errors import ConfigError, ExportError
+from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
+from ..storage.store import Map
+from .export_frames import check_box, check_frame, placed, world_of
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConfigError, ExportError
-from ..store import Map
-from ..types import FREE, OCCUPIED, Occupancy
-from .frames import check_box, check_frame, placed, write_description
+from ..core.errors import ConfigError, ExportError
+from ..core.types import FREE, OCCUPIED, Occupancy
+from ..storage.store import Map
+from .export_frames import check_box, check_frame, placed, write_description
 from .octree import KEY_ORIGIN, Leaves, Octree, octree
 
 REQUIRES: tuple[str, ...] = ()

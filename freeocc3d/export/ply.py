@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConfigError, ExportError
-from ..files import write_whole
-from ..occupancy.faces import exposed_faces
-from ..palette import class_colors, height_colors, highlighted, ramp
-from ..query import QueryResult
-from ..store import Map
-from ..types import OCCUPIED, Occupancy
-from .frames import Placed, check_box, check_frame, placed
+from ..core.atomic_files import write_whole
+from ..core.errors import ConfigError, ExportError
+from ..core.types import OCCUPIED, Occupancy
+from ..occupancy.surface_faces import exposed_faces
+from ..query.word_query import QueryResult
+from ..storage.store import Map
+from ..viewer.palette import class_colors, height_colors, highlighted, ramp
+from .export_frames import Placed, check_box, check_frame, placed
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConfigError, ExportError
-from ..geometry import invert, rotations_to_quats, transform
-from ..store import Map
-from ..types import Gaussians, Intrinsics
-from .frames import check_frame, to_frame, write_description
+from ..core.errors import ConfigError, ExportError
+from ..core.transforms import invert, rotations_to_quats, transform
+from ..core.types import Gaussians, Intrinsics
+from ..storage.store import Map
+from .export_frames import check_frame, to_frame, write_description
 from .ply import write_ply
 
 REQUIRES: tuple[str, ...] = ()

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..errors import ConfigError
-from ..geometry import invert, multiply_quats, rotations_to_quats
-from ..registry import require_positive
-from ..types import Frame, Gaussians, Intrinsics, PosedFrame
-from . import fusion
-from .cells import Cells, CellSums
+from ..core.errors import ConfigError
+from ..core.transforms import invert, multiply_quats, rotations_to_quats
+from ..core.types import Frame, Gaussians, Intrinsics, PosedFrame
+from ..settings.registry import require_positive
+from . import denoising
+from .surface_cells import Cells, CellSums
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class AnchoredCells:
     def _denoised(self, cells: Cells, frames: Iterable[PosedFrame]) -> Cells:
         """The cells' points where all depth images have the surface, averaged by the cells that they are in now."""
         directions = cells.points - self._T_world_keyframe[cells.keyframe, :3, 3]
-        found = fusion.denoised(cells.points, directions, frames, self.options.edge)
+        found = denoising.denoised(cells.points, directions, frames, self.options.edge)
         seen = found.weights > 0  # what no image shows, because its pixel is another point's, stays as it was measured
         moved = replace(
             cells,

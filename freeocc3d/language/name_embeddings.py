@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import read_arrays
-from ..errors import ConfigError, MapError
-from .vocabulary import key_of, synonyms
+from ..core.arrays import read_arrays
+from ..core.errors import ConfigError, MapError
+from .synonyms import key_of, synonyms
 
 _NEIGHBOURS = 10
 _ROWS = 1024

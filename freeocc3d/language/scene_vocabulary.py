@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConfigError
-from ..registry import require_positive
-from ..types import Frame
+from ..core.errors import ConfigError
+from ..core.types import Frame
+from ..settings.registry import require_positive
+from .synonyms import normal
 from .vision_server import ServerError, VisionServer, address, one_line
-from .vocabulary import normal
 
 QUESTION = (
     "Name every kind of object, furniture and surface that is clearly visible in this picture of a room, walls and "

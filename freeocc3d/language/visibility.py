@@ -20,11 +20,11 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ..geometry import invert, quats_to_rotations
-from ..types import Frame, Gaussians
+from ..core.transforms import invert, quats_to_rotations
+from ..core.types import Frame, Gaussians
 
 if TYPE_CHECKING:
-    from .lift import Options
+    from .lifting import Options
 
 _MIN_COSINE = np.float32(0.05)
 """Of a view along the surface, and of one next to a depth edge, where pixels mix both sides."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import IO, Any
 from urllib.parse import urlsplit
 
-from ..errors import ConfigError, FreeOccError
+from ..core.errors import ConfigError, FreeOccError
 
 _MOST_BYTES = 1 << 20  # of an answer
 _MOST_TOKENS = 1024

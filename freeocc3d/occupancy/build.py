@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, PosedFrame
+from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, PosedFrame
 from . import carve, splat
-from .grid import pack, union, unpack
+from .voxel_blocks import pack, union, unpack
 
 
 def build_occupancy(

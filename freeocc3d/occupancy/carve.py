@@ -9,11 +9,11 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ..errors import ConfigError
-from ..geometry import back_project, invert, transform
-from ..registry import require_positive
-from ..types import BLOCK, Frame
-from .grid import blocks_along_rays, unpack
+from ..core.errors import ConfigError
+from ..core.transforms import back_project, invert, transform
+from ..core.types import BLOCK, Frame
+from ..settings.registry import require_positive
+from .voxel_blocks import blocks_along_rays, unpack
 
 _NARROW = 64
 """Of the image's width: where no depth is measured within one such part of a pixel, the pixel is amid a wide patch, and

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import OCCUPIED, Frame, Gaussians, Occupancy
+from ..core.types import OCCUPIED, Frame, Gaussians, Occupancy
 from . import build, carve, splat
-from .grid import pack, union, unpack
 from .levels import chosen_blocks, says_something
+from .voxel_blocks import pack, union, unpack
 
 
 @dataclass(frozen=True)

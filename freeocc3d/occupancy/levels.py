@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
+from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
 from .build import normalized
-from .grid import pack, unpack
+from .voxel_blocks import pack, unpack
 
 PER_BLOCK = "keys", "probability", "free", "hits", "state"
 """Arrays of an ``Occupancy`` with a row for each block."""

@@ -40,12 +40,12 @@ from numba import get_num_threads, njit, prange, types
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from ..errors import ConfigError
-from ..hashing import build_table, find
-from ..registry import require_positive
-from ..types import BLOCK, Gaussians
-from .grid import packed_key, touched_blocks, union
-from .mass import box_masses
+from ..core.errors import ConfigError
+from ..core.hash_table import build_table, find
+from ..core.types import BLOCK, Gaussians
+from ..settings.registry import require_positive
+from .gaussian_mass import box_masses
+from .voxel_blocks import packed_key, touched_blocks, union
 
 _PROBABILISTIC, _POISSON, _INTEGRATED, _RELEASED = range(4)
 _MODES = {"probabilistic": _PROBABILISTIC, "poisson": _POISSON, "integrated": _INTEGRATED, "released": _RELEASED}

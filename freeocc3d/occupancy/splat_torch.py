@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..errors import ConfigError, DependencyError
-from ..types import BLOCK
-from .grid import KEY_LIMIT, pack
+from ..core.errors import ConfigError, DependencyError
+from ..core.types import BLOCK
+from .voxel_blocks import KEY_LIMIT, pack
 
 if TYPE_CHECKING:
     from .splat import Bins

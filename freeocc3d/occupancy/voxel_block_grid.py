@@ -12,9 +12,9 @@ import open3d as o3d
 import open3d.core as o3c
 from numpy.typing import NDArray
 
-from ..errors import FreeOccError
-from ..types import BLOCK, OCCUPIED, Occupancy
-from .grid import pack
+from ..core.errors import FreeOccError
+from ..core.types import BLOCK, OCCUPIED, Occupancy
+from .voxel_blocks import pack
 
 _PER_VOXEL = {"probability": np.float32, "free": np.uint16, "hits": np.uint16, "state": np.uint8}
 _OF_OCCUPIED = {"color": np.uint8, "feature": np.float32}

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..progress import Progress
-from ..types import Frame, Submap, Trajectory
+from ..core.progress import Progress
+from ..core.types import Frame, Submap, Trajectory
 from .pose_graph import Edge, edges_to_arrays
 from .records import Records
 
 if TYPE_CHECKING:
-    from .stereo import scan_depth
+    from ..depth import multi_view_stereo
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Tracker(ABC):
     """Whether ``prepare`` works through the whole scan before the first frame is tracked."""
     warnings: tuple[str, ...] = ()
     """What ``prepare`` found that the user should know."""
-    stereo: scan_depth.Options
+    stereo: multi_view_stereo.Options
     """How depth is measured where the capture has none; set before ``prepare``."""
 
     def __init__(self) -> None:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry import back_project, invert, project, transform
-from ..types import Intrinsics
+from ..core.transforms import back_project, invert, project, transform
+from ..core.types import Intrinsics
 
 
 def sample_points(depth_m: NDArray[np.float32], intrinsics: Intrinsics, step: int = 8) -> NDArray[np.float32]:

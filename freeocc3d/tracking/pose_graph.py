@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from ..geometry import apart, invert, nearest_rigid
+from ..core.transforms import apart, invert, nearest_rigid
 
 _SWEEPS = 6
 _HELD_M, _HELD_DEG = 0.1, 5.0

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..types import Submap, Trajectory
+from ..core.types import Submap, Trajectory
 from .pose_graph import Edge, holds
 
 STATUSES = ("unused", "lost", "tracked", "keyframe", "relocalised", "interpolated", "apart")

@@ -20,7 +20,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ...types import Intrinsics
+from ...core.types import Intrinsics
 
 BLUR = 0.3
 """Variance in pixels^2 that every splat is widened by: none is smaller than a pixel."""

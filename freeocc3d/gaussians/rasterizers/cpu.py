@@ -11,7 +11,7 @@ from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...types import Intrinsics
+from ...core.types import Intrinsics
 from .base import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR, TRANSMITTANCE_MIN, Rendered, slope_limits
 
 REQUIRES: tuple[str, ...] = ()

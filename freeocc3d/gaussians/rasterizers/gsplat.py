@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...errors import DependencyError
-from ...types import Intrinsics
+from ...core.errors import DependencyError
+from ...core.types import Intrinsics
 from .base import BLUR, NEAR, Rendered
 
 REQUIRES = ("gsplat",)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...types import Intrinsics
+from ...core.types import Intrinsics
 from .base import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR, TRANSMITTANCE_MIN, Rendered, slope_limits
 
 REQUIRES: tuple[str, ...] = ()

@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import ConfigError
-from ...types import Frame
+from ...core.errors import ConfigError
+from ...core.types import Frame
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import ConfigError
-from ...types import Frame
-from .. import models
-from ..words import CONTRAST, TEMPLATES, ModelWords, Wording
+from ...core.errors import ConfigError
+from ...core.types import Frame
+from .. import model_packages
+from ..text_networks import CONTRAST, TEMPLATES, ModelWords, Wording
 from .base import Encoder, require_sizes
 
 if TYPE_CHECKING:
-    from ..dense import Tiling
+    from ..patch_features import Tiling
 
 REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
 
@@ -64,7 +64,7 @@ class ClipEncoder(Encoder):
 
     name: ClassVar[str] = "clip"
 
-    def __init__(self, package: models.Package, options: Options):
+    def __init__(self, package: model_packages.Package, options: Options):
         self.package = package
         self.options = options
         self.dimension = package.dimension
@@ -72,13 +72,13 @@ class ClipEncoder(Encoder):
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16, or (rows, columns, D) of patches."""
-        from ..dense import finished
+        from ..patch_features import finished
 
         return finished(self.patches(frame.color), frame.color, self.options.stride)
 
     def patches(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(rows, columns, D) unit features of the patches of (H, W, 3) pixels."""
-        from ..dense import Splice, Tiling, unit
+        from ..patch_features import Splice, Tiling, unit
 
         options, package = self.options, self.package
         window = package.input_size if options.window is None else options.window
@@ -90,23 +90,23 @@ class ClipEncoder(Encoder):
 
     def _window_features(self, images: NDArray[np.float32], tiling: Tiling) -> NDArray[np.float32]:
         """(B, h, w, D) of (B, 3, H, W) windows."""
-        from .. import attention
+        from .. import clip_attention
 
         chosen = self.options.attention
         q, k, v, stream = self._image.run(["queries", "keys", "values", "stream"], {"image": images})
-        mixed = attention.mixed(chosen, q, k, v, tiling.window)
-        output = "features" if attention.KEEPS_REST[chosen] else "reduced"
+        mixed = clip_attention.mixed(chosen, q, k, v, tiling.window)
+        output = "features" if clip_attention.KEEPS_REST[chosen] else "reduced"
         (features,) = self._head.run([output], {"mixed": mixed, "stream": stream})
         h, w = tiling.window
         return np.asarray(features[:, -h * w :].reshape(len(images), h, w, -1))
 
     def pooled(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
         """(B, D) the network's own embeddings of (B, 3, H, W) normalised images; H and W multiples of the patch."""
-        from .. import attention
+        from .. import clip_attention
 
         q, k, v, stream = self._image.run(["queries", "keys", "values", "stream"], {"image": images})
         grid = images.shape[2] // self.package.patch, images.shape[3] // self.package.patch
-        mixed = attention.mixed("plain", q, k, v, grid)
+        mixed = clip_attention.mixed("plain", q, k, v, grid)
         return np.asarray(self._head.run(["pooled"], {"mixed": mixed, "stream": stream})[0])
 
     def text_state(self) -> dict[str, Any]:
@@ -117,9 +117,9 @@ NEEDS_CAPTURE = False
 """The keyframes alone are enough to encode them again."""
 
 
-def check(options: Options) -> models.Package:
+def check(options: Options) -> model_packages.Package:
     """The model that is named. Raises ModelError if it is not there."""
-    return models.find(options.model, ("clip",), "language.clip.model")
+    return model_packages.find(options.model, ("clip",), "language.clip.model")
 
 
 def load(options: Options, capture: object = None) -> ClipEncoder:

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
-from ...errors import ConfigError, MapError
-from ...types import Frame
+from ...core.errors import ConfigError, MapError
+from ...core.types import Frame
 from .base import Encoder, TextEncoder, TextFeatures
 
 REQUIRES: tuple[str, ...] = ()

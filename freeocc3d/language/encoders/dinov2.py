@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...types import Frame
-from .. import models
-from ..words import CONTRAST, TEMPLATES, ModelWords, Wording
+from ...core.types import Frame
+from .. import model_packages
+from ..text_networks import CONTRAST, TEMPLATES, ModelWords, Wording
 from .base import Encoder, require_sizes
 
 REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
@@ -54,7 +54,7 @@ class Dinov2Encoder(Encoder):
 
     name: ClassVar[str] = "dinov2"
 
-    def __init__(self, package: models.Package, options: Options):
+    def __init__(self, package: model_packages.Package, options: Options):
         self.package = package
         self.options = options
         self.dimension = package.dimension
@@ -62,7 +62,7 @@ class Dinov2Encoder(Encoder):
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16, or (rows, columns, D) of patches."""
-        from ..dense import Splice, Tiling, finished, unit
+        from ..patch_features import Splice, Tiling, finished, unit
 
         options, package, rgb = self.options, self.package, frame.color
         window = package.input_size if options.window is None else options.window
@@ -80,9 +80,9 @@ NEEDS_CAPTURE = False
 """The keyframes alone are enough to encode them again."""
 
 
-def check(options: Options) -> models.Package:
+def check(options: Options) -> model_packages.Package:
     """The model that is named. Raises ModelError if it is not there."""
-    return models.find(options.model, ("dense",), "language.dinov2.model")
+    return model_packages.find(options.model, ("dense",), "language.dinov2.model")
 
 
 def load(options: Options, capture: object = None) -> Dinov2Encoder:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
-from ...errors import CaptureError, ConfigError
-from ...types import Frame
-from .. import vocabulary
-from ..class_names import read_names
+from ...core.errors import CaptureError, ConfigError
+from ...core.types import Frame
+from .. import synonyms
+from ..class_files import read_names
 from .base import Encoder, TextEncoder, TextFeatures
 
 REQUIRES: tuple[str, ...] = ()
@@ -116,7 +116,7 @@ class LabelWords(TextEncoder):
 
     def matching(self, word: str) -> tuple[list[int], str]:
         """Dimensions of the classes that a phrase means, and the part of it that was used."""
-        return vocabulary.matching_names(word, self.classes[1:])
+        return synonyms.matching_names(word, self.classes[1:])
 
     def contrast_words(self) -> list[str]:
         return self.classes[1:]

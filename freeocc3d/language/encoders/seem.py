@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import ConfigError
-from ...types import Frame
-from .. import models
-from ..words import CONTRAST, TEMPLATES, ModelWords, Wording
+from ...core.errors import ConfigError
+from ...core.types import Frame
+from .. import model_packages
+from ..text_networks import CONTRAST, TEMPLATES, ModelWords, Wording
 from .base import Encoder, require_sizes
 
 REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
@@ -59,7 +59,7 @@ class SeemEncoder(Encoder):
 
     name: ClassVar[str] = "seem"
 
-    def __init__(self, package: models.Package, options: Options):
+    def __init__(self, package: model_packages.Package, options: Options):
         self.package = package
         self.options = options
         self.dimension = package.dimension
@@ -67,7 +67,7 @@ class SeemEncoder(Encoder):
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(h, w, D) float16, at the masks' resolution; zero where no mask is sure."""
-        from ..dense import Tiling
+        from ..patch_features import Tiling
 
         package, rgb = self.package, frame.color
         tiling = Tiling.of(rgb.shape[0], rgb.shape[1], package, self.options.short_side, 0)
@@ -83,7 +83,7 @@ def painted(
     masks: NDArray[np.float32], embeddings: NDArray[np.float32], least_probability: float
 ) -> NDArray[np.float16]:
     """(h, w, D) unit embeddings of the masks, (Q, h, w) logits, that cover each pixel best; zero where none does."""
-    from ..dense import unit
+    from ..patch_features import unit
 
     best = masks.argmax(axis=0)
     features = unit(embeddings).astype(np.float16)[best]
@@ -95,9 +95,9 @@ NEEDS_CAPTURE = False
 """The keyframes alone are enough to encode them again."""
 
 
-def check(options: Options) -> models.Package:
+def check(options: Options) -> model_packages.Package:
     """The model that is named. Raises ModelError if it is not there."""
-    return models.find(options.model, ("masks",), "language.seem.model")
+    return model_packages.find(options.model, ("masks",), "language.seem.model")
 
 
 def load(options: Options, capture: object = None) -> SeemEncoder:

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
-from ...errors import ConfigError, FrameError
-from ...onnx_model import load_session
-from ...registry import nearest
-from ...types import Frame
-from .. import vocabulary
-from ..class_names import read_mapping, read_names
+from ...core.errors import ConfigError, FrameError
+from ...core.onnx_session import load_session
+from ...core.types import Frame
+from ...settings.registry import nearest
+from .. import synonyms
+from ..class_files import read_mapping, read_names
 from ..name_embeddings import NameEmbeddings
 from .base import Encoder
 from .labels import LabelWords
@@ -234,11 +234,11 @@ class SegmenterWords(LabelWords):
     def matching(self, word: str) -> tuple[list[int], str]:
         """Of the parts of a phrase, most specific first, the first that either knows."""
         found, used = super().matching(word)
-        for part in vocabulary.parts_of(word):
+        for part in synonyms.parts_of(word):
             if part == used:
                 break
-            if vocabulary.key_of(part) in self.aliases:
-                return [self.aliases[vocabulary.key_of(part)]], part
+            if synonyms.key_of(part) in self.aliases:
+                return [self.aliases[synonyms.key_of(part)]], part
         return found, used
 
 
@@ -292,8 +292,8 @@ def _void(names: tuple[str, ...], options: Options) -> NDArray[np.bool_]:
 
 def _aliases(names: NameEmbeddings, classes: tuple[str, ...]) -> dict[str, int]:
     """Names that mean a class by their embeddings, and that the vocabulary knows nothing of."""
-    known = {name: vocabulary.matching_names(name, list(classes))[1] for name in names.names}
-    whole = {vocabulary.key_of(name) for name, part in known.items() if part == vocabulary.normal(name)}
+    known = {name: synonyms.matching_names(name, list(classes))[1] for name in names.names}
+    whole = {synonyms.key_of(name) for name, part in known.items() if part == synonyms.normal(name)}
     return {key: row for key, row in names.meaning(classes).items() if key not in whole}
 
 

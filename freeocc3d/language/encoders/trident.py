@@ -22,14 +22,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import ConfigError
-from ...types import Frame
-from .. import models
-from ..words import CONTRAST, TEMPLATES, ModelWords, Wording
+from ...core.errors import ConfigError
+from ...core.types import Frame
+from .. import model_packages
+from ..text_networks import CONTRAST, TEMPLATES, ModelWords, Wording
 from .base import Encoder, require_sizes
 
 if TYPE_CHECKING:
-    from ..dense import Tiling
+    from ..patch_features import Tiling
 
 REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
 
@@ -91,7 +91,9 @@ class TridentEncoder(Encoder):
 
     name: ClassVar[str] = "trident"
 
-    def __init__(self, clip: models.Package, dino: models.Package, sam: models.Package, options: Options):
+    def __init__(
+        self, clip: model_packages.Package, dino: model_packages.Package, sam: model_packages.Package, options: Options
+    ):
         self.clip, self.dino, self.sam = clip, dino, sam
         self.options = options
         self.dimension = clip.dimension
@@ -101,7 +103,7 @@ class TridentEncoder(Encoder):
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16, or (h, w, D) at SAM's grid, twice as fine with masks."""
-        from ..dense import finished, resampled
+        from ..patch_features import finished, resampled
 
         rgb = frame.color
         spliced = self.spliced(rgb)
@@ -118,7 +120,7 @@ class TridentEncoder(Encoder):
 
     def spliced(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(rows, columns, width) CLIP's values, mixed by DINO's correlation in each window; the windows' mean."""
-        from ..dense import Splice, Tiling
+        from ..patch_features import Splice, Tiling
 
         options, clip, dino = self.options, self.clip, self.dino
         window = clip.input_size if options.window is None else options.window
@@ -138,7 +140,7 @@ class TridentEncoder(Encoder):
         return splice.mean()
 
     def _mixed(self, values: NDArray[np.float32], seen: NDArray[np.float32], tiling: Tiling) -> NDArray[np.float32]:
-        from ..attention import joined
+        from ..clip_attention import joined
 
         h, w = tiling.window
         patches = joined(values)[:, -h * w :]
@@ -148,7 +150,7 @@ class TridentEncoder(Encoder):
 
     def _in_words(self, mixed: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N, D) unit features of (N, width) mixed values."""
-        from ..dense import unit
+        from ..patch_features import unit
 
         (features,) = self._head.run(["reduced"], {"mixed": mixed[None], "stream": np.zeros_like(mixed[None])})
         return unit(features[0])
@@ -156,7 +158,7 @@ class TridentEncoder(Encoder):
     def _sam_view(self, rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[int, int]]:
         """SAM's features (1, C, n, n), attention (1, n n, n n), and the (rows, columns) of them that show the frame: it
         lies at the upper left of a square."""
-        from ..dense import Tiling
+        from ..patch_features import Tiling
 
         size, patch = self.sam.input_size, self.sam.patch
         long, short = max(rgb.shape[:2]), min(rgb.shape[:2])
@@ -170,7 +172,7 @@ class TridentEncoder(Encoder):
 
     def _refined(self, features: NDArray[np.float32], sam_features: NDArray[np.float32]) -> NDArray[np.float32]:
         """(2 h, 2 w, D) features of (h, w, D), brought together within SAM's masks."""
-        from ..dense import resampled, unit
+        from ..patch_features import resampled, unit
 
         h, w = features.shape[:2]
         spacing = max(h, w) / self.options.points * self.sam.patch
@@ -195,8 +197,8 @@ class TridentEncoder(Encoder):
 def correlation(seen: NDArray[np.float32], beta: float, gamma: float) -> NDArray[np.float32]:
     """(N, N) attention from the cosines of (N, C) features: those below beta times their mean get nothing; a patch
     always attends to itself."""
-    from ..attention import softmax
-    from ..dense import unit
+    from ..clip_attention import softmax
+    from ..patch_features import unit
 
     u = unit(seen)
     cosines = u @ u.T
@@ -209,7 +211,7 @@ def correlation(seen: NDArray[np.float32], beta: float, gamma: float) -> NDArray
 def gathering(attention: NDArray[np.float32], seen: NDArray[np.float32], cosine: float) -> NDArray[np.float32]:
     """(N, N) attention without the pairs of patches whose (N, C) features are less alike than ``cosine`` times the
     mean, rows summing to 1."""
-    from ..dense import unit
+    from ..patch_features import unit
 
     u = unit(seen)
     cosines = u @ u.T
@@ -237,12 +239,12 @@ NEEDS_CAPTURE = False
 """The keyframes alone are enough to encode them again."""
 
 
-def check(options: Options) -> tuple[models.Package, models.Package, models.Package]:
+def check(options: Options) -> tuple[model_packages.Package, model_packages.Package, model_packages.Package]:
     """The models that are named: CLIP, DINO and SAM. Raises ModelError if one is not there."""
     return (
-        models.find(options.model, ("clip",), "language.trident.model"),
-        models.find(options.dino, ("backbone",), "language.trident.dino"),
-        models.find(options.sam, ("sam",), "language.trident.sam"),
+        model_packages.find(options.model, ("clip",), "language.trident.model"),
+        model_packages.find(options.dino, ("backbone",), "language.trident.dino"),
+        model_packages.find(options.sam, ("sam",), "language.trident.sam"),
     )
 
 

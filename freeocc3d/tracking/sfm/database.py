@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ...types import Intrinsics
+from ...core.types import Intrinsics
 from .local_features import LocalFeatures
 
 _BYTES = pycolmap.FeatureExtractorType.SIFT

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...errors import TrackingError
+from ...core.errors import TrackingError
 from .database import SfmDatabase
 
 LEAST_IMAGES = 5

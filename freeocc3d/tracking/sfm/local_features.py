@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import ModelError
+from ...core.errors import ModelError
 
 SIFT = "sift"
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import read_arrays
 from ...capture.base import NOMINAL_DEPTH
-from ...capture.rectified import Lens, Rectified
-from ...types import Intrinsics
+from ...capture.undistortion import Lens, Rectified
+from ...core.arrays import read_arrays
+from ...core.types import Intrinsics
 
 _EXPECTED = {
     "T_world_cam": ("f", 3), "camera": ("f", 1), "points": ("f", 2), "seen_frame": ("i", 1), "seen_point": ("i", 1),

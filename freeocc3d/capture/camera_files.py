@@ -1,0 +1,203 @@
+"""Camera parameters and poses in text files: read, and refused with a sentence where they cannot be true."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import CaptureError
+from ..core.transforms import is_rigid
+from ..core.types import Intrinsics
+from .base import Options
+from .image_files import Size
+
+ASPECT_TOLERANCE = 0.02
+"""Relative difference of two aspect ratios up to which two images are taken to show the same view (ScanNet's colour and
+depth differ by 0.4 %, a 16:9 and a 4:3 image by 33 %)."""
+
+MAX_SKEW_PX = 1.0
+"""Calibrations state tiny skews that no pixel notices; the camera model here has none."""
+
+
+USUAL_FOCAL = 0.85
+"""Focal length over the longer side of an image where nothing says it: between a phone's main camera (a 24 to 28 mm
+equivalent: 0.72 to 0.78 of a photograph, 0.8 to 0.95 of a video, which stabilisation crops) and the 0.82 to 0.96 of
+depth cameras' colour images; within a fifth of all of them, from where it can be estimated."""
+
+
+DIAGONAL_35MM = 43.27
+"""Of the 36 x 24 mm frame, millimetres."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """fx, fy, cx, cy in pixels, the image size that they are meant for (None = that of the images found), and where
+    they were read, for messages."""
+
+    values: tuple[float, float, float, float]
+    size: Size | None
+    source: str
+
+    def camera(self, size: Size) -> Intrinsics:
+        """The camera of images of ``size``. Parameters meant for another size of the same view are rescaled.
+
+        Raises CaptureError: not finite, focal length not positive, principal point outside of the image, another view.
+        """
+        fx, fy, cx, cy = self.values
+        if not np.isfinite(self.values).all() or fx <= 0 or fy <= 0:
+            raise CaptureError(
+                f"{self.source} holds unusable intrinsics (fx, fy, cx, cy = {fx:g}, {fy:g}, {cx:g}, {cy:g}): "
+                "correct it, or give capture.intrinsics."
+            )
+        width, height = self.size or size
+        if min(width, height) <= 0 or not same_view((width, height), size):
+            raise CaptureError(
+                f"{self.source} is for images of {width} x {height} pixels, but they have {size[0]} x {size[1]}: "
+                "correct it, or give capture.intrinsics."
+            )
+        if not (0 <= cx <= width and 0 <= cy <= height):
+            raise CaptureError(
+                f"{self.source} puts the principal point at ({cx:g}, {cy:g}), outside of the {width} x {height} image, "
+                "as if it were for another resolution: correct it, or give capture.intrinsics."
+            )
+        return Intrinsics(width, height, fx, fy, cx, cy).resized(*size)
+
+
+def same_view(a: Size, b: Size) -> bool:
+    """Whether images of these sizes can show the same view, which is so if they have the same aspect ratio."""
+    return abs(a[0] * b[1] / (a[1] * b[0]) - 1.0) < ASPECT_TOLERANCE
+
+
+def seen_at(camera: Intrinsics, size: Size) -> Intrinsics:
+    """The camera of images of ``size`` that show the same view. Raises CaptureError if they cannot."""
+    if not same_view((camera.width, camera.height), size):
+        raise CaptureError(
+            f"One camera cannot have taken images of {camera.width} x {camera.height} and of {size[0]} x {size[1]} "
+            "pixels: colour and depth need a calibration each (the scannet layout has room for both)."
+        )
+    return camera.resized(*size)
+
+
+def usual(size: Size) -> Intrinsics:
+    """A guess at the camera of images of ``size`` of which nothing is known."""
+    width, height = size
+    focal = USUAL_FOCAL * max(size)
+    return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def equivalent(focal_35mm: float, size: Size) -> Intrinsics | None:
+    """The camera of images of ``size`` whose lens is stated as the focal length in millimetres of a 35 mm camera with
+    the same view across its diagonal; None where it cannot be one."""
+    if not 8 <= focal_35mm <= 500:
+        return None
+    width, height = size
+    focal = focal_35mm / DIAGONAL_35MM * float(np.hypot(width, height))
+    return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def reduced(camera: Intrinsics, max_size: int | None) -> Intrinsics:
+    """The camera of the same images, reduced such that their longer side has no more than ``max_size`` pixels."""
+    longer = max(camera.width, camera.height)
+    if max_size is None or longer <= max_size:
+        return camera
+    width, height = (max(1, round(side * max_size / longer)) for side in (camera.width, camera.height))
+    return camera.resized(width, height)
+
+
+def given(options: Options) -> Calibration | None:
+    """What ``capture.intrinsics`` says of the colour camera."""
+    return Calibration(options.intrinsics, None, "capture.intrinsics") if options.intrinsics else None
+
+
+def read_intrinsics(path: Path) -> Calibration:
+    """From a text file with K (3 x 3, or 4 x 4 with K in its corner), or an Open3D camera file (``.json``).
+
+    Raises CaptureError naming the file.
+    """
+    if path.suffix == ".json":
+        return _open3d_intrinsics(path)
+    matrix = read_matrix(path)
+    if matrix is None or matrix.shape not in ((3, 3), (4, 4)):
+        raise CaptureError(f"{path} must hold a camera matrix of 3 x 3 or 4 x 4 numbers.")
+    return _from_matrix(matrix[:3, :3], None, path)
+
+
+def read_rigid(path: Path) -> NDArray[np.float64]:
+    """(4, 4) rigid transform. Raises CaptureError naming the file."""
+    matrix = read_matrix(path)
+    if matrix is None or not is_rigid(matrix):
+        raise CaptureError(f"{path} must hold a rigid transform of 4 x 4 numbers: correct or remove it.")
+    return matrix
+
+
+def read_pose(path: Path) -> NDArray[np.float64] | None:
+    """(4, 4) T_world_cam, or None if there is no such file or what it holds is not a rigid transform (ScanNet writes
+    -inf where tracking was lost)."""
+    matrix = read_matrix(path) if path.is_file() else None
+    return matrix if matrix is not None and is_rigid(matrix) else None
+
+
+def read_matrix(path: Path) -> NDArray[np.float64] | None:
+    """The (rows, columns) numbers of a text file, or None if it holds anything else. Raises CaptureError if it cannot
+    be read at all."""
+    rows = [line.replace(",", " ").split() for line in read_text(path).splitlines() if line.strip()]
+    try:
+        return np.array(rows, np.float64, ndmin=2)
+    except ValueError:  # rows of unequal length, or words
+        return None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object. Raises CaptureError naming the file."""
+    try:
+        content = json.loads(read_text(path))
+    except ValueError as error:
+        raise CaptureError(f"{path} is not valid JSON: {error}.") from error
+    if not isinstance(content, dict):
+        raise CaptureError(f"{path} must hold a JSON object.")
+    return content
+
+
+def read_class_names(path: Path) -> tuple[str, ...]:
+    """The names in a ``{"classes": ["nothing", …]}`` file, or none if there is no such file. Raises CaptureError."""
+    if not path.is_file():
+        return ()
+    names = read_json(path).get("classes")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or len(names) > 255:
+        raise CaptureError(f'{path} must hold {{"classes": ["nothing", "name of class 1", …]}}, at most 255 of them.')
+    return tuple(names)
+
+
+def read_text(path: Path) -> str:
+    """The text of a file. Raises CaptureError."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise CaptureError(f"Cannot read {path}: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise CaptureError(f"{path} is not a text file.") from error
+
+
+def _open3d_intrinsics(path: Path) -> Calibration:
+    """PinholeCameraIntrinsic as Open3D writes it: ``intrinsic_matrix`` is column-major."""
+    content = read_json(path)
+    try:
+        matrix = np.array(content["intrinsic_matrix"], np.float64).reshape(3, 3).T
+        size = int(content["width"]), int(content["height"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise CaptureError(f"{path} must hold width, height and an intrinsic_matrix of 9 numbers.") from error
+    return _from_matrix(matrix, size, path)
+
+
+def _from_matrix(K: NDArray[np.float64], size: Size | None, path: Path) -> Calibration:
+    if not np.isfinite(K).all():
+        raise CaptureError(f"{path} holds NaN or infinite numbers: correct it, or give capture.intrinsics.")
+    if np.abs(K[2] - (0, 0, 1)).max() > 1e-6 or abs(K[1, 0]) > MAX_SKEW_PX or abs(K[0, 1]) > MAX_SKEW_PX:
+        raise CaptureError(f"{path} is not a camera matrix: it must read fx 0 cx / 0 fy cy / 0 0 1.")
+    fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return Calibration((fx, fy, cx, cy), size, str(path))

@@ -1,0 +1,134 @@
+"""Image files to arrays: whole or an error. A cut-off file is told from a whole one by its end marker, because some
+decoders return the part of a JPEG that is there, and grey for the rest."""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import CaptureError, FrameError
+
+Size = tuple[int, int]
+"""Width and height in pixels."""
+
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+TAIL_BYTES = 4096
+"""Cameras may append bytes after the end marker; it is looked for in this many last bytes."""
+
+SATURATED = np.iinfo(np.uint16).max
+"""What sensors and renderers store where the depth does not fit into 16 bits."""
+
+
+def read_color(path: Path) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB, as stored: an EXIF orientation is not applied, for depth and intrinsics know nothing of it.
+
+    Raises FrameError if the file is missing, cut off or not an image.
+    """
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+
+
+def read_depth(path: Path) -> NDArray[np.uint16]:
+    """(H, W) uint16 depth as stored. Raises FrameError, also for an image that is not 16-bit grey."""
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise FrameError(f"{path} is not a depth image: expected 16-bit grey, got {_kind(image)}.")
+    return image
+
+
+def read_classes(path: Path, count: int) -> NDArray[np.uint8]:
+    """(H, W) class image with values below ``count``; 255, which many programs write for "nothing", becomes 0 unless it
+    has a name. Raises FrameError, also for a value that has no class."""
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        raise FrameError(f"{path} is not a class image: expected 8- or 16-bit grey, got {_kind(image)}.")
+    if count <= 255:
+        image[image == 255] = 0
+    if (largest := int(image.max())) >= count:
+        raise FrameError(f"{path} holds class {largest}, but only {count} classes are named (0…{count - 1}).")
+    return image.astype(np.uint8, copy=False)
+
+
+def metres(raw: NDArray[np.uint16], units_per_metre: float, max_depth: float) -> NDArray[np.float32]:
+    """Stored depth to float32 metres; saturated values and those beyond ``max_depth`` metres become 0."""
+    depth_m = raw.astype(np.float32)
+    depth_m *= np.float32(1.0 / units_per_metre)
+    limit = min(max_depth, (SATURATED - 0.5) / units_per_metre)
+    return cv2.threshold(depth_m, limit, 0.0, cv2.THRESH_TOZERO_INV, dst=depth_m)[1]
+
+
+def image_size(path: Path) -> Size:
+    """Width and height from the header of a PNG or JPEG; nothing is decoded. Raises FrameError."""
+    data = _read(path)
+    if data.startswith(PNG_START) and len(data) >= 24:
+        return struct.unpack(">II", data[16:24])
+    if data.startswith(JPEG_START) and (size := _jpeg_size(data)):
+        return size
+    raise FrameError(f"{path} is not a PNG or JPEG image.")
+
+
+def numbered(folder: Path, pattern: str) -> dict[int, Path]:
+    """Files of ``folder`` whose whole name matches ``pattern``, by the number in its first group.
+
+    Raises CaptureError if two files have the same number.
+    """
+    expression, found = re.compile(pattern, re.IGNORECASE), dict[int, Path]()
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if match := expression.fullmatch(path.name):
+            other = found.setdefault(int(match[1]), path)
+            if other is not path:
+                raise CaptureError(
+                    f"{folder} holds two files of frame {int(match[1])}, {other.name} and {path.name}: remove one."
+                )
+    return found
+
+
+def holds(folder: Path, pattern: str) -> bool:
+    """Whether a file of ``folder`` has a name that matches ``pattern``."""
+    expression = re.compile(pattern, re.IGNORECASE)
+    return folder.is_dir() and any(expression.fullmatch(path.name) for path in folder.iterdir())
+
+
+def _decode(path: Path, flags: int) -> NDArray[Any]:
+    data = _read(path)
+    tail = data[-TAIL_BYTES:]
+    if (data.startswith(JPEG_START) and JPEG_END not in tail) or (data.startswith(PNG_START) and PNG_END not in tail):
+        raise FrameError(f"{path} is cut off: its end is missing ({len(data)} bytes).")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if image is None:
+        raise FrameError(f"{path} is not a readable image ({len(data)} bytes).")
+    return image
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FrameError(f"Cannot read {path}: {error.strerror}.") from error
+
+
+def _jpeg_size(data: bytes) -> Size | None:
+    """From the start-of-frame segment (ITU T.81, B.2.2), which follows segments that state their own length."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # a fill byte
+            at += 1
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            return width, height
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
+
+
+def _kind(image: NDArray[np.generic]) -> str:
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    return f"{8 * image.itemsize}-bit with {channels} channel{'s' if channels > 1 else ''}"

@@ -1,0 +1,38 @@
+"""Decodes frames on a second thread while the first one works on the frames before them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from ..core.errors import FrameError
+from ..core.types import Frame
+from .base import Capture
+
+
+def read_ahead(capture: Capture, indices: Iterable[int], depth: int = 4) -> Generator[tuple[int, Frame | FrameError]]:
+    """Yield ``(index, frame)`` in the order of ``indices``, or ``(index, error)`` for a frame that is broken.
+
+    depth: how many frames are decoded ahead of use, and so how many are held in memory besides the one in use.
+    Raises what the capture raises, other than FrameError, at the frame concerned. When the generator is left early, by
+    ``break`` or an exception, the thread finishes the frame it is at and ends.
+    """
+    pending: deque[Future[tuple[int, Frame | FrameError]]] = deque()
+    executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="read-ahead")
+    try:
+        for index in indices:
+            pending.append(executor.submit(_read, capture, index))
+            if len(pending) > depth:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _read(capture: Capture, index: int) -> tuple[int, Frame | FrameError]:
+    try:
+        return index, capture[index]
+    except FrameError as error:
+        return index, error.with_traceback(None)  # it would hold on to the bytes of the file

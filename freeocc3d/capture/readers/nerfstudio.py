@@ -1,0 +1,105 @@
+"""nerfstudio folders: transforms.json with images, poses and, as exported by LiDAR apps, depth.
+
+Source: nerfstudio's "Data conventions".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import CaptureError
+from ...core.types import Intrinsics
+from ..base import Options
+from ..camera_files import Calibration, read_json
+from ..posed_images import PosedImage, PosedImages, inside, nominal_scale
+from ..trajectory_files import read_trajectory
+from ..undistortion import Lens
+from .photos import natural, read_header
+
+REQUIRES: tuple[str, ...] = ()
+
+TRANSFORMS = "transforms.json"
+
+_MODELS = {"OPENCV": False, "PINHOLE": False, "SIMPLE_PINHOLE": False, "SIMPLE_RADIAL": False, "RADIAL": False,
+           "OPENCV_FISHEYE": True}  # fmt: skip
+"""Whether a camera model is a fisheye's."""
+
+
+class Reader(PosedImages):
+    """Frames are in the natural order of their files' names. Intrinsics stand in the file or in each frame, with the
+    origin at the corner of the first pixel; poses are of OpenGL cameras; depth is 16-bit millimetres, of any size.
+
+    Poses that come with depth are in metres, whether it is read or not; others are in the file's unit, of which
+    ``capture.scale`` says how many metres it is; without it, the file's points, if it has any, are scaled to a median
+    depth of ``NOMINAL_DEPTH``. Raises CaptureError, naming the file, for what it lacks.
+    """
+
+    format = "nerfstudio"
+    layout = f"{TRANSFORMS} with images"
+
+    def __init__(self, path: Path, options: Options):
+        file = path / TRANSFORMS
+        content = read_json(file)
+        poses = read_trajectory(file).T_world_cam  # checks that there are frames with paths and poses
+        posed = []
+        for frame, T_world_cam in zip(content["frames"], poses, strict=True):
+            image = inside(path, str(frame["file_path"]), file)
+            if not image.suffix:  # as in NeRF's synthetic scenes
+                image = image.with_suffix(".png")
+            depth = frame.get("depth_file_path") if options.depth else None
+            depth_path = None if depth is None else inside(path, str(depth), file)
+            posed.append(PosedImage(image, depth_path, _lens({**content, **frame}, image, file), T_world_cam))
+        posed.sort(key=lambda view: natural(view.image))
+        comes_with_depth = any("depth_file_path" in frame for frame in content["frames"])
+        scale = options.scale
+        if scale is None and not comes_with_depth and (points := content.get("ply_file_path")):
+            scale = nominal_scale(posed, _read_points(inside(path, str(points), file)))
+        super().__init__(path, options, posed, scale)
+        self.metric_poses = comes_with_depth or options.scale is not None
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return (path / TRANSFORMS).is_file()
+
+
+def _read_points(file: Path) -> NDArray[np.float64]:
+    """(P, 3), of a PLY file; none if it is not there or damaged, for they are not needed."""
+    import open3d as o3d
+
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.io.read_point_cloud(str(file), remove_nan_points=True, remove_infinite_points=True)
+    return np.asarray(cloud.points, np.float64).reshape(-1, 3)
+
+
+def _lens(stated: Mapping[str, Any], image: Path, file: Path) -> Lens:
+    """Raises CaptureError."""
+    model = str(stated.get("camera_model", "OPENCV")).upper()
+    if model not in _MODELS:
+        raise CaptureError(f"{file} states the camera model {model}, which is not read: {', '.join(_MODELS)} are.")
+    try:
+        width, height = int(stated.get("w", 0)), int(stated.get("h", 0))
+        if min(width, height) <= 0:
+            header = read_header(image)
+            if header is None:
+                raise CaptureError(f"{file} states no size (w, h), and its image {image} cannot be read.")
+            width, height = header.size if header.orientation < 5 else header.size[::-1]
+        fx = float(stated.get("fl_x") or 0.5 * width / math.tan(0.5 * float(stated["camera_angle_x"])))
+        fy = float(stated.get("fl_y") or fx)
+        cx, cy = float(stated.get("cx", width / 2)), float(stated.get("cy", height / 2))
+        k1, k2, k3, k4, p1, p2 = (float(stated.get(name, 0.0)) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    except KeyError as error:
+        raise CaptureError(f"{file} states no focal length: it needs fl_x, or camera_angle_x.") from error
+    except (TypeError, ValueError, ZeroDivisionError) as error:
+        raise CaptureError(f"{file} holds intrinsics that are no numbers: correct it.") from error
+    camera: Intrinsics = Calibration((fx, fy, cx - 0.5, cy - 0.5), (width, height), str(file)).camera((width, height))
+    if _MODELS[model] or stated.get("is_fisheye"):
+        return Lens(camera, (k1, k2, k3, k4), fisheye=True)
+    if k4:
+        raise CaptureError(f"{file} states k4 of the model {model}, which is not read: undistort the images first.")
+    return Lens(camera, (k1, k2, p1, p2, k3))

@@ -1,0 +1,235 @@
+"""A folder of photographs, or of a video's frames: jpg, png, tif, bmp, webp, in the natural order of their names."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import CaptureError, FrameError
+from ...core.types import Frame, Intrinsics
+from ..base import Capture, Options
+from ..camera_files import DIAGONAL_35MM, equivalent, given, reduced, usual
+from ..image_files import Size, read_color
+
+REQUIRES: tuple[str, ...] = ("PIL",)
+
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+UNREADABLE = {".heic", ".heif", ".dng"}
+"""What phones also write, and no decoder here reads."""
+
+SAME_LENS = 0.05
+"""Relative spread of the focal lengths that images state up to which they are taken to be of one lens."""
+
+_EXIF, _ORIENTATION, _FOCAL, _FOCAL_35MM = 0x8769, 0x0112, 0x920A, 0xA405
+_TIME, _SUBSECONDS, _WIDTH, _PLANE_RESOLUTION, _PLANE_UNIT = 0x9003, 0x9291, 0xA002, 0xA20E, 0xA210
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
+
+
+@dataclass(frozen=True)
+class Header:
+    """What an image's header says. size: upright.  orientation: EXIF's, 1…8.  focal: over the diagonal, or None.  time:
+    seconds, or None."""
+
+    size: Size
+    orientation: int
+    focal: float | None
+    time: float | None
+
+
+class Reader(Capture):
+    """The images lie in the folder or in its ``images/``; an EXIF orientation is applied, and they are reduced to
+    ``capture.max_size``. All have one camera: what it took held the other way, so that width and height are swapped, is
+    turned by a quarter to the size of most (``turned``), and images of really other sizes are left out with a warning.
+    Frames are numbered over what is left, and poses, pixels and pictures are of the images as they are turned.
+
+    The camera is ``capture.intrinsics``, for the upright size before it is reduced; else a guess with the focal length
+    that EXIF states (35 mm equivalent, or focal length and sensor resolution) for most of them: good to some percent,
+    so that ``focal_stated`` but not ``intrinsics_known``. Timestamps are EXIF's if these ascend, else 0, 1, 2, ….
+    """
+
+    format = "photos"
+    layout = "images (jpg, png, tif, bmp, webp) by one camera"
+    general = True
+    has_depth = False
+
+    def __init__(self, path: Path, options: Options):
+        super().__init__(path, options)
+        paths = images_in(path)
+        if len(paths) < 2:
+            raise CaptureError(_too_few(path, paths))
+        images = [(image, read_header(image)) for image in paths]
+        self._size = _common_size(path, [header for _, header in images if header is not None])
+        both = self._size, self._size[::-1]
+        odd = [(image, header) for image, header in images if header is not None and header.size not in both]
+        images = [(image, header) for image, header in images if header is None or header.size in both]
+        if odd:
+            self.warnings = (_left_out(path, odd, len(images), self._size),)
+        self._paths, headers = [image for image, _ in images], [header for _, header in images]
+        self._headers = headers
+        stated, lens = given(options), _focal([header for header in headers if header is not None], self._size)
+        camera = stated.camera(self._size) if stated else lens or usual(self._size)
+        self.intrinsics_known, self.focal_stated = stated is not None, stated is not None or lens is not None
+        self.intrinsics: Intrinsics = reduced(camera, options.max_size)
+        self.timestamps = _times(headers)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        found = images_in(path)
+        return bool(found or _unreadable(path)) and not any("depth" in image.name.lower() for image in found)
+
+    def __getitem__(self, index: int) -> Frame:
+        if not 0 <= index < len(self):
+            raise IndexError(f"Frame {index} of {len(self)} images.")
+        path, header, camera = self._paths[index], self._headers[index], self.intrinsics
+        color = upright(read_color(path), header.orientation if header else 1)
+        color = np.ascontiguousarray(np.rot90(color, self.turned(index)))
+        height, width = color.shape[:2]
+        if (width, height) != self._size:
+            raise FrameError(
+                f"{path} has {width} x {height} pixels, most of the other images have {self._size[0]} x "
+                f"{self._size[1]}."
+            )
+        if (width, height) != (camera.width, camera.height):
+            color = cv2.resize(color, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        return Frame(index, float(self.timestamps[index]), color, np.zeros(color.shape[:2], np.float32), camera)
+
+    def name(self, index: int) -> str:
+        return self._paths[index].name
+
+    def turned(self, index: int) -> int:
+        header = self._headers[index]
+        if header is None or header.size == self._size:
+            return 0
+        if header.orientation >= 5:  # back to how it is stored, as the others are
+            return 1 if header.orientation in (5, 6) else -1
+        # To portrait as phones store it, the sensor's left edge being above.
+        return 1 if self._size[0] > self._size[1] or header.orientation in (3, 4) else -1
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images of a folder, or of its ``images/`` if it has none itself, in natural order: 2 before 10."""
+    for place in (folder, folder / "images"):
+        paths = list(place.iterdir()) if place.is_dir() else []
+        found = [path for path in paths if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
+        if found:
+            return sorted(found, key=natural)
+    return []
+
+
+def natural(path: Path) -> list[tuple[int, str]]:
+    """Sort key by which numbers in names count as numbers."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.as_posix().lower())]
+
+
+def read_header(path: Path) -> Header | None:
+    """Size and EXIF of an image, without decoding it; None if it is none."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+            exif = image.getexif()
+            inner = exif.get_ifd(_EXIF)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+    orientation = exif.get(_ORIENTATION, 1)
+    orientation = orientation if orientation in range(1, 9) else 1
+    size = (height, width) if orientation >= 5 else (width, height)
+    return Header(size, orientation, _stated_focal(inner, width, height), _stated_time(inner))
+
+
+def upright(image: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+    """(H, W, 3) stored, to as it was seen. orientation: EXIF's (CIPA DC-008, tag 274)."""
+    if orientation >= 5:
+        image = image.transpose(1, 0, 2)  # 5; the others are 5 and then 2, 3 or 4
+    rows, columns = {2: (1, -1), 6: (1, -1), 3: (-1, -1), 7: (-1, -1), 4: (-1, 1), 8: (-1, 1)}.get(orientation, (1, 1))
+    return np.ascontiguousarray(image[::rows, ::columns])
+
+
+def _stated_focal(exif: Any, width: int, height: int) -> float | None:
+    """Focal length over the image's diagonal."""
+    try:
+        if exif.get(_FOCAL_35MM) and (camera := equivalent(float(exif[_FOCAL_35MM]), (width, height))):
+            return camera.fx / float(np.hypot(width, height))
+        pixels_per_mm = float(exif[_PLANE_RESOLUTION]) / _UNIT_MM[int(exif.get(_PLANE_UNIT, 2))]
+        focal = float(exif[_FOCAL]) * pixels_per_mm * width / float(exif.get(_WIDTH, width))
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    # Nonsense is common: many programs keep the tag and change the image.
+    return focal / float(np.hypot(width, height)) if 0.3 < focal / max(width, height) < 20 else None
+
+
+def _stated_time(exif: Any) -> float | None:
+    try:
+        whole = datetime.strptime(str(exif[_TIME]).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+        digits = str(exif.get(_SUBSECONDS, "")).strip("\0 ")
+        return (whole - datetime(1970, 1, 1)).total_seconds() + (float(f"0.{digits}") if digits.isdigit() else 0.0)
+    except (KeyError, ValueError):
+        return None
+
+
+def _times(headers: Sequence[Header | None]) -> NDArray[np.float64]:
+    """(N,) seconds since the first image, if all state when they were taken, and in this order."""
+    stated = np.array([np.nan if header is None or header.time is None else header.time for header in headers])
+    if np.isfinite(stated).all() and (np.diff(stated) > 0).all():
+        return np.asarray(stated - stated[0])
+    return np.arange(len(headers), dtype=np.float64)
+
+
+def _focal(headers: Sequence[Header], size: Size) -> Intrinsics | None:
+    """The camera of the lens that most images state; None where they state none, or several."""
+    stated = [header.focal for header in headers if header.focal is not None]
+    if 2 * len(stated) <= len(headers):
+        return None
+    low, middle, high = np.percentile(stated, (10, 50, 90))
+    return None if high - low > SAME_LENS * middle else equivalent(float(middle) * DIAGONAL_35MM, size)
+
+
+def _common_size(folder: Path, headers: Sequence[Header]) -> Size:
+    """The upright size of most images, of which those held the other way count as well. Raises CaptureError if none can
+    be read, or no two are of one size."""
+    if not headers:
+        raise CaptureError(f"No image of {folder} can be read: all are damaged, or no images at all.")
+    upright_sizes = Counter(header.size for header in headers)
+    either = {
+        size: count + (upright_sizes[size[::-1]] if size[0] != size[1] else 0) for size, count in upright_sizes.items()
+    }
+    size = max(upright_sizes, key=lambda size: (either[size], upright_sizes[size]))
+    if either[size] < 2 <= len(headers):
+        raise CaptureError(
+            f"The {len(headers)} images of {folder} have as many sizes, but a scan is of one camera: give "
+            "images of one size, as a camera stores them."
+        )
+    return size
+
+
+def _left_out(folder: Path, odd: Sequence[tuple[Path, Header]], used: int, size: Size) -> str:
+    """A warning in one sentence."""
+    (path, header), count = odd[0], len(odd)
+    return (
+        f"{count} of the {count + used} images of {folder} {'is' if count == 1 else 'are'} left out, the first "
+        f"{path.name} of {header.size[0]} x {header.size[1]} pixels: the others have {size[0]} x {size[1]}, and a scan "
+        "is of one camera."
+    )
+
+
+def _too_few(path: Path, found: Sequence[Path]) -> str:
+    if found:
+        return f"{path} holds one image, {found[0].name}: a scan needs many, of the same place from all around."
+    if raw := _unreadable(path):
+        return f"{path} holds {raw[0].name} and the like, which cannot be decoded here: convert them to JPEG."
+    return f"{path} holds no images (jpg, png, tif, bmp, webp)."
+
+
+def _unreadable(path: Path) -> list[Path]:
+    places = [place for place in (path, path / "images") if place.is_dir()]
+    return [file for place in places for file in sorted(place.iterdir()) if file.suffix.lower() in UNREADABLE]

@@ -1,0 +1,106 @@
+"""Replica as NICE-SLAM packs it: results/frame000000.jpg and depth000000.png, traj.txt, cam_params.json."""
+
+from __future__ import annotations
+
+import functools
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import CaptureError
+from ...core.transforms import is_rigid
+from ..base import Options
+from ..camera_files import Calibration, given, read_class_names, read_json, read_text, seen_at, usual
+from ..depth_registration import Grid
+from ..image_files import holds, numbered
+from ..image_pairs import ImagePairs, pair
+
+REQUIRES: tuple[str, ...] = ()
+
+COLOR = r"frame(\d+)\.(?:png|jpe?g)"
+DEPTH = r"depth(\d+)\.png"
+CLASSES = r"semantic_class_(\d+)\.png"
+
+UNITS_PER_METRE = 6553.5
+"""Of the published Replica renderings; where cam_params.json states ``scale``, that is used."""
+
+
+class Reader(ImagePairs):
+    """Depth is stored / ``scale`` metres. ``cam_params.json`` lies in the folder or, as in NICE-SLAM's package, beside
+    it. Poses are the lines of ``traj.txt``, row-major camera-to-world in OpenCV axes; it is optional and not opened
+    before a pose is asked for. Class images are optional: ``semantic_class/semantic_class_N.png`` hold indices into the
+    names of ``classes.json``."""
+
+    format = "replica"
+    layout = "results/frameN.jpg (or .png) with results/depthN.png and cam_params.json"
+
+    def __init__(self, path: Path, options: Options):
+        results = path / "results"
+        pairs = pair(numbered(results, COLOR), numbered(results, DEPTH), results, options)
+        calibration, units_per_metre = _parameters(path, options)
+        camera = calibration.camera(pairs.color_size) if calibration else usual(pairs.color_size)
+        grid = Grid(camera, seen_at(camera, pairs.depth_size))
+        super().__init__(path, options, pairs, grid, units_per_metre)
+        self.intrinsics_known = self.focal_stated = calibration is not None
+        self.classes = read_class_names(path / "classes.json")
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return holds(path / "results", COLOR)
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        """Raises CaptureError if traj.txt is there but its lines cannot be assigned to the frames."""
+        if self._trajectory is None:
+            return None
+        # Line n is frame n in the order of the files, unless files were taken out: then it is the file's number.
+        row = index if len(self._trajectory) == len(self) else self._pairs.numbers[index]
+        T_world_cam = self._trajectory[row]
+        return T_world_cam if is_rigid(T_world_cam) else None
+
+    def labels(self, index: int) -> NDArray[np.uint8] | None:
+        return self._class_image(self._class_files.get(self._pairs.numbers[index]))
+
+    @functools.cached_property
+    def _class_files(self) -> dict[int, Path]:
+        return numbered(self.path / "semantic_class", CLASSES)
+
+    @functools.cached_property
+    def _trajectory(self) -> NDArray[np.float64] | None:
+        """(L, 4, 4), one per line of traj.txt."""
+        path = self.path / "traj.txt"
+        if not path.is_file():
+            return None
+        lines = [line for line in read_text(path).splitlines() if line.strip()]
+        try:
+            poses = np.array([[float(number) for number in line.split()] for line in lines]).reshape(-1, 4, 4)
+        except ValueError as error:
+            raise CaptureError(f"{path} must hold 16 numbers a line: correct or remove it.") from error
+        if len(poses) != len(self) and len(poses) <= self._pairs.numbers[-1]:
+            raise CaptureError(f"{path} holds {len(poses)} poses for {len(self)} frames: correct or remove it.")
+        return poses
+
+
+def _parameters(path: Path, options: Options) -> tuple[Calibration | None, float]:
+    """Colour camera, None if it is unknown and depth is not read, and depth units per metre. Raises CaptureError."""
+    override = given(options)
+    file = next((f for f in (path / "cam_params.json", path.parent / "cam_params.json") if f.is_file()), None)
+    if file is None:
+        if override is None and options.depth:
+            raise CaptureError(
+                f"There is no cam_params.json in {path} or beside it: add it, or give capture.intrinsics "
+                "(and capture.depth_scale)."
+            )
+        return override, UNITS_PER_METRE
+    camera = read_json(file).get("camera", {})
+    try:
+        fx, fy, cx, cy, width, height = (float(camera[key]) for key in ("fx", "fy", "cx", "cy", "w", "h"))
+        units_per_metre = float(camera.get("scale", UNITS_PER_METRE))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise CaptureError(f'{file} must hold {{"camera": {{w, h, fx, fy, cx, cy, scale}}}}, all numbers.') from error
+    if not (math.isfinite(units_per_metre) and units_per_metre > 0):
+        raise CaptureError(f"{file}: scale must be a positive number of depth units per metre, not {units_per_metre}.")
+    if not (math.isfinite(width) and math.isfinite(height)):
+        raise CaptureError(f"{file}: w and h must be numbers of pixels.")
+    return override or Calibration((fx, fy, cx, cy), (int(width), int(height)), str(file)), units_per_metre

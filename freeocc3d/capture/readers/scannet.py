@@ -1,0 +1,116 @@
+"""ScanNet as exported, and RealSense recordings: color/N.jpg, depth/N.png, intrinsic/, pose/N.txt where known."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import CaptureError
+from ...core.transforms import invert
+from ...core.types import Intrinsics
+from ..base import Options
+from ..camera_files import given, read_class_names, read_intrinsics, read_pose, read_rigid, seen_at, usual
+from ..depth_registration import Grid
+from ..image_files import holds, numbered
+from ..image_pairs import ImagePairs, Pairs, pair
+
+REQUIRES: tuple[str, ...] = ()
+
+# One number in the name: a time stamp in seconds has two, and hidden files (._7.jpg) are not images.
+NUMBER = r"(?:[^.\d]\D*)?(\d+)"
+COLOR = rf"{NUMBER}\.(?:png|jpe?g)"
+IMAGE = rf"{NUMBER}\.png"
+POSE = rf"{NUMBER}\.txt"
+
+COLOR_CAMERA = ("intrinsic/intrinsic_color.txt", "intrinsic_color.txt")
+DEPTH_CAMERA = ("intrinsic/intrinsic_depth.txt", "intrinsic_depth.txt")
+ONE_CAMERA = ("intrinsic/intrinsic.txt", "intrinsic.txt", "intrinsic.json", "camera_intrinsic.json")
+"""Where recorders put the camera if colour and depth share it; the JSON files are Open3D's."""
+
+
+class Reader(ImagePairs):
+    """Depth is uint16 millimetres. Numbers are not zero-padded and sort as numbers. ``pose/`` is optional, camera-to-
+    world; a pose of -inf is none.
+
+    The colour and depth cameras are in ``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` (4 x 4 or 3 x 3);
+    a file that is missing is derived from the other where both images have the same aspect ratio.
+    ``extrinsic_color.txt`` and ``extrinsic_depth.txt`` beside them map a camera to the rig; where they differ, depth is
+    moved to the colour camera, otherwise colour is resampled to the depth's pixels (see ``registration``). With
+    ``capture.depth=false`` colour is left as it is.
+
+    With a ``classes.json`` in the folder, ``label-filt/N.png`` are class images that hold indices into its names.
+    """
+
+    format = "scannet"
+    layout = "color/N.jpg (or .png) with depth/N.png and intrinsic/intrinsic_color.txt"
+
+    def __init__(self, path: Path, options: Options):
+        pairs = pair(numbered(path / "color", COLOR), numbered(path / "depth", IMAGE), path, options)
+        grid, self.intrinsics_known = _grid(path, options, pairs)
+        self.focal_stated = self.intrinsics_known
+        super().__init__(path, options, pairs, grid, units_per_metre=1000.0)
+        self.classes = read_class_names(path / "classes.json")
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return holds(path / "color", COLOR)
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        path = self._pose_files.get(self._pairs.numbers[index])
+        return None if path is None else read_pose(path)
+
+    def labels(self, index: int) -> NDArray[np.uint8] | None:
+        return self._class_image(self._class_files.get(self._pairs.numbers[index]))
+
+    @functools.cached_property
+    def _pose_files(self) -> dict[int, Path]:
+        return numbered(self.path / "pose", POSE)
+
+    @functools.cached_property
+    def _class_files(self) -> dict[int, Path]:
+        return numbered(self.path / "label-filt", IMAGE)
+
+
+def _grid(path: Path, options: Options, pairs: Pairs) -> tuple[Grid, bool]:
+    """The frames' pixel grid, and whether anything says what the colour camera is. Raises CaptureError."""
+    if options.depth:
+        color, depth = _cameras(path, options, pairs)
+        return Grid(color, depth, _T_color_depth(path)), True
+    file = _first(path, (*COLOR_CAMERA, *ONE_CAMERA))
+    stated = given(options) or (read_intrinsics(file) if file else None)
+    camera = stated.camera(pairs.color_size) if stated else usual(pairs.color_size)
+    return Grid(camera, camera), stated is not None
+
+
+def _cameras(path: Path, options: Options, pairs: Pairs) -> tuple[Intrinsics, Intrinsics]:
+    """The colour and the depth camera. Raises CaptureError if nothing states either."""
+    color_file, depth_file = _first(path, (*COLOR_CAMERA, *ONE_CAMERA)), _first(path, DEPTH_CAMERA)
+    color = given(options) or (read_intrinsics(color_file) if color_file else None)
+    depth = read_intrinsics(depth_file) if depth_file else None
+    if color is None and depth is None:
+        raise CaptureError(f"{path} has no {COLOR_CAMERA[0]}: add it, or give capture.intrinsics.")
+    color_camera = color.camera(pairs.color_size) if color else None
+    depth_camera = depth.camera(pairs.depth_size) if depth else None
+    if color_camera is None:
+        assert depth_camera is not None
+        return seen_at(depth_camera, pairs.color_size), depth_camera
+    return color_camera, depth_camera or seen_at(color_camera, pairs.depth_size)
+
+
+def _T_color_depth(path: Path) -> NDArray[np.float64] | None:
+    """Depth to colour camera frame, or None where no extrinsics are given and the two coincide."""
+    color, depth = (
+        _first(path, (f"intrinsic/extrinsic_{camera}.txt", f"extrinsic_{camera}.txt")) for camera in ("color", "depth")
+    )
+    if color is None and depth is None:
+        return None
+    T_rig_color, T_rig_depth = (np.eye(4) if file is None else read_rigid(file) for file in (color, depth))
+    return invert(T_rig_color) @ T_rig_depth
+
+
+def _first(path: Path, names: Iterable[str]) -> Path | None:
+    return next((path / name for name in names if (path / name).is_file()), None)

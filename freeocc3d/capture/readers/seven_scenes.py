@@ -1,0 +1,49 @@
+"""7-Scenes: frame-000000.color.png (or .jpg), .depth.png and .pose.txt in one folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base import Options
+from ..camera_files import Calibration, given, read_intrinsics, read_pose, seen_at
+from ..depth_registration import Grid
+from ..image_files import holds, numbered
+from ..image_pairs import ImagePairs, pair
+
+REQUIRES: tuple[str, ...] = ()
+
+COLOR = r"frame-(\d+)\.color\.(?:png|jpe?g)"
+DEPTH = r"frame-(\d+)\.depth\.png"
+
+KINECT = Calibration((585.0, 585.0, 320.0, 240.0), (640, 480), "the Kinect calibration of 7-Scenes")
+"""What the data set's page states; a camera-intrinsics.txt in the folder takes its place."""
+
+
+class Reader(ImagePairs):
+    """Depth is uint16 millimetres, 0 and 65535 invalid, and as large as colour. Both have the same intrinsics: the data
+    set registers them only roughly and says no more: they are the depth camera's, so that without depth they are only
+    a guess. Poses are camera-to-world and optional."""
+
+    format = "seven_scenes"
+    layout = "frame-N.color.png (or .jpg) with frame-N.depth.png"
+
+    def __init__(self, path: Path, options: Options):
+        pairs = pair(numbered(path, COLOR), numbered(path, DEPTH), path, options)
+        stated = path / "camera-intrinsics.txt"
+        calibration = given(options) or (read_intrinsics(stated) if stated.is_file() else KINECT)
+        camera = calibration.camera(pairs.color_size)
+        grid = Grid(camera, seen_at(camera, pairs.depth_size))
+        super().__init__(path, options, pairs, grid, units_per_metre=1000.0)
+        self.intrinsics_known = options.depth or options.intrinsics is not None
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return holds(path, COLOR)
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        image = self._pairs.color[index] or self._pairs.depth[index]
+        assert image is not None  # a frame has at least one of the two
+        return read_pose(image.with_name(f"{image.name.split('.', 1)[0]}.pose.txt"))

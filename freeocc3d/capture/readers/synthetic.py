@@ -1,0 +1,324 @@
+"""The built-in room, rendered: exact poses, class images and occupancy truth; needs no download."""
+
+from __future__ import annotations
+
+import functools
+import math
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from ...core.errors import CaptureError
+from ...core.transforms import back_project, depth_sigma, invert
+from ...core.types import FREE, UNKNOWN, Frame, Intrinsics
+from ...settings.registry import require_positive
+from .. import base, builtin_room
+from ..camera_files import given
+
+REQUIRES: tuple[str, ...] = ("open3d",)
+
+PATH = "builtin:room"
+
+_RATE_HZ = 30.0
+_FOCAL_PER_WIDTH = 0.82  # 63 degrees across
+_NEAREST_M = 0.3  # a depth camera measures nothing nearer
+_EDGE = 0.05  # relative step of depth at which the sensor's two views disagree
+_GRAZING = 0.10, 0.22  # cosine of incidence at which every, and the first, pixel is lost
+
+
+@dataclass(frozen=True)
+class Options:
+    """The walk and the camera."""
+
+    frames: int = 240
+    """Frames of one round through the room; fewer are a faster walk."""
+    width: int = 320
+    """Image width, pixels."""
+    height: int = 240
+    """Image height, pixels."""
+    noise: bool = True
+    """Whether depth and colour are disturbed as by a sensor; false = exact."""
+    seed: int = 0
+    """Seed of the noise."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "frames", "width", "height")
+
+
+@dataclass(frozen=True)
+class _View:
+    """What each pixel of a frame sees, exactly.
+
+    depth_m: (H, W), 0 = nothing.  triangle: (H, W) row in the room's arrays, -1 = nothing.
+    points: (H, W, 3) world, metres.  cosine: (H, W) of the angle of incidence, 0…1.
+    """
+
+    depth_m: NDArray[np.float32]
+    triangle: NDArray[np.int32]
+    points: NDArray[np.float32]
+    cosine: NDArray[np.float32]
+
+
+class Reader(base.Capture):
+    """A hand-held walk through the furnished room of ``room.py``, at 30 Hz. A frame is the same whenever, and from
+    whichever thread, it is asked for. The world's z points up, its origin is the middle of the floor.
+
+    Raises CaptureError for another path than ``builtin:room``, DependencyError where Open3D is not installed.
+    """
+
+    format = "synthetic"
+    layout = f"the name {PATH}"
+
+    def __init__(self, path: Path, options: base.Options, own: Options):
+        super().__init__(path, options)
+        if str(path) != PATH:
+            raise CaptureError(f"There is no built-in capture '{path}': the one there is is called {PATH}.")
+        self.own = own
+        self.has_depth = options.depth
+        self.timestamps = np.arange(own.frames) / _RATE_HZ
+        self.classes = builtin_room.CLASSES
+        focal = _FOCAL_PER_WIDTH * own.width
+        self.camera = Intrinsics(own.width, own.height, focal, focal, (own.width - 1) / 2, (own.height - 1) / 2)
+        stated = given(options)
+        self.intrinsics = stated.camera((own.width, own.height)) if stated else self.camera
+        self._lock = threading.Lock()
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return False  # it is named, never found
+
+    def __getitem__(self, index: int) -> Frame:
+        view = self._view(index)
+        depth_m, color = view.depth_m, self._color(view)
+        if self.own.noise:
+            rng = np.random.default_rng((self.own.seed, index))
+            depth_m, color = disturbed_depth(depth_m, view.cosine, rng), _disturbed_color(color, index, rng)
+        farthest = self.options.max_depth if self.has_depth else 0.0
+        depth_m = np.where(depth_m <= farthest, depth_m, np.float32(0))
+        return Frame(index, float(self.timestamps[index]), color, depth_m, self.intrinsics)
+
+    def pose(self, index: int) -> NDArray[np.float64]:
+        return camera_on_the_walk(self._checked(index) / self.own.frames)
+
+    def labels(self, index: int) -> NDArray[np.uint8]:
+        triangle = self._view(index).triangle
+        return np.where(triangle >= 0, self._room.class_ids[triangle], np.uint8(0))
+
+    def object_image(self, index: int) -> NDArray[np.int32]:
+        """(H, W) which object each pixel shows, as index into ``objects``; -1 = none."""
+        triangle = self._view(index).triangle
+        return np.where(triangle >= 0, self._room.object_ids[triangle], np.int32(-1))
+
+    def exact_depth(self, index: int) -> NDArray[np.float32]:
+        """(H, W) metres, without noise or limit of range; 0 where nothing is hit."""
+        return self._view(index).depth_m
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Class name of each object in the room."""
+        return self._room.objects
+
+    def ground_truth(self, voxel_size: float = 0.08) -> dict[str, Any]:
+        """Occupancy truth from the room's exact surfaces and what the used frames of the walk see of them (paper,
+        supplement, "Benchmark Details": every second frame, majority vote per voxel).
+
+        A voxel is occupied if seen surface lies in it, with the class of most of that; free if no surface lies in it
+        and its centre is seen before what the depth images end at; all else, such as the inside of a cupboard, is
+        unknown. Returns labels (X, Y, Z) uint8 (0 free, k class, 255 unknown), origin (3,) lower corner of voxel
+        (0, 0, 0) in metres, voxel_size, classes: the keys of the captures' ``ground_truth.npz``. Memory grows with
+        1 / voxel_size³: 2 cm takes about a gigabyte.
+        """
+        points, normals, classes = self._surface(voxel_size / 6)
+        # Walls and furniture stand on whole centimetres: shifted like this, none lies on a face between two voxels.
+        origin = points.min(axis=0).astype(np.float64) - 0.37 * voxel_size
+        voxels = np.floor((points - origin) / voxel_size).astype(np.int32)
+        shape = tuple(int(n) for n in voxels.max(axis=0) + 1)
+        flat = np.ravel_multi_index(tuple(voxels.T), shape)
+        centers = (origin + (np.indices(shape).reshape(3, -1).T + 0.5) * voxel_size).astype(np.float32)
+        surface_seen, center_seen = self._seen(points, normals), self._seen(centers, None)
+
+        labels = np.where(center_seen, FREE, UNKNOWN).astype(np.uint8)
+        labels[flat] = UNKNOWN
+        votes, counts = np.unique(flat[surface_seen] * len(self.classes) + classes[surface_seen], return_counts=True)
+        votes = votes[np.argsort(counts, kind="stable")]  # of several classes in a voxel the last written wins
+        labels[votes // len(self.classes)] = votes % len(self.classes)
+        return {
+            "labels": labels.reshape(shape),
+            "origin": origin,
+            "voxel_size": voxel_size,
+            "classes": np.array(self.classes),
+        }
+
+    def _checked(self, index: int) -> int:
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of {len(self)}")
+        return index
+
+    @functools.cached_property
+    def _room(self) -> builtin_room.Room:
+        return builtin_room.furnished()
+
+    @functools.cached_property
+    def _scene(self) -> Any:
+        import open3d as o3d
+
+        scene = o3d.t.geometry.RaycastingScene()
+        corners = self._room.triangles.reshape(-1, 3)
+        faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+        scene.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(faces))
+        return scene
+
+    @functools.cached_property
+    def _directions_cam(self) -> NDArray[np.float32]:
+        """(H, W, 3) rays with z = 1, so that a ray's parameter is the depth."""
+        v, u = np.mgrid[: self.camera.height, : self.camera.width]
+        pixels = np.stack((u, v), axis=-1).astype(np.float32)
+        return back_project(pixels, np.ones(u.shape, np.float32), self.camera).astype(np.float32)
+
+    def _view(self, index: int) -> _View:
+        import open3d as o3d
+
+        T_world_cam = self.pose(index).astype(np.float32)
+        directions = self._directions_cam @ T_world_cam[:3, :3].T
+        rays = np.concatenate((np.broadcast_to(T_world_cam[:3, 3], directions.shape), directions), axis=-1)
+        with self._lock:  # the first cast builds the scene's tree, and Open3D does not say that casting is thread-safe
+            hit = self._scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)))
+        depth_m = hit["t_hit"].numpy()
+        seen = np.isfinite(depth_m)
+        depth_m = np.where(seen, depth_m, np.float32(0))
+        triangle = np.where(seen, hit["primitive_ids"].numpy().astype(np.int32), np.int32(-1))
+        along = np.abs(np.einsum("hwc,hwc->hw", directions, self._room.normals[triangle]))
+        points = rays[..., :3] + depth_m[..., None] * directions
+        return _View(depth_m, triangle, points, along / np.linalg.norm(directions, axis=-1))
+
+    def _color(self, view: _View) -> NDArray[np.uint8]:
+        """(H, W, 3) RGB without noise."""
+        r = self._room
+        footprint = view.depth_m / np.float32(self.camera.fx) / np.maximum(view.cosine, np.float32(0.3))
+        flat = view.points.reshape(-1, 3), view.triangle.ravel(), footprint.ravel()
+        return builtin_room.shade(*flat, r.textures, r.colors, r.scales, r.normals).reshape(*view.depth_m.shape, 3)
+
+    def _surface(self, spacing: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+        """Random points on all triangles, one per ``spacing``² m²: (P, 3) world, (P, 3) normals, (P,) class ids."""
+        rng = np.random.default_rng(0)
+        a, b, c = self._room.triangles.astype(np.float64).transpose(1, 0, 2)
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        which = np.repeat(np.arange(len(area)), np.ceil(area / spacing**2).astype(int))
+        s, t = rng.random((2, len(which), 1))
+        s, t = np.where(s + t > 1, 1 - s, s), np.where(s + t > 1, 1 - t, t)
+        points = a[which] + s * (b - a)[which] + t * (c - a)[which]
+        return points.astype(np.float32), self._room.normals[which], self._room.class_ids[which]
+
+    def _seen(self, points: NDArray[np.float32], normals: NDArray[np.float32] | None) -> NDArray[np.bool_]:
+        """(P,) whether any second one of the used frames sees each world point, from the front if it has a normal, at
+        or before the exact depth and within the sensor's range."""
+        seen = np.zeros(len(points), bool)
+        facing = np.zeros((0, 3), np.float32) if normals is None else normals
+        used = range(len(self))[self.options.start : self.options.stop : self.options.stride]
+        for index in used[::2]:
+            T_cam_world = invert(self.pose(index))
+            depth_m = self.exact_depth(index)
+            depth_m = np.where(depth_m > 0, np.minimum(depth_m, np.float32(self.options.max_depth)), np.float32(0))
+            _mark_seen(points, facing, T_cam_world, self.camera.matrix, depth_m, seen)
+        return seen
+
+
+def camera_on_the_walk(phase: float) -> NDArray[np.float64]:
+    """(4, 4) T_world_cam on a closed hand-held walk; phase 0…1 is one round. It turns left while it goes round to the
+    right: close to the table and the door it faces them, along the other two walls it looks across the room."""
+    angle = 2 * math.pi * phase
+    sway = [math.sin(k * angle + k) for k in (5, 7, 11)]
+    position = np.array((0.12 + 0.95 * math.cos(angle), -0.85 * math.sin(angle) - 0.05, 1.5))
+    position += np.array((0.02, 0.02, 0.03)) * sway
+    yaw = angle + 0.08 * math.sin(3 * angle)
+    pitch = -0.42 - 0.09 * math.cos(2 * angle) + 0.06 * math.sin(3 * angle + 1.0) + 0.01 * sway[2]
+    pitch += 0.34 * math.exp(-(((angle - 2.2) / 0.55) ** 2))  # a glance up at the wardrobe and the ceiling
+    forward = np.array((math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)))
+    right = np.array((math.sin(yaw), -math.cos(yaw), 0.0))
+    down = np.cross(forward, right)
+    roll = 0.02 * sway[1]
+    T_world_cam = np.eye(4)
+    T_world_cam[:3, 0] = math.cos(roll) * right + math.sin(roll) * down
+    T_world_cam[:3, 1] = math.cos(roll) * down - math.sin(roll) * right
+    T_world_cam[:3, 2], T_world_cam[:3, 3] = forward, position
+    return T_world_cam
+
+
+def disturbed_depth(
+    depth_m: NDArray[np.float32], cosine: NDArray[np.float32], rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """(H, W) exact depth as a sensor gives it: jagged at edges, with axial noise, whole millimetres, and holes (0) at
+    edges, at grazing incidence and nearer than 0.3 m. cosine: (H, W) of the angle of incidence."""
+    height, width = depth_m.shape
+    shift = rng.integers(-1, 2, (2, height, width)) * (rng.random((2, height, width), np.float32) < 0.2)
+    rows = np.clip(np.arange(height)[:, None] + shift[0], 0, height - 1)
+    columns = np.clip(np.arange(width)[None] + shift[1], 0, width - 1)
+    edges = _edges(depth_m)
+    noisy = np.where(edges, depth_m[rows, columns], depth_m)
+    noisy = noisy + depth_sigma(noisy) * rng.standard_normal(noisy.shape, np.float32)
+    chance = np.where(edges, 0.5, np.clip((_GRAZING[1] - cosine) / (_GRAZING[1] - _GRAZING[0]), 0, 1))
+    holes = (rng.random(depth_m.shape, np.float32) < chance) | (depth_m < _NEAREST_M)
+    return np.where(holes, 0, np.rint(noisy * 1000) / 1000).astype(np.float32)
+
+
+def _disturbed_color(color: NDArray[np.uint8], index: int, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Noise of two grey levels, and an exposure that changes slowly by 4 %."""
+    exposure = np.float32(1.0 + 0.04 * math.sin(0.05 * index))
+    noisy = color * exposure + 2.0 * rng.standard_normal(color.shape, np.float32)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def _edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(H, W) pixels on either side of a step in depth."""
+    edges = np.zeros(depth_m.shape, bool)
+    for axis in (0, 1):
+        # Views: what is written to along_axis lands in edges.
+        along_axis, depths = np.moveaxis(edges, axis, 0), np.moveaxis(depth_m, axis, 0)
+        step = np.abs(np.diff(depths, axis=0)) > _EDGE * np.minimum(depths[:-1], depths[1:])
+        along_axis[:-1] |= step
+        along_axis[1:] |= step
+    return edges
+
+
+@njit(parallel=True, cache=True)
+def _mark_seen(
+    points: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    T_cam_world: NDArray[np.float64],
+    K: NDArray[np.float64],
+    depth_m: NDArray[np.float32],
+    seen: NDArray[np.bool_],
+) -> None:
+    """Set ``seen`` (P,) for points (P, 3) of the world that a depth image (H, W) does not hide. normals: (P, 3) of the
+    surface that the points lie on, which must face the camera; (0, 3) = the points lie on none."""
+    height, width = depth_m.shape
+    R, t = T_cam_world[:3, :3], T_cam_world[:3, 3]
+    for p in prange(len(points)):
+        if seen[p]:
+            continue
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        cx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
+        cy = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
+        cz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+        if cz <= 0:
+            continue
+        column, row = round(K[0, 0] * cx / cz + K[0, 2]), round(K[1, 1] * cy / cz + K[1, 2])
+        if not (0 <= column < width and 0 <= row < height):
+            continue
+        tolerance = 0.0
+        if len(normals) > 0:
+            nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
+            facing = 0.0
+            for axis, along in enumerate((cx, cy, cz)):
+                facing -= along * (R[axis, 0] * nx + R[axis, 1] * ny + R[axis, 2] * nz)
+            cosine = facing / math.sqrt(cx * cx + cy * cy + cz * cz)
+            if cosine <= 0:
+                continue
+            tolerance = 0.75 * cz / K[0, 0] / max(cosine, 0.1)  # how far depth changes within a pixel of the surface
+        if cz <= depth_m[row, column] + tolerance and depth_m[row, column] > 0:
+            seen[p] = True

@@ -1,0 +1,241 @@
+"""Trajectories from other systems' files, and which of their poses belong to which frame of a capture.
+
+Every format is brought to camera-to-world poses in OpenCV axes here. A pose is known by its time (TUM), by its image's
+name (COLMAP, nerfstudio, 7-Scenes), or by its place in the file alone (KITTI, Replica, Open3D's .log).
+
+Sources: J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012 (TUM's form, association by
+time); A. Geiger et al., KITTI's odometry development kit; the format pages of COLMAP, nerfstudio and Open3D.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import CaptureError
+from ..core.transforms import invert, is_rigid, quats_to_rotations
+from .base import Capture
+
+SAME_TIME_S = 0.02
+"""Poses whose timestamps differ by no more belong together: the tolerance of the TUM RGB-D benchmark."""
+
+FORMS = (
+    "TUM (timestamp, position, quaternion xyzw), KITTI or Replica (12 or 16 numbers a line), Open3D's .log, COLMAP's "
+    "images.txt or images.bin, nerfstudio's transforms.json, or a folder of 7-Scenes' *.pose.txt"
+)
+"""What can be read, in words."""
+
+_LARGEST_BYTES = 1 << 28
+
+
+@dataclass(frozen=True)
+class PoseFile:
+    """M poses of a file, as they stand there.
+
+    T_world_cam: (M, 4, 4); NaN where a line states none.  timestamps: (M,) seconds, or None.
+    names: of the M images, or empty.
+    """
+
+    path: Path
+    T_world_cam: NDArray[np.float64]
+    timestamps: NDArray[np.float64] | None = None
+    names: tuple[str, ...] = ()
+
+    def times(self) -> NDArray[np.float64]:
+        """(M,) seconds; where the file has none, the number in the image's name or the place in the file, as captures
+        without times count theirs."""
+        if self.timestamps is not None:
+            return self.timestamps
+        numbers = [_number(name) for name in self.names]
+        if numbers and all(numbers):
+            return np.array(numbers, np.float64)
+        return np.arange(len(self.T_world_cam), dtype=np.float64)
+
+    def of_frames(self, capture: Capture, tolerance_s: float = SAME_TIME_S) -> NDArray[np.float64]:
+        """(N, 4, 4) poses of a capture's N frames, NaN where the file has none.
+
+        Images are matched by name, else by the number in their name; times by the nearest within the tolerance.
+        Raises CaptureError if nothing matches.
+        """
+        T = np.full((len(capture), 4, 4), np.nan)
+        if self.names:
+            rows = _by_name(self.names, [capture.name(index) for index in range(len(capture))])
+        elif self.timestamps is not None:
+            order = np.argsort(self.timestamps, kind="stable")
+            own, frames = associate(self.timestamps[order], capture.timestamps, tolerance_s)
+            rows = dict(zip(frames.tolist(), order[own].tolist(), strict=True))
+        else:
+            rows = {index: index for index in range(min(len(T), len(self.T_world_cam)))}
+        for frame, row in rows.items():
+            T[frame] = self.T_world_cam[row]
+        if not np.isfinite(T).any():
+            raise CaptureError(
+                f"No pose of {self.path} belongs to a frame of {capture.path}: {self._mismatch(capture)}."
+            )
+        return T
+
+    def _mismatch(self, capture: Capture) -> str:
+        if self.names:
+            return f"its first image is {self.names[0]}, the capture's {capture.name(0) or 'has no name'}"
+        if self.timestamps is not None and len(self.timestamps):
+            a, b = self.timestamps, capture.timestamps
+            return f"its times are {a.min():.2f} to {a.max():.2f} s, the capture's {b[0]:.2f} to {b[-1]:.2f} s"
+        return "it states none"
+
+
+def read_trajectory(path: str | Path) -> PoseFile:
+    """Read any of ``FORMS``. Raises CaptureError, with the file's name, for what is none of them or damaged."""
+    path = Path(path).expanduser()
+    try:
+        if path.is_dir():
+            return _read_folder(path)
+        if not path.is_file():
+            raise CaptureError(f"There is no trajectory {path}.")
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise CaptureError(f"{path} is no trajectory: it has {path.stat().st_size / 1e6:.0f} MB.")
+        if path.name in ("images.txt", "images.bin"):
+            return _read_colmap(path.parent)
+        read: Callable[[Path], PoseFile] = _read_nerfstudio if path.suffix == ".json" else _read_text
+        found = read(path)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CaptureError(f"{path} is no trajectory: expected {FORMS}.") from error
+    return _checked(found)
+
+
+def _checked(found: PoseFile) -> PoseFile:
+    finite = np.isfinite(found.T_world_cam).all(axis=(1, 2))
+    if not finite.any():
+        raise CaptureError(f"{found.path} is no trajectory: it holds no pose.")
+    if not all(is_rigid(pose) for pose in found.T_world_cam[finite]):
+        raise CaptureError(f"{found.path} holds a matrix that is no rigid camera-to-world pose.")
+    return found
+
+
+def _read_folder(folder: Path) -> PoseFile:
+    if files := sorted(folder.glob("*.pose.txt")):
+        T = np.stack([np.loadtxt(file).reshape(4, 4) for file in files])
+        return _checked(PoseFile(folder, T, names=tuple(file.name for file in files)))
+    if model := colmap_folder(folder):
+        return _checked(_read_colmap(model))
+    if (folder / "transforms.json").is_file():
+        return _checked(_read_nerfstudio(folder / "transforms.json"))
+    raise CaptureError(f"{folder} holds no trajectory: expected {FORMS}.")
+
+
+def _read_text(path: Path) -> PoseFile:
+    lines = [line.replace(",", " ").split() for line in path.read_text(encoding="utf-8").splitlines()]
+    rows = [line for line in lines if line and not line[0].startswith("#")]
+    lengths = {len(row) for row in rows}
+    if lengths == {8}:
+        table = np.array(rows, np.float64)
+        finite = np.isfinite(table).all(axis=1)
+        quats_wxyz = table[:, [7, 4, 5, 6]]
+        norms = np.linalg.norm(quats_wxyz, axis=1, keepdims=True)
+        if not finite.all() or (norms == 0).any():
+            raise ValueError
+        T = np.tile(np.eye(4), (len(table), 1, 1))
+        T[:, :3, 3] = table[:, 1:4]
+        T[:, :3, :3] = quats_to_rotations(quats_wxyz / norms)
+        return PoseFile(path, T, timestamps=table[:, 0])
+    if lengths in ({12}, {16}):
+        T = np.tile(np.eye(4), (len(rows), 1, 1))
+        T[:, : len(rows[0]) // 4] = np.array(rows, np.float64).reshape(len(rows), -1, 4)
+        return PoseFile(path, T)
+    return _read_log(path, rows)
+
+
+def _read_log(path: Path, rows: list[list[str]]) -> PoseFile:
+    """Open3D's .log: a line of three numbers, of which the first is the frame's, then four lines of the matrix."""
+    if len(rows) % 5 or not rows or any(len(row) != (3 if n % 5 == 0 else 4) for n, row in enumerate(rows)):
+        raise ValueError
+    numbers = [int(float(row[0])) for row in rows[::5]]
+    if min(numbers) < 0 or max(numbers) > 10_000_000:
+        raise ValueError
+    T = np.full((max(numbers) + 1, 4, 4), np.nan)
+    for k, number in enumerate(numbers):
+        T[number] = np.array(rows[5 * k + 1 : 5 * k + 5], np.float64)
+    return PoseFile(path, T)
+
+
+def _read_nerfstudio(path: Path) -> PoseFile:
+    frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
+    T = np.array([frame["transform_matrix"] for frame in frames], np.float64).reshape(-1, 4, 4)
+    T[:, :, 1:3] *= -1  # OpenGL's camera looks along -z with y up
+    return PoseFile(path, T, names=tuple(Path(frame["file_path"]).name for frame in frames))
+
+
+def colmap_folder(folder: Path) -> Path | None:
+    """Where the COLMAP model of a folder lies, if it has one."""
+    models = (folder, folder / "sparse" / "0", folder / "sparse", folder / "0")
+    return next((m for m in models if any((m / name).is_file() for name in ("images.bin", "images.txt"))), None)
+
+
+def read_colmap_model(folder: Path) -> Any:
+    """The ``pycolmap.Reconstruction`` in a folder. Raises CaptureError."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    try:
+        if (folder / "images.bin").is_file():
+            model.read_binary(str(folder))
+        else:
+            model.read_text(str(folder))
+    except (RuntimeError, ValueError, OSError) as error:
+        raise CaptureError(
+            f"{folder} is no COLMAP model: it needs cameras, images and points3D, all .txt or all .bin."
+        ) from error
+    return model
+
+
+def _read_colmap(folder: Path) -> PoseFile:
+    model = read_colmap_model(folder)
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    if not images:
+        raise CaptureError(f"The COLMAP model {folder} holds no image with a pose.")
+    T_cam_world = np.tile(np.eye(4), (len(images), 1, 1))
+    T_cam_world[:, :3] = [image.cam_from_world().matrix() for image in images]
+    return _checked(PoseFile(folder, invert(T_cam_world), names=tuple(Path(image.name).name for image in images)))
+
+
+def _by_name(names: tuple[str, ...], frames: list[str]) -> dict[int, int]:
+    """Frame -> row of the pose whose image has its name; if none has, whose last number is the same."""
+    for key in (str, _stem, _number):
+        rows = {key(name): row for row, name in enumerate(names)}
+        found = {frame: rows[key(name)] for frame, name in enumerate(frames) if name and key(name) in rows}
+        if found and "" not in rows:
+            return found
+    return {}
+
+
+def _stem(name: str) -> str:
+    return name.split(".")[0] if not re.match(r"\d+\.\d+\.", name) else name.rsplit(".", 1)[0]
+
+
+def _number(name: str) -> str:
+    digits = re.findall(r"\d+", _stem(name))
+    return digits[-1].lstrip("0") or "0" if digits else ""
+
+
+def associate(
+    times_a: NDArray[np.float64], times_b: NDArray[np.float64], tolerance_s: float = SAME_TIME_S
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of two ascending lists of timestamps that belong together: each of the shorter list with the nearest of the
+    longer, where they differ by no more than the tolerance."""
+    if len(times_a) > len(times_b):
+        rows_b, rows_a = associate(times_b, times_a, tolerance_s)
+        return rows_a, rows_b
+    if not len(times_a):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    after = np.clip(np.searchsorted(times_b, times_a), 1, max(len(times_b) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(times_b) - 1)
+    nearest = np.where(np.abs(times_b[after] - times_a) < np.abs(times_b[before] - times_a), after, before)
+    close = np.abs(times_b[nearest] - times_a) <= tolerance_s
+    return np.flatnonzero(close), nearest[close]

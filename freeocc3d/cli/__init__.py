@@ -1,0 +1,1 @@
+"""The command ``freeocc3d``: parses, calls Python, prints. Nothing else prints."""

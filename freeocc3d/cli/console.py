@@ -1,0 +1,62 @@
+"""What commands have in common: arguments, and progress on stderr."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..core.progress import Progress
+
+MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="Map folder.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set one option; repeatable.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what exists.")]
+
+
+class ConsoleProgress(Progress):
+    """Progress on stderr: one line that is redrawn on a terminal, a line per stage and warning elsewhere."""
+
+    def __init__(self) -> None:
+        self._name, self._total, self._start, self._drawn = "", None, 0.0, 0.0  # type: tuple[str, int | None, float, float]
+        self._on_terminal = sys.stderr.isatty()
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        self.close()
+        self._name, self._total, self._start = name, total, time.monotonic()
+        if self._on_terminal:
+            self._draw(0)
+
+    def advance(self, done: int) -> None:
+        if self._on_terminal and (done == self._total or time.monotonic() - self._drawn > 0.1):
+            self._draw(done)
+
+    def warn(self, text: str) -> None:
+        self._clear()
+        print(f"warning: {text}", file=sys.stderr)
+
+    def close(self) -> None:
+        """End the present stage's line."""
+        if self._name:
+            self._clear()
+            seconds = time.monotonic() - self._start
+            steps = f", {self._total} steps" if self._total else ""
+            print(f"{self._name}: {seconds:.1f} s{steps}", file=sys.stderr)
+        self._name = ""
+
+    def _draw(self, done: int) -> None:
+        self._drawn = time.monotonic()
+        line = self._name
+        if self._total:
+            filled = 30 * done // self._total
+            elapsed = self._drawn - self._start
+            left = elapsed / done * (self._total - done) if done else 0.0
+            line += f" [{'=' * filled}{' ' * (30 - filled)}] {done}/{self._total}, {left:.0f} s left"
+        print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+
+    def _clear(self) -> None:
+        if self._on_terminal:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,107 @@
+"""What is in a map and how it was made: what ``freeocc3d info`` says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ..storage.store import Map
+
+_SHOWN_NAMES = 12
+
+
+def facts(loaded: Map) -> dict[str, Any]:
+    """What ``info --json`` prints."""
+    manifest, report = loaded.manifest, loaded.report
+    counts = manifest["counts"]
+    return {
+        "version": manifest["freeocc3d"],
+        "map": str(loaded.path),
+        "capture": manifest["capture"],
+        "frames": counts["frames"],
+        "frames_with_pose": counts["frames_with_pose"],
+        "frame_status": report["frames"],
+        "keyframes": len(manifest["keyframes"]),
+        "submaps": counts["submaps"],
+        "submap_frames": [
+            {key: submap[key] for key in ("first", "last", "frames", "keyframes", "mapped")}
+            for submap in report.get("submaps", [])
+        ],
+        "color_focal": report.get("color_focal", 1.0),
+        "gaussians": counts["gaussians"],
+        "voxels": {"occupied": counts["voxels"]["occupied"], "free": counts["voxels"]["free"]},
+        "metric": loaded.metric,
+        "scale": manifest.get("scale", {"metric": True, "by": "sensor", "factor": 1.0}),
+        "voxel_size_m": manifest["voxel_size_m"],
+        "finest_voxel_m": manifest.get("finest_voxel_m", manifest["voxel_size_m"]),
+        "refined": manifest.get("refined"),
+        "encoder": manifest["encoder"]["name"],
+        "encoder_knows": loaded.text_encoder.knows,
+        "vocabulary": manifest.get("vocabulary"),
+        "bytes": {
+            name: sum(size for file, size in manifest["files"].items() if file.split("/")[0] == name)
+            for name in dict.fromkeys(file.split("/")[0] for file in manifest["files"])
+        },
+        "seconds": report["seconds"],
+        "peak_memory_bytes": report["peak_memory_bytes"],
+        "warnings": report["warnings"],
+    }
+
+
+def to_text(loaded: Map) -> str:
+    """What ``info`` prints."""
+    said = facts(loaded)
+    size = sum(said["bytes"].values())
+    used = said["frames"] - said["frame_status"].get("unused", 0)
+    largest, smallest = said["voxel_size_m"], said["finest_voxel_m"]
+    unit = "m" if said["metric"] else "units"
+    plural = {name: "s" if said[name] != 1 else "" for name in ("keyframes", "submaps")}
+    seconds = ", ".join(f"{name} {value:.1f}" for name, value in said["seconds"].items())
+    lines = [
+        f"map        {said['map']}  ({size / 1e6:.1f} MB)",
+        f"capture    {said['capture']['path']}  ({said['capture']['format']})",
+        f"frames     {said['frames']} in the capture, {used} used, {said['frames_with_pose']} with a pose, "
+        f"{said['keyframes']} keyframe{plural['keyframes']}, {said['submaps']} submap{plural['submaps']}",
+        *(
+            [
+                f"refined    {'a box of ' if 'box' in said['refined'] else 'from '}{said['refined']['map']}, whose "
+                "frames and times these are"
+            ]
+            if said["refined"]
+            else []
+        ),
+        f"gaussians  {said['gaussians']:,}",
+        f"voxels     {said['voxels']['occupied']:,} occupied, {said['voxels']['free']:,} free, "
+        + (f"edge {largest:.3g} {unit}" if largest == smallest else f"edges {largest:.3g} to {smallest:.3g} {unit}"),
+        *([] if said["scale"]["by"] == "sensor" else [_scale_text(said["scale"])]),
+        f"encoder    {said['encoder']}, which knows {said['encoder_knows']}",
+        *([_vocabulary_text(said["vocabulary"])] if said["vocabulary"] else []),
+        f"time       {sum(said['seconds'].values()):.1f} s: {seconds}",
+        f"memory     {said['peak_memory_bytes'] / 1e9:.2f} GB at most",
+    ]
+    if said["submaps"] > 1:
+        lines += [
+            f"submap     frames {submap['first']} to {submap['last']}: {submap['frames']} with a pose, of these "
+            f"{submap['keyframes']} as keyframes; {'mapped' if submap['mapped'] else 'apart, not in the map'}"
+            for submap in said["submap_frames"]
+        ]
+    lines += [f"warning    {text}" for text in said["warnings"]]
+    return "\n".join(lines)
+
+
+def _scale_text(scale: dict[str, Any]) -> str:
+    if not scale["metric"]:
+        return "scale      unknown: lengths are not metres"
+    told = {"given": "as given", "length": "by a known length", "camera height": "by the cameras' height"}
+    times = "" if scale["factor"] == 1 else f", {scale['factor']:.4g} of them per unit of what was tracked"
+    return f"scale      metres, {told.get(scale['by'], 'by the poses')}{times}"
+
+
+def _vocabulary_text(vocabulary: dict[str, Any]) -> str:
+    names = vocabulary["names"]
+    shown = ", ".join(f"{name} {entry['count']}" for name, entry in list(names.items())[:_SHOWN_NAMES])
+    return (
+        f"words      {len(names)} named by {vocabulary['model']} in {len(vocabulary['keyframes'])} keyframes"
+        + (f": {shown}" if shown else "")
+        + (", …" if len(names) > _SHOWN_NAMES else "")
+    )

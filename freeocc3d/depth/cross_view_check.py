@@ -1,0 +1,86 @@
+"""Which depths of a view the depths of other views confirm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..core.transforms import invert
+from ..core.types import Intrinsics
+from .photo_consistency import rays
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """Inverse depths of a posed view: ``inverse`` and its standard deviation ``sigma``, (H, W) float32, 1 / metres;
+    ``inverse`` 0 = none."""
+
+    inverse: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    camera: Intrinsics
+    T_world_cam: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Confirmed:
+    """Per pixel, (H, W): how many views agree and how many look through the point; the mean ``inverse`` depth of all
+    that agree, weighted by their variances; its standard deviation ``sigma``, of which their spread is part."""
+
+    agreeing: Tensor
+    through: Tensor
+    inverse: Tensor
+    sigma: Tensor
+
+
+def confirmed(view: DepthImage, others: Sequence[DepthImage], tolerance: float, device: str = "cpu") -> Confirmed:
+    """``view`` compared with ``others``: a view agrees where its depth, seen from the first one, differs by at most the
+    ``tolerance`` (relative) or two standard deviations, whichever is more."""
+    inverse, sigma = (torch.from_numpy(a).to(device) for a in (view.inverse, view.sigma))
+    there = inverse > 0
+    points = rays(view.camera, device) / inverse.clamp_min(1e-6)
+    variance = sigma.square().clamp_min(1e-12)
+    weight, total = 1.0 / variance, inverse / variance
+    square = inverse.square() / variance
+    agreeing, through = torch.zeros_like(inverse), torch.zeros_like(inverse)
+    for other in others:
+        T_other_view = invert(other.T_world_cam) @ view.T_world_cam
+        moved = _moved(T_other_view, points)
+        found, found_sigma = _sampled(other, moved, device)
+        seen = there & (found > 0)
+        back = _moved(invert(T_other_view), moved * (1.0 / (found * moved[2]).clamp_min(1e-6)))[2]
+        ratio = back * inverse  # its depth over ours
+        here = 1.0 / back.clamp_min(1e-3)
+        spread = torch.sqrt(variance + (found_sigma * (here / found.clamp_min(1e-6)) ** 2) ** 2)
+        within = torch.maximum(2.0 * spread, tolerance * inverse)
+        agrees = seen & (back > 0) & ((here - inverse).abs() <= within)
+        through += seen & ~agrees & (ratio > 1.0)
+        agreeing += agrees
+        own = agrees / (found_sigma * (here / found.clamp_min(1e-6)) ** 2).square().clamp_min(1e-12)
+        weight, total, square = weight + own, total + own * here, square + own * here.square()
+    mean = total / weight
+    scatter = (square / weight - mean.square()).clamp_min(0.0)
+    # Neighbours share images, and with them their errors: the mean is not surer than a single one.
+    return Confirmed(agreeing, through, mean, torch.sqrt((agreeing + 1) / weight + scatter))
+
+
+def _moved(T: NDArray[np.float64], points: Tensor) -> Tensor:
+    """(3, H, W) points by a rigid transform."""
+    M = torch.from_numpy(T[:3]).float().to(points.device)
+    return torch.einsum("ij,jhw->ihw", M[:, :3], points) + M[:, 3].reshape(3, 1, 1)
+
+
+def _sampled(image: DepthImage, points: Tensor, device: str) -> tuple[Tensor, Tensor]:
+    """The image's inverse depth and sigma at the nearest pixel that (3, H, W) points are seen at; 0 outside."""
+    camera = image.camera
+    z = points[2].clamp_min(1e-6)
+    u = torch.round(points[0] / z * camera.fx + camera.cx)
+    v = torch.round(points[1] / z * camera.fy + camera.cy)
+    inside = (points[2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    place = (v.clamp(0, camera.height - 1) * camera.width + u.clamp(0, camera.width - 1)).long()
+    inverse, sigma = (torch.from_numpy(a).to(device).reshape(-1)[place] for a in (image.inverse, image.sigma))
+    return inverse * inside, sigma

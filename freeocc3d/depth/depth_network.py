@@ -1,0 +1,100 @@
+"""A monocular depth network as a second opinion: an ONNX file that guesses (inverse) depth from one image.
+
+What such networks give is right up to a scale and a shift of inverse depth (R. Ranftl et al., Towards Robust Monocular
+Depth Estimation, PAMI 2022), which each frame's stereo depth tells.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import ModelError
+from ..core.onnx_session import load_session
+
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, on which encoders are trained
+_FREE_SIZE = 518
+_PATCH = 14
+_LEAST_PIXELS = 200
+_OUTLIERS = 2.5  # robust standard deviations
+_LEAST_RELATIVE = 0.02  # of inverse depth: no guess is taken for better
+_METRIC = {"depth": True, "inverse": False}
+
+
+class DepthNetwork:
+    """Calls the network; its metadata ``output`` says "inverse" (the default) or "depth"."""
+
+    def __init__(self, session: Any, path: Path):
+        inputs, self._session = session.get_inputs(), session
+        if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].shape[1] != 3:
+            raise ModelError(f"{path} is no depth network: it must take one image, (1, 3, H, W).")
+        self._path, self._input = path, inputs[0]
+        said = session.get_modelmeta().custom_metadata_map.get("output", "inverse")
+        if said not in _METRIC:
+            raise ModelError(f"{path}: its metadata 'output' must be inverse or depth, not {said}.")
+        self._is_depth = _METRIC[said]
+
+    def __call__(self, color: NDArray[np.uint8], width: int, height: int) -> NDArray[np.float32]:
+        """(height, width) inverse depth in no unit, from (H, W, 3) uint8 RGB. Raises ModelError."""
+        rows, columns = self._size(color)
+        image = cv2.resize(color, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+        image = (image - np.array(_MEAN, np.float32)) / np.array(_DEVIATION, np.float32)
+        try:
+            output = self._session.run(None, {self._input.name: image.transpose(2, 0, 1)[None]})[0]
+        except Exception as error:  # onnxruntime's exceptions have no common base of their own
+            raise ModelError(f"{self._path} fails on an image of {columns} x {rows} pixels: {error}") from error
+        found = np.asarray(output, np.float32)
+        found = (
+            found.reshape(found.shape[-2:]) if found.ndim >= 2 and found.size == np.prod(found.shape[-2:]) else found
+        )
+        if found.ndim != 2 or not np.isfinite(found).all():
+            raise ModelError(f"{self._path} is no depth network: its output of shape {output.shape} is no depth image.")
+        inverse = 1.0 / np.maximum(found, 1e-3) if self._is_depth else found
+        return np.asarray(cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+
+    def _size(self, color: NDArray[np.uint8]) -> tuple[int, int]:
+        """Rows and columns of the input: as the network fixes them, else in whole patches of vision transformers."""
+        rows, columns = self._input.shape[2:]
+        if isinstance(rows, int) and isinstance(columns, int):
+            return rows, columns
+        by = _FREE_SIZE / max(color.shape[:2])
+        tall, wide = (max(_PATCH, _PATCH * round(side * by / _PATCH)) for side in color.shape[:2])
+        return (rows if isinstance(rows, int) else tall), (columns if isinstance(columns, int) else wide)
+
+
+def load(path: Path, device: str = "cpu") -> DepthNetwork:
+    """The network in an ONNX file. Raises ModelError, ConfigError."""
+    return DepthNetwork(load_session(path, device), path)
+
+
+def fused(
+    inverse: NDArray[np.float32], sigma: NDArray[np.float32], guess: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Stereo's inverse depth and sigma with a network's guess, weighted by their variances; the guess alone where
+    stereo has none. All (H, W). A frame in which too little is known to place the guess stays as it is."""
+    known = inverse > 0
+    if np.count_nonzero(known) < _LEAST_PIXELS:
+        return inverse, sigma
+    x, y = guess[known].astype(np.float64), inverse[known].astype(np.float64)
+    rows, inside = np.stack((x, np.ones_like(x)), axis=1), np.ones(len(x), bool)
+    for _ in range(5):
+        fit = np.linalg.lstsq(rows[inside], y[inside], rcond=None)[0]
+        off = np.abs(rows @ fit - y)
+        deviation = 1.4826 * float(np.median(off))
+        inside = off <= max(_OUTLIERS * deviation, 1e-9)
+    if fit[0] <= 0:
+        return inverse, sigma
+    placed = np.asarray(fit[0] * guess + fit[1], np.float32)
+    nearest, farthest = y.max() * 1.5, y.min() / 1.5
+    usable = (placed > farthest) & (placed < nearest)
+    spread = np.sqrt(deviation**2 + (_LEAST_RELATIVE * placed) ** 2).astype(np.float32)
+    own = np.where(known, 1.0 / np.maximum(sigma, 1e-9) ** 2, 0.0)
+    theirs = np.where(usable, 1.0 / spread**2, 0.0)
+    total = own + theirs
+    mean = np.divide(own * inverse + theirs * placed, total, out=np.zeros_like(total), where=total > 0)
+    deviation_of_mean = np.divide(1.0, np.sqrt(total), out=np.zeros_like(total), where=total > 0)
+    return mean.astype(np.float32), deviation_of_mean.astype(np.float32)

@@ -1,0 +1,337 @@
+"""Dense depth of a scan's posed frames by multi-view stereo, for captures that have none."""
+
+from __future__ import annotations
+
+import functools
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..capture import read_ahead
+from ..capture.base import Capture
+from ..core.arrays import read_arrays
+from ..core.errors import ConfigError, FrameError, MapError, TrackingError
+from ..core.progress import Progress
+from ..core.types import Frame, Intrinsics
+from ..settings.registry import require_positive
+from . import depth_network
+from .building_planes import Layout
+from .cross_view_check import DepthImage
+from .photo_consistency import View
+from .plane_detection import layout
+from .scan_points import Points, confirmed_points, merged
+from .surface_depth import own_where_alike, surface_depth
+from .view_depth import measured
+from .view_selection import APART, Chosen, neighbours
+from .watertight_surface import Surface, watertight
+
+__all__ = ["Options", "Scan", "StereoDepth", "View", "depth_map"]
+
+_AT_ONCE = 16  # frames
+_FILES_KEPT = 64  # in memory: images and depths of the frames around the one in work
+_STORED: dict[str, dict[str, tuple[str, int]]] = {
+    "view": {"grey": ("u", 2), "T_world_cam": ("f", 2), "size": ("i", 1), "camera": ("f", 1)},
+    "guess": {"inverse": ("f", 2)},
+    **{stage: {"inverse": ("f", 2), "sigma": ("f", 2)} for stage in ("measured", "depth")},
+}
+_SURFACE = {"vertices": ("f", 2), "sigma_m": ("f", 1), "triangles": ("i", 2), "cell_m": ("f", 1)}
+_EACH_WAY = 8  # pixels: depths that are looked at for how deep the scan is
+_LEAST_POINTS = 100
+_Result = TypeVar("_Result")
+_SAME_SURFACE = 0.02  # relative: beyond it, depths of adjacent pixels belong to different things
+
+
+@dataclass(frozen=True)
+class Options:
+    """Depth for captures that have none, by multi-view stereo."""
+
+    size: int = 640
+    """Longer side of the depth images in pixels; frames get them enlarged to their own size."""
+    neighbours: int = 4
+    """Views that each frame is compared with."""
+    agreeing: int = 2
+    """Views whose depth must confirm a pixel's, of twice as many as each frame is compared with, for it to become part
+    of the surface."""
+    network: str | None = None
+    """ONNX network that guesses (inverse) depth from one image, fitted to each frame's stereo depth; it fills what
+    stereo leaves empty."""
+    device: str = "cpu"
+    """Where stereo is computed: "cpu", or a CUDA device of torch's."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "neighbours", "agreeing")
+        if self.size < 64:
+            raise ConfigError(f"'size' must be at least 64 pixels, got {self.size}.")
+
+
+class Scan(Protocol):
+    """Poses and sparse points of a capture.
+
+    T_world_cam: (N, 4, 4) float64, NaN where a frame has none.  points: (P, 3) float32 world.
+    seen_frame, seen_point: (O,) int32, point ``seen_point[o]`` is seen in frame ``seen_frame[o]``.
+    """
+
+    @property
+    def T_world_cam(self) -> NDArray[np.float64]: ...
+    @property
+    def points(self) -> NDArray[np.float32]: ...
+    @property
+    def seen_frame(self) -> NDArray[np.int32]: ...
+    @property
+    def seen_point(self) -> NDArray[np.int32]: ...
+
+
+def depth_map(
+    view: View, others: Sequence[View], near: float, far: float, options: Options
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depth of one view from ``others``, which nothing has confirmed yet: (H, W) metres, 0 = none, and its standard
+    deviation. The depth lies between ``near`` and ``far``; H, W are those of a view of ``options.size``."""
+    small, sources = _shrunk(view, options.size), [_shrunk(other, options.size) for other in others]
+    depth = measured(small, sources, sources, near, far, options.device)
+    return _metres(depth.inverse, depth.sigma)
+
+
+class StereoDepth:
+    """Depth of a scan's frames: what each measures becomes points that others confirm, these the surface of the scan,
+    and this the depth of each. One file a frame and stage in ``folder``, and one of the surface: what is there is not
+    computed again."""
+
+    def __init__(self, folder: Path, options: Options):
+        self.folder, self.options = folder, options
+        self._lock = threading.Lock()
+        self._read: OrderedDict[Path, dict[str, NDArray[np.generic]]] = OrderedDict()
+
+    def compute(
+        self,
+        capture: Capture,
+        scan: Scan,
+        frames: Sequence[int],
+        progress: Progress,
+        prepared: Callable[[Frame], Frame] = lambda frame: frame,
+    ) -> None:
+        """Depth of those of ``frames`` that have a pose and partners.
+
+        prepared: the frame as a pinhole camera sees it, should the capture's frames be distorted.
+        Raises TrackingError if hardly any frame has others to be compared with; ModelError, about the network.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        T = np.full_like(scan.T_world_cam, np.nan)
+        T[list(frames)] = scan.T_world_cam[list(frames)]
+        posed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
+        broken = self._decode(capture, posed, T, progress, prepared)
+        T[broken] = np.nan
+        seen, count = (T, scan.points, scan.seen_frame, scan.seen_point), self.options.neighbours
+        chosen = neighbours(*seen, 2 * count)
+        apart = neighbours(*seen, count + count // 2, APART).partners
+        able = [frame for frame, partners in enumerate(chosen.partners) if len(partners)]
+        if len(able) < 2:
+            raise TrackingError(
+                f"No depth can be had from the images of {capture.path}: no two of its frames see the same things from "
+                "different places. Move the camera sideways, do not only turn it."
+            )
+        self._compute("measured", able, functools.partial(self._measure, chosen=chosen, apart=apart), progress)
+        if not self._surface_path.exists():
+            points = self._points(able, chosen, progress)
+            if len(points.points) < _LEAST_POINTS:
+                raise TrackingError(
+                    f"No depth can be had from the images of {capture.path}: hardly anything in them was found to be "
+                    "equally far away by several. They may be blurred, or show bare surfaces, or their poses be wrong."
+                )
+            surface = watertight(points, T[able, :3, 3])
+            self._save(surface, layout(points, T[able, :3, 3], surface.normals()))
+        self._compute(
+            "depth", able, functools.partial(self._render, surface=self._surface(), planes=self._layout()), progress
+        )
+
+    def depth(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """(H, W) depth in metres of a frame, 0 = none, and its standard deviation, at the size of ``prepared`` frames;
+        None for a frame that has none. Raises MapError for a file that is damaged."""
+        if not self._path("depth", index).exists():
+            return None
+        height, width = self._load("view", index)["size"].tolist()
+        return _metres(*_enlarged(self._depth("depth", index), width, height))
+
+    def _compute(
+        self, stage: str, frames: Sequence[int], step: Callable[[int], DepthImage], progress: Progress
+    ) -> None:
+        """``step`` of the frames that have no file of the stage yet."""
+        missing = [frame for frame in frames if not self._path(stage, frame).exists()]
+        progress.stage(f"stereo: {stage}", len(missing))
+        for done, frame, depth in self._each(missing, step):
+            self._write(stage, frame, inverse=depth.inverse.astype(np.float16), sigma=depth.sigma.astype(np.float16))
+            progress.advance(done)
+
+    def _each(self, frames: Sequence[int], step: Callable[[int], _Result]) -> Iterator[tuple[int, int, _Result]]:
+        """How many are done, a frame, and ``step`` of it. On a CPU each core has a frame of its own: their images are
+        too small to be shared out."""
+        workers = len(os.sched_getaffinity(0)) if self.options.device == "cpu" else 1
+        threads = torch.get_num_threads()
+        pool = ThreadPoolExecutor(workers, "stereo", initializer=torch.set_num_threads, initargs=(1,))
+        try:
+            for start in range(0, len(frames), _AT_ONCE):  # so that results do not pile up
+                some = frames[start : start + _AT_ONCE]
+                for done, (frame, found) in enumerate(zip(some, pool.map(step, some), strict=True), start=start + 1):
+                    yield done, frame, found
+        finally:
+            pool.shutdown(cancel_futures=True)
+            torch.set_num_threads(threads)
+
+    def _decode(
+        self,
+        capture: Capture,
+        frames: Sequence[int],
+        T_world_cam: NDArray[np.float64],
+        progress: Progress,
+        prepared: Callable[[Frame], Frame],
+    ) -> list[int]:
+        """Keep what is needed of each image; returns the frames that are broken."""
+        path = self.options.network
+        network = None if path is None else depth_network.load(Path(path).expanduser(), self.options.device)
+        broken = []
+        missing = [frame for frame in frames if not self._path("view", frame).exists()]
+        progress.stage("stereo: images", len(missing))
+        for done, (index, frame) in enumerate(read_ahead(capture, missing), start=1):
+            if isinstance(frame, FrameError):
+                broken.append(index)
+                continue
+            frame = prepared(frame)
+            camera = frame.intrinsics
+            small = _shrunk(View(frame.color, camera, T_world_cam[index]), self.options.size)
+            if network is not None:
+                guess = network(frame.color, small.intrinsics.width, small.intrinsics.height)
+                self._write("guess", index, inverse=guess)
+            self._write(
+                "view", index, grey=np.rint(small.color * 65535.0).astype(np.uint16), T_world_cam=small.T_world_cam,
+                size=np.array((camera.height, camera.width)),
+                camera=np.array((camera.fx, camera.fy, camera.cx, camera.cy)),
+            )  # fmt: skip
+            progress.advance(done)
+        return broken
+
+    def _measure(self, frame: int, chosen: Chosen, apart: list[NDArray[np.int64]]) -> DepthImage:
+        others = [self._view(other) for other in chosen.partners[frame][: self.options.neighbours]]
+        wide = [self._view(other) for other in apart[frame]] or others
+        return measured(self._view(frame), others, wide, chosen.near[frame], chosen.far[frame], self.options.device)
+
+    def _points(self, frames: Sequence[int], chosen: Chosen, progress: Progress) -> Points:
+        def confirmed(frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            others = [self._depth("measured", i) for i in chosen.partners[frame] if len(chosen.partners[i])]
+            agreeing = max(1, min(self.options.agreeing, len(others)))
+            return confirmed_points(self._depth("measured", frame), others, agreeing, self.options.device)
+
+        def advancing() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+            for done, _, points in self._each(frames, confirmed):
+                progress.advance(done)
+                yield points
+
+        progress.stage("stereo: surface", len(frames))
+        some = [self._depth("measured", frame).inverse[::_EACH_WAY, ::_EACH_WAY] for frame in frames]
+        inverse = np.concatenate([image[image > 0] for image in some])
+        return merged(advancing(), 1.0 / float(np.median(inverse)) if len(inverse) else 1.0)
+
+    def _render(self, frame: int, surface: Surface, planes: Layout) -> DepthImage:
+        view = self._view(frame)
+        depth = surface_depth(surface, planes, view.intrinsics, view.T_world_cam)
+        depth = own_where_alike(self._depth("measured", frame), depth)
+        if self.options.network is None:
+            return depth
+        guess = self._load("guess", frame)["inverse"].astype(np.float32)
+        inverse, sigma = depth_network.fused(depth.inverse, depth.sigma, guess)
+        return DepthImage(inverse, sigma, view.intrinsics, view.T_world_cam)
+
+    @property
+    def _surface_path(self) -> Path:
+        return self.folder / "surface.npz"
+
+    def _surface(self) -> Surface:
+        stored = read_arrays(self._surface_path, _SURFACE)
+        vertices, triangles = stored["vertices"], stored["triangles"]
+        shapes = tuple(stored[name].shape for name in ("vertices", "sigma_m", "triangles", "cell_m"))
+        if shapes != ((len(vertices), 3), (len(vertices),), (len(triangles), 3), (1,)):
+            raise MapError(f"{self._surface_path} is damaged: its arrays do not fit each other.")
+        if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
+            raise MapError(f"{self._surface_path} is damaged: it has triangles of points that it does not have.")
+        return Surface(vertices, stored["sigma_m"], triangles, float(stored["cell_m"][0]))
+
+    def _layout(self) -> Layout:
+        path = self.folder / "layout.npz"
+        try:
+            return Layout.from_arrays(read_arrays(path, Layout.EXPECTED))
+        except ValueError as error:
+            raise MapError(f"{path} is damaged: it has {error}.") from error
+
+    def _save(self, surface: Surface, planes: Layout) -> None:
+        """The surface last: where it is, both are."""
+        _write_arrays(self.folder / "layout.npz", **planes.to_arrays())
+        _write_arrays(
+            self._surface_path, vertices=surface.vertices, sigma_m=surface.sigma_m, triangles=surface.triangles,
+            cell_m=np.array([surface.cell_m]),
+        )  # fmt: skip
+
+    def _view(self, frame: int) -> View:
+        stored = self._load("view", frame)
+        height, width = stored["size"].tolist()
+        grey = stored["grey"].astype(np.float32) / np.float32(65535.0)
+        camera = Intrinsics(width, height, *stored["camera"].tolist()).resized(grey.shape[1], grey.shape[0])
+        return View(grey, camera, stored["T_world_cam"].astype(np.float64))
+
+    def _depth(self, stage: str, frame: int) -> DepthImage:
+        stored, view = self._load(stage, frame), self._view(frame)
+        inverse, sigma = stored["inverse"].astype(np.float32), stored["sigma"].astype(np.float32)
+        return DepthImage(inverse, sigma, view.intrinsics, view.T_world_cam)
+
+    def _path(self, stage: str, frame: int) -> Path:
+        return self.folder / f"{frame:06d}.{stage}.npz"
+
+    def _write(self, stage: str, frame: int, **arrays: NDArray[np.generic]) -> None:
+        _write_arrays(self._path(stage, frame), **arrays)
+
+    def _load(self, stage: str, frame: int) -> dict[str, NDArray[np.generic]]:
+        path = self._path(stage, frame)
+        with self._lock:
+            if path not in self._read:
+                self._read[path] = read_arrays(path, _STORED[stage])
+                if len(self._read) > _FILES_KEPT:
+                    self._read.popitem(last=False)
+            self._read.move_to_end(path)
+            return self._read[path]
+
+
+def _write_arrays(path: Path, **arrays: NDArray[np.generic]) -> None:
+    temporary = path.with_suffix(".tmp.npz")
+    np.savez(temporary, **arrays)  # type: ignore[arg-type]
+    temporary.replace(path)
+
+
+def _shrunk(view: View, size: int) -> View:
+    """The view with a longer side of ``size`` pixels, or of fewer if it has fewer; both sides even."""
+    camera = view.intrinsics
+    by = min(1.0, size / max(camera.width, camera.height))
+    return view.shrunk(2 * round(camera.width * by / 2), 2 * round(camera.height * by / 2))
+
+
+def _enlarged(depth: DepthImage, width: int, height: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Inverse depths and their sigma at another size: between pixels of one surface they are interpolated."""
+    nearest = cv2.resize(depth.inverse, (width, height), interpolation=cv2.INTER_NEAREST)
+    between = cv2.resize(depth.inverse, (width, height), interpolation=cv2.INTER_LINEAR)
+    smooth = (nearest > 0) & (np.abs(between - nearest) < _SAME_SURFACE * nearest)
+    sigma = cv2.resize(depth.sigma, (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.where(smooth, between, nearest), np.asarray(sigma, np.float32)
+
+
+def _metres(
+    inverse: NDArray[np.float32], sigma: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depth and its standard deviation from those of inverse depth."""
+    depth_m = np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+    return depth_m, np.asarray(sigma * depth_m**2, np.float32)

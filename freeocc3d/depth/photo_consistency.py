@@ -1,0 +1,152 @@
+"""Photo-consistency: how well other views agree with a reference view about hypothetical depths of its pixels.
+
+Depths are handled as inverse depths: along them a pixel moves nearly evenly through the other images, and over a plane
+they are linear in the pixel. Source: R. T. Collins, A Space-Sweep Approach to True Multi-Image Matching, CVPR 1996.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..core.transforms import invert
+from ..core.types import Intrinsics
+
+NOISE = 3.0 / 255.0
+"""Standard deviation of what differs between two images of the same surface; fainter texture scores little."""
+
+_AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 24}  # pixels x hypotheses; on a CPU such that they stay in its cache
+
+
+@dataclass(frozen=True)
+class View:
+    """An image whose camera is known.
+
+    color: (H, W, 3) uint8 RGB, or (H, W) float32 grey in 0…1 for ``intrinsics`` of that size.
+    T_world_cam: (4, 4) float64.
+    """
+
+    color: NDArray[np.uint8] | NDArray[np.float32]
+    intrinsics: Intrinsics
+    T_world_cam: NDArray[np.float64]
+
+    def shrunk(self, width: int, height: int) -> View:
+        """The same view in grey, of another size."""
+        image = self.color
+        if image.ndim == 3:
+            image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255.0))
+        if image.shape != (height, width):
+            image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+        return View(image, self.intrinsics.resized(width, height), self.T_world_cam)
+
+
+def rays(camera: Intrinsics, device: str | torch.device = "cpu") -> Tensor:
+    """(3, H, W) points at depth 1 that the pixels see."""
+    v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    return torch.stack((x, y, torch.ones_like(x))).float().to(device)
+
+
+class Matcher:
+    """A reference view and the V views that it is compared with, all grey and of one size.
+
+    Patches of (2 radius + 1)² pixels are compared by zero-mean normalised cross-correlation, each pixel at the depth
+    that it has itself: where the hypotheses vary over a patch, it is slanted or curved as they are.
+    """
+
+    def __init__(self, view: View, others: Sequence[View], radius: int, device: str = "cpu"):
+        self.camera, self.radius, self.device = view.intrinsics, radius, torch.device(device)
+        self.grey = self._image(view)
+        self.rays = rays(view.intrinsics, self.device)
+        self._mean = box_mean(self.grey[None], radius)[0]
+        self._variance = box_mean(self.grey[None] ** 2, radius)[0] - self._mean**2
+        self._sources = [(self._image(other), *self._projection(view, other)) for other in others]
+        baselines = [np.linalg.norm((invert(o.T_world_cam) @ view.T_world_cam)[:3, 3]) for o in others]
+        self.pixel = 1.0 / (self.camera.fx * float(np.median(baselines)))
+        """Inverse depth that moves a point by about one pixel in the other views."""
+
+    def scores(self, inverse_depth: Tensor) -> Tensor:
+        """Correlations in -1…1 of the reference with each view; 0 where that does not see the point.
+
+        inverse_depth: (D, H, W) or (D, 1, 1) hypotheses.  Returns (V, D, H, W).
+        """
+        depths = len(inverse_depth)
+        out = self.grey.new_empty((len(self._sources), depths, *self.grey.shape))
+        chunk = max(1, _AT_ONCE[self.device.type] // self.grey.numel())
+        for at in range(0, depths, chunk):
+            for row, source in enumerate(self._sources):
+                out[row, at : at + chunk] = self._correlation(*source, inverse_depth[at : at + chunk])
+        return out
+
+    def agreement(self, inverse_depth: Tensor) -> Tensor:
+        """(D, H, W) mean of the better half of the views' scores, so that what hides a point from some does not count.
+
+        Source: S. B. Kang, R. Szeliski, J. Chai, Handling Occlusions in Dense Multi-view Stereo, CVPR 2001.
+        """
+        chunk = max(1, _AT_ONCE[self.device.type] // self.grey.numel())
+        parts = [best_half(self.scores(part)) for part in inverse_depth.split(chunk)]
+        return torch.cat(parts)
+
+    def _correlation(self, image: Tensor, turn: Tensor, shift: Tensor, inverse_depth: Tensor) -> Tensor:
+        x, y, z = turn[:, None] + inverse_depth[None] * shift  # (3, D, H, W)
+        z = z.clamp_min(1e-6)
+        grid = torch.stack((x / z, y / z), dim=-1)
+        inside = grid.abs().amax(dim=-1) <= 1.0
+        depths, height, width = inside.shape
+        flat = grid.view(1, depths * height, width, 2)
+        warped = F.grid_sample(image[None, None], flat, padding_mode="border", align_corners=False)
+        warped = warped.view(depths, height, width)
+        mean = box_mean(warped, self.radius)
+        variance = (box_mean(warped * warped, self.radius) - mean * mean).clamp_min(0.0)
+        shared = box_mean(warped * self.grey, self.radius) - mean * self._mean
+        scores = shared * torch.rsqrt((variance + NOISE**2) * (self._variance.clamp_min(0.0) + NOISE**2))
+        return scores * inside
+
+    def _image(self, view: View) -> Tensor:
+        return torch.from_numpy(view.color).to(self.device) - 0.5  # sums of squares keep more digits
+
+    def _projection(self, view: View, other: View) -> tuple[Tensor, Tensor]:
+        """(3, H, W) and (3, 1, 1, 1): their sum, the latter times the inverse depth, is the homogeneous place in the
+        other image, whose borders are -1 and 1."""
+        camera = other.intrinsics
+        to_grid = np.array(
+            [[2.0 / camera.width, 0.0, 1.0 / camera.width - 1.0], [0.0, 2.0 / camera.height, 1.0 / camera.height - 1.0],
+             [0.0, 0.0, 1.0]]
+        )  # fmt: skip
+        T_other_cam = invert(other.T_world_cam) @ view.T_world_cam
+        P = torch.from_numpy(to_grid @ camera.matrix @ T_other_cam[:3]).float().to(self.device)
+        return torch.einsum("ij,jhw->ihw", P[:, :3], self.rays), P[:, 3].reshape(3, 1, 1, 1)
+
+
+def best_half(scores: Tensor) -> Tensor:
+    """(V, …) to (…): the mean of the better half of the views."""
+    count = (len(scores) + 1) // 2
+    return scores.mean(dim=0) if count == len(scores) else scores.topk(count, dim=0)[0].mean(dim=0)
+
+
+def box_mean(images: Tensor, radius: int) -> Tensor:
+    """(D, H, W): means over the part of (2 radius + 1)² pixels around each that lies in the image."""
+    if images.device.type != "cpu":
+        return pooled_mean(images, radius)
+    size = (2 * radius + 1,) * 2  # OpenCV's sums run along rows and columns: four times as fast as pooling
+    inside = np.ones(images.shape[1:], np.float32)
+    share = 1.0 / cv2.boxFilter(inside, -1, size, borderType=cv2.BORDER_CONSTANT)
+    means = np.empty(images.shape, np.float32)
+    for image, mean in zip(images.numpy(), means, strict=True):
+        cv2.boxFilter(image, -1, size, dst=mean, borderType=cv2.BORDER_CONSTANT)
+        mean *= share
+    return torch.from_numpy(means)
+
+
+def pooled_mean(images: Tensor, radius: int) -> Tensor:
+    """``box_mean`` by torch, on any device."""
+    size = 2 * radius + 1
+    rows = F.avg_pool2d(images[:, None], (1, size), 1, (0, radius), count_include_pad=False)
+    return F.avg_pool2d(rows, (size, 1), 1, (radius, 0), count_include_pad=False)[:, 0]

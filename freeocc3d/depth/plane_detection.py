@@ -1,0 +1,314 @@
+"""Finds the planes of a building from what little is measured of them.
+
+A bare wall has no texture that could be matched, but the edges around it and on it can: the surface of the scan spans
+what lies between them by large triangles, and the wall's plane is where it should be put. Most walls are at right
+angles; so three directions are found first in which most points lie in layers, and then the layers.
+Sources of the ideas: J. Coughlan, A. Yuille, Manhattan World, ICCV 1999; Y. Furukawa et al., Manhattan-world Stereo,
+CVPR 2009.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .building_planes import Layout, Plane
+from .scan_points import Points
+
+_MOST_PLANES = 60
+_LEAST_POINTS = 60
+# Lengths in cells of the points; sizes of pieces in squares of a plane.
+_WITHIN = 1.0  # off a plane, of what lies on it
+_LAYER = 0.6  # layers that points are counted in
+_BESIDE = 4.0  # up to here a surface that runs through the plane is looked for
+_SQUARE = 2.0
+_SEEN_THROUGH = 3.0  # beyond the plane, or 3 sigma
+_PIECE, _HELD = 60, 30
+_GAPS = (4, 8, 16, 32)
+_GAP_OF_PIECE = 0.3  # gaps up to this share of a piece's length are closed
+_REACH = 34  # squares that a plane may go on beyond its points
+_MOST_SQUARES = 1 << 24  # a plane of more is some stray points far apart
+
+_TURNS_DEG = (
+    -0.5,
+    -0.25,
+    0.0,
+    0.25,
+    0.5,
+)  # of the second and third direction about the first, for walls that are not quite at right angles
+_LEAST_ALIKE = 0.9  # cosine between the normals of a plane before and after it is fitted
+_TILT = 0.003  # radians: standard deviation of a plane's normal before its points are asked
+_DEPENDENT = 50.0  # points per independent measurement
+_BEHIND = 0.01  # share of the points that may lie behind the outermost wall
+_OUTERMOST = 60  # squares that it must hold
+
+
+@dataclass(frozen=True)
+class _Bounded:
+    """A plane where its points support it; the squares in which it is not seen through; how many hold points; which
+    points it takes."""
+
+    plane: Plane
+    free: NDArray[np.bool_]
+    held: int
+    taken: NDArray[np.bool_]
+
+
+def layout(points: Points, centres: NDArray[np.float64], normals: NDArray[np.float64]) -> Layout:
+    """The planes of a scan.
+
+    centres: (C, 3) of the cameras that ``points.ray_camera`` counts.  normals: (N, 3) of surfaces, of length 1 and any
+    sign, one of which at least is that of a wall or floor.
+    """
+    if len(points.points) < _LEAST_POINTS or not len(normals):
+        return Layout(())
+    axes = directions(points, normals)
+    return Layout(_outermost(points, centres, axes) + _layers(points, centres, axes))
+
+
+def directions(points: Points, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3): rows at right angles to each other, along which points lie in layers. The first is that of the layer with
+    most points, and as exact as these say; it is the floor's more often than not."""
+    X, cell = points.points - points.points.mean(axis=0), points.cell_m
+    some = X[np.random.default_rng(0).permutation(len(X))[:40_000]]
+    axes = _coarse(some, _commonest(normals), cell)
+    for step, thickness in ((1.0, 2.0), (0.5, 2.0), (0.25, 1.0), (0.1, 1.0)):
+        for _ in range(4):
+            turned = [axes] + [axes @ _turn(axes[k], by * step).T for k in range(3) for by in (-2, -1, 1, 2)]
+            best = int(np.argmax([_layered(some, rows, thickness * cell) for rows in turned]))
+            axes = turned[best]
+            if best == 0:
+                break
+    counts = [np.bincount(_layer(X @ row, cell)) for row in axes]
+    first = int(np.argmax([count.max() for count in counts]))
+    height = X @ axes[first]
+    normal = _fitted(X, axes[first], float(height.min()) + (int(np.argmax(counts[first])) + 0.5) * cell, cell)
+    across = axes[(first + 1) % 3] - normal * (normal @ axes[(first + 1) % 3])
+    across /= np.linalg.norm(across)
+    axes = np.stack((normal, across, np.cross(normal, across)))
+    sure = X[points.sigma_m <= np.median(points.sigma_m)]
+    angles = np.arange(-3.0, 3.01, 0.125)
+    sharp = [sum(_peaks(sure, row, 0.5 * cell) for row in (axes @ _turn(normal, by).T)[1:]) for by in angles]
+    return np.asarray(axes @ _turn(normal, float(angles[int(np.argmax(sharp))])).T)
+
+
+def _commonest(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    some = normals[np.random.default_rng(0).permutation(len(normals))[:4000]]
+    alike = np.abs(some @ some.T) > 0.99
+    best = int(np.argmax(alike.sum(axis=1)))
+    held = some[alike[best]]
+    mean = (held * np.sign(held @ some[best])[:, None]).sum(axis=0)
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def _coarse(X: NDArray[np.float64], normal: NDArray[np.float64], cell: float) -> NDArray[np.float64]:
+    across = np.linalg.svd(normal[None])[2][1]
+    axes = np.stack((normal, across, np.cross(normal, across)))
+    turned = [axes @ _turn(normal, by).T for by in range(0, 90, 2)]
+    return turned[int(np.argmax([_layered(X, rows, 2.0 * cell) for rows in turned]))]
+
+
+def _turn(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+    return np.asarray(cv2.Rodrigues(axis * np.radians(degrees))[0], np.float64)
+
+
+def _layer(heights: NDArray[np.float64], thickness: float) -> NDArray[np.int64]:
+    return np.floor((heights - heights.min()) / thickness).astype(np.int64)
+
+
+def _layered(X: NDArray[np.float64], axes: NDArray[np.float64], thickness: float) -> float:
+    """How unevenly points lie along the axes."""
+    return float(sum((np.bincount(_layer(X @ row, thickness)).astype(float) ** 2).sum() for row in axes))
+
+
+def _peaks(X: NDArray[np.float64], axis: NDArray[np.float64], thickness: float) -> float:
+    """The same, of what stands out from its surroundings alone: a floor seen edge-on says nothing about its azimuth."""
+    count = np.bincount(_layer(X @ axis, thickness)).astype(float)
+    count += np.append(count[1:], 0.0)
+    around = np.convolve(count, np.full(15, 1 / 15.0))[7 : 7 + len(count)]  # as many, however few layers
+    return float((np.maximum(count - around, 0.0) ** 2).sum())
+
+
+def _fitted(X: NDArray[np.float64], normal: NDArray[np.float64], offset: float, cell: float) -> NDArray[np.float64]:
+    """The normal of the plane through the points near one."""
+    for within in (1.5, 1.5, 1.5, 1.0, 1.0, 1.0):
+        held = X[np.abs(X @ normal - offset) < within * cell]
+        if len(held) < _LEAST_POINTS:
+            break
+        mean = held.mean(axis=0)
+        found = np.linalg.eigh((held - mean).T @ (held - mean))[1][:, 0]
+        if abs(found @ normal) < _LEAST_ALIKE:
+            break  # they lie in a line
+        normal = found * np.sign(found @ normal)
+        offset = float(normal @ mean)
+    return normal
+
+
+def _layers(points: Points, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
+    """Planes, those that hold most points first; what one holds the next ones do without.
+
+    Source: P. Hough, Method and Means for Recognizing Complex Patterns, 1962.
+    """
+    X, cell = points.points, points.cell_m
+    rows, of_axis = [axes[0]], [0]
+    for axis, other in ((1, 2), (2, 1)):
+        for degrees in _TURNS_DEG:
+            row = axes[axis] + np.radians(degrees) * axes[other]
+            rows.append(row / np.linalg.norm(row))
+            of_axis.append(axis)
+    normals, group = np.stack(rows), np.array(of_axis)
+    mean, thickness = X.mean(axis=0), _LAYER * cell
+    heights = (X - mean) @ normals.T
+    lowest = float(heights.min())
+    layer = np.floor((heights - lowest) / thickness).astype(np.int64)
+    layers = int(layer.max()) + 2
+    count = np.stack([np.bincount(column, minlength=layers) for column in layer.T]).astype(float)
+    left = np.ones(len(X), bool)
+    found: list[Plane] = []
+    while len(found) < _MOST_PLANES:
+        thick = count[:, :-1] + count[:, 1:]
+        row, at = np.unravel_index(int(np.argmax(thick)), thick.shape)
+        if thick[row, at] < _LEAST_POINTS:
+            break
+        plane = _tilted(
+            X, points.sigma_m, left, normals[row], lowest + (at + 1) * thickness + mean @ normals[row], cell
+        )
+        bounded = None if plane is None else _bounded(points, centres, *plane)
+        alike = group == group[row] if bounded is not None else np.arange(len(group)) == row
+        count[alike, max(at - 1, 0) : at + 2] = -np.inf  # never the same again
+        if bounded is None:
+            continue
+        found.append(bounded.plane)
+        gone = np.flatnonzero(left & bounded.taken)
+        for k in range(len(normals)):
+            count[k] -= np.bincount(layer[gone, k], minlength=layers)
+        left[gone] = False
+    return found
+
+
+def _tilted(
+    X: NDArray[np.float64], sigma_m: NDArray[np.float64], left: NDArray[np.bool_], start: NDArray[np.float64],
+    offset: float, cell: float,
+) -> tuple[NDArray[np.float64], float] | None:  # fmt: skip
+    """The plane through the points near one, whose normal is known to a few milliradians beforehand: what hangs on a
+    corner's edge alone cannot turn it."""
+    normal, across = start, np.linalg.svd(start[None])[2][1:]
+    for _ in range(4):
+        held = left & (np.abs(X @ normal - offset) < _WITHIN * cell)
+        if np.count_nonzero(held) < _LEAST_POINTS:
+            return None
+        weight = 1.0 / np.maximum(sigma_m[held], 0.25 * cell) ** 2
+        mean = (X[held] * weight[:, None]).sum(axis=0) / weight.sum()
+        moved = X[held] - mean
+        weight /= weight.max() * _DEPENDENT * (0.5 * _WITHIN * cell) ** 2
+        along, above = moved @ across.T, moved @ start
+        information = (along * weight[:, None]).T @ along + np.eye(2) / _TILT**2
+        normal = start - np.linalg.solve(information, (along * weight[:, None]).T @ above) @ across
+        normal = normal / np.linalg.norm(normal)
+        offset = float(normal @ mean)
+    return normal, offset
+
+
+def _bounded(
+    points: Points, centres: NDArray[np.float64], normal: NDArray[np.float64], offset: float
+) -> _Bounded | None:
+    """The plane where its points support it; None if these are few or scattered."""
+    X, cell = points.points, points.cell_m
+    square = _SQUARE * cell
+    height = X @ normal - offset
+    on = np.abs(height) < _WITHIN * cell
+    axes = np.linalg.svd(normal[None])[2][1:]
+    place = X[on] @ axes.T
+    if len(place) < _LEAST_POINTS:
+        return None
+    corner = np.percentile(place, 0.5, axis=0) - _REACH * square
+    shape = np.ceil((np.percentile(place, 99.5, axis=0) + _REACH * square - corner) / square).astype(np.int64)
+    if shape.prod() > _MOST_SQUARES:
+        return None
+
+    def squares(some: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        index = np.floor((some @ axes.T - corner) / square).astype(np.int64)
+        return index, np.asarray(((index >= 0) & (index < shape)).all(axis=1))
+
+    def counted(some: NDArray[np.float64]) -> NDArray[np.float32]:
+        index, inside = squares(some)
+        flat = np.ravel_multi_index(tuple(index[inside].T), tuple(shape))
+        return np.bincount(flat, minlength=int(shape.prod())).reshape(shape).astype(np.float32)
+
+    beside = ~on & (np.abs(height) < _BESIDE * cell)
+    count, above, below = counted(X[on]), counted(X[beside & (height > 0)]), counted(X[beside & (height < 0)])
+    around = np.ones((3, 3), np.uint8)
+    # Another surface runs through it where there are as many points on both sides as on it.
+    both_sides = (cv2.dilate(above, around) > 0) & (cv2.dilate(below, around) > 0)
+    crossed = both_sides & (cv2.blur(above + below, (3, 3)) / (_BESIDE - 1.0) > 0.5 * cv2.blur(count, (3, 3)))
+    held = _pieces((count >= 1) & ~crossed)
+    if np.count_nonzero(held) < _HELD:
+        return None
+    from_camera, to_point = centres @ normal - offset, height
+    a, b = from_camera[points.ray_camera], to_point[points.ray_point]
+    beyond = np.maximum(_SEEN_THROUGH * cell, 3.0 * points.sigma_m[points.ray_point])
+    through = np.flatnonzero((a * b < 0) & (np.abs(b) > beyond))
+    share = (a[through] / (a[through] - b[through]))[:, None]
+    start = centres[points.ray_camera[through]]
+    rays = counted(start + share * (X[points.ray_point[through]] - start))
+    held = _pieces(held & (rays <= 2 * count))
+    if np.count_nonzero(held) < _HELD:
+        return None
+    free = cv2.dilate(((rays >= 2) & (rays > 2 * count)).astype(np.uint8), around) > 0
+    support = _closed(held) & ~free
+    support = (cv2.morphologyEx(support.astype(np.uint8), cv2.MORPH_OPEN, around) > 0) | held
+    near = np.abs(height) < 2.0 * _WITHIN * cell
+    index, inside = squares(X[near])
+    taken = np.zeros(len(X), bool)
+    rows = np.flatnonzero(near)[inside]
+    taken[rows] = cv2.dilate(held.astype(np.uint8), around)[tuple(index[inside].T)] > 0
+    plane = Plane(normal, offset, axes, corner, square, support, outermost=False)
+    return _Bounded(plane, ~free | held, int(np.count_nonzero(held)), taken)
+
+
+def _pieces(held: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Without those that are small."""
+    _, labels, sizes, _ = cv2.connectedComponentsWithStats(cv2.dilate(held.astype(np.uint8), np.ones((5, 5), np.uint8)))
+    return held & np.isin(labels, np.flatnonzero(sizes[:, cv2.CC_STAT_AREA] >= _PIECE))
+
+
+def _closed(held: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """With the gaps closed that are small beside the pieces around them."""
+    grid = held.astype(np.uint8)
+    for gap in _GAPS:
+        _, labels, sizes, _ = cv2.connectedComponentsWithStats(cv2.dilate(grid, _disc(2)))
+        lengths = sizes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
+        long = np.flatnonzero(lengths * _GAP_OF_PIECE >= gap)
+        some = (grid * np.isin(labels, long[long > 0])).astype(np.uint8)
+        if not some.any():
+            break
+        grid |= cv2.morphologyEx(some, cv2.MORPH_CLOSE, _disc(gap))
+    return grid > 0
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
+
+
+def _outermost(points: Points, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
+    """The floor, the ceiling and the walls that have hardly anything behind them: of the layers of which that is true,
+    those that hold most. They go on wherever they are not seen through."""
+    X, cell = points.points, points.cell_m
+    everything, planes = np.ones(len(X), bool), []
+    for outwards in np.concatenate((axes, -axes)):
+        height = X @ outwards
+        lowest = float(height.min())
+        count = np.bincount(_layer(height, _LAYER * cell)).astype(float)
+        count[:-1] += count[1:]
+        offsets = lowest + (np.arange(len(count)) + 1) * _LAYER * cell
+        behind = 1.0 - np.searchsorted(np.sort(height), offsets + _SEEN_THROUGH * cell) / len(X)
+        count[(behind > _BEHIND) | (offsets < (centres @ outwards).max())] = 0.0
+        best = int(np.argmax(count))
+        plane = _tilted(X, points.sigma_m, everything, outwards, offsets[best], cell) if count[best] else None
+        bounded = None if plane is None else _bounded(points, centres, *plane)
+        if bounded is not None and bounded.held >= _OUTERMOST:
+            planes.append(replace(bounded.plane, support=bounded.free, outermost=True))
+    return planes

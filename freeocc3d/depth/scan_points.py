@@ -1,0 +1,137 @@
+"""The points of a scan that several of its views measured, and the rays along which they did."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cross_view_check import DepthImage, confirmed
+from .photo_consistency import rays
+
+_SAME_DEPTH = 0.01  # relative: up to it views agree, whatever their standard deviations
+_LOOKING_THROUGH = 0.5  # views that contradict, over those that agree
+_CELL = 0.01  # of the scan's depth
+_LEAST_VIEWS = 2
+_BITS = 20  # of a cell's number along one axis
+_HALF = 1 << _BITS - 1  # its number in the middle
+_MOST = 500_000  # points: the cut through their tetrahedra takes some 2 GB
+_UNCONFIRMED = 4  # times as many are kept until it is known which ones other cameras measured, too
+
+
+@dataclass(frozen=True)
+class Points:
+    """points: (P, 3) float64 world.  sigma_m: (P,) metres.  ray_point, ray_camera: (R,) int32, the rays along which
+    points were measured.  cell_m: edge of the cells that hold one point each."""
+
+    points: NDArray[np.float64]
+    sigma_m: NDArray[np.float64]
+    ray_point: NDArray[np.int32]
+    ray_camera: NDArray[np.int32]
+    cell_m: float
+
+
+def confirmed_points(
+    view: DepthImage, others: Sequence[DepthImage], agreeing: int, device: str = "cpu"
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N, 3) world points of a view that ``agreeing`` of the ``others`` see at the same depth, and few at a greater
+    one; their (N,) standard deviations in metres."""
+    found = confirmed(view, others, _SAME_DEPTH, device)
+    keep = (found.agreeing >= agreeing) & (found.through <= _LOOKING_THROUGH * found.agreeing)
+    there = keep.cpu().numpy() & (view.inverse > 0)
+    z = 1.0 / found.inverse.cpu().numpy()[there].astype(np.float64)
+    T = view.T_world_cam
+    points = (rays(view.camera).numpy()[:, there].T * z[:, None]) @ T[:3, :3].T + T[:3, 3]
+    return points, found.sigma.cpu().numpy()[there] * z**2
+
+
+def merged(
+    measured: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], depth_m: float, most: int = _MOST
+) -> Points:
+    """One point per cell of a hundredth of the scan's typical ``depth_m``: the mean of those in it, weighted by their
+    variances. Points that one camera alone measured are left out; cells are larger where there would be more than
+    ``most``.
+
+    measured: (N, 3) points and (N,) sigma, metres, of each camera.
+    """
+    cells = _Cells.none(_CELL * depth_m)
+    waiting: list[_Cells] = []
+    for camera, (points, sigma_m) in enumerate(measured):
+        waiting.append(_Cells.of(camera, points, sigma_m, cells.edge))
+        if sum(len(part.keys) for part in waiting) > len(cells.keys):
+            cells, waiting = _joined([cells, *waiting]), []
+        while len(cells.keys) > _UNCONFIRMED * most:
+            cells, waiting = _joined([cells, *waiting]).coarser(), []
+    cells = _joined([cells, *waiting])
+    while True:
+        row = np.searchsorted(cells.keys, cells.ray_key)
+        keep = np.bincount(row, minlength=len(cells.keys)) >= _LEAST_VIEWS
+        if np.count_nonzero(keep) <= most:
+            break
+        cells = cells.coarser()
+    weight, places, spread = np.split(cells.sums[keep], (1, 4), axis=1)
+    seen = keep[row]
+    ray_point = (np.cumsum(keep) - 1)[row[seen]].astype(np.int32)
+    return Points(places / weight, (spread / weight)[:, 0], ray_point, cells.ray_camera[seen], cells.edge)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """keys: (K,) int64, ascending, three numbers of a cell packed.  sums: (K, 5) of weights, weighted x, y, z, sigma.
+    ray_key, ray_camera: (R,) a cell holds what a camera measured, each pair once."""
+
+    edge: float
+    keys: NDArray[np.int64]
+    sums: NDArray[np.float64]
+    ray_key: NDArray[np.int64]
+    ray_camera: NDArray[np.int32]
+
+    @classmethod
+    def none(cls, edge: float) -> _Cells:
+        return cls.of(0, np.zeros((0, 3)), np.zeros(0), edge)
+
+    @classmethod
+    def of(cls, camera: int, points: NDArray[np.float64], sigma_m: NDArray[np.float64], edge: float) -> _Cells:
+        numbers = np.floor(points / edge) + _HALF
+        near = ((numbers >= 0) & (numbers < 2 * _HALF)).all(axis=1)
+        x, y, z = numbers[near].astype(np.int64).T
+        weight = 1.0 / sigma_m[near] ** 2
+        columns = (weight, *(weight * points[near].T), weight * sigma_m[near])
+        keys, sums = _summed((x << 2 * _BITS) | (y << _BITS) | z, np.stack(columns, axis=1))
+        return cls(edge, keys, sums, keys, np.full(len(keys), camera, np.int32))
+
+    def coarser(self) -> _Cells:
+        """In cells of twice the edge."""
+        keys, sums = _summed(_halved(self.keys), self.sums)
+        ray_key, ray_camera = _halved(self.ray_key), self.ray_camera
+        order = np.lexsort((ray_camera, ray_key))
+        ray_key, ray_camera = ray_key[order], ray_camera[order]
+        new = np.ones(len(order), bool)
+        new[1:] = (np.diff(ray_key) != 0) | (np.diff(ray_camera) != 0)
+        return _Cells(2.0 * self.edge, keys, sums, ray_key[new], ray_camera[new])
+
+
+def _joined(parts: Sequence[_Cells]) -> _Cells:
+    """Cells of one edge, each of its own cameras."""
+    keys, sums = _summed(np.concatenate([p.keys for p in parts]), np.concatenate([p.sums for p in parts]))
+    return _Cells(
+        parts[0].edge,
+        keys,
+        sums,
+        np.concatenate([part.ray_key for part in parts]),
+        np.concatenate([part.ray_camera for part in parts]),
+    )
+
+
+def _summed(keys: NDArray[np.int64], sums: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    unique, which = np.unique(keys, return_inverse=True)
+    return unique, np.stack([np.bincount(which, column, len(unique)) for column in sums.T], axis=1)
+
+
+def _halved(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Packed numbers of the cells of twice the edge; those are counted from the same middle."""
+    one = (1 << _BITS) - 1
+    x, y, z = (((keys >> shift & one) + _HALF) >> 1 for shift in (2 * _BITS, _BITS, 0))
+    return np.asarray((x << 2 * _BITS) | (y << _BITS) | z)

@@ -1,0 +1,98 @@
+"""Sparse points of a scan whose poses are known: features matched between frames, and where their rays meet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import read_ahead
+from ..capture.base import Capture
+from ..core.errors import FrameError
+from ..core.progress import Progress
+from ..core.types import Frame
+from ..tracking.rgbd import orb_features
+
+_STEPS = (1, 2, 3, 5, 8, 12)  # frames ahead
+_NEAR = 6  # frames of another time whose cameras look the same way from close by
+_LOOK = 0.8  # cosine between optical axes
+_LEAST_ANGLE = np.radians(2.0)
+_AGREES = 2.0 / 500.0  # of a ray's length: how far two rays of one point may pass each other
+
+
+@dataclass(frozen=True)
+class PosedPoints:
+    """What stereo needs of a scan (``scan_depth.Scan``)."""
+
+    T_world_cam: NDArray[np.float64]
+    points: NDArray[np.float32]
+    seen_frame: NDArray[np.int32]
+    seen_point: NDArray[np.int32]
+
+
+def triangulated(
+    capture: Capture,
+    T_world_cam: NDArray[np.float64],
+    frames: Sequence[int],
+    progress: Progress,
+    prepared: Callable[[Frame], Frame] = lambda frame: frame,
+) -> PosedPoints:
+    """Points that two of ``frames`` see each. T_world_cam: (N, 4, 4), NaN where unknown."""
+    posed = [frame for frame in frames if np.isfinite(T_world_cam[frame]).all()]
+    progress.stage("triangulation", len(posed))
+    found: dict[int, tuple[orb_features.Features, NDArray[np.float64]]] = {}
+    for done, (index, frame) in enumerate(read_ahead(capture, posed), start=1):
+        if not isinstance(frame, FrameError):
+            frame = prepared(frame)
+            detected = orb_features.detect(frame)
+            rays = detected.rays(frame.intrinsics).astype(np.float64)
+            directions = np.concatenate((rays, np.ones((len(rays), 1))), axis=1) @ T_world_cam[index, :3, :3].T
+            found[index] = detected, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        progress.advance(done)
+    points, seen_frame, seen_point, count = [], [], [], 0
+    for a, b in _pairs(T_world_cam, list(found)):
+        rows = orb_features.match(found[a][0], found[b][0])
+        met = _meeting(T_world_cam[a, :3, 3], found[a][1][rows[:, 0]], T_world_cam[b, :3, 3], found[b][1][rows[:, 1]])
+        points.append(met)
+        seen_frame += [np.full(len(met), a), np.full(len(met), b)]
+        seen_point += [count + np.arange(len(met))] * 2
+        count += len(met)
+    return PosedPoints(
+        T_world_cam,
+        np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32),
+        np.concatenate([np.zeros(0), *seen_frame]).astype(np.int32),
+        np.concatenate([np.zeros(0), *seen_point]).astype(np.int32),
+    )
+
+
+def _pairs(T_world_cam: NDArray[np.float64], frames: list[int]) -> list[tuple[int, int]]:
+    """Frames that may see the same: those that follow each other, and those that look the same way from close by."""
+    T = T_world_cam[frames]
+    pairs = {(row, row + step) for step in _STEPS for row in range(len(frames) - step)}
+    for row in range(len(frames)):
+        distance = np.linalg.norm(T[:, :3, 3] - T[row, :3, 3], axis=1)
+        other = (T[:, :3, 2] @ T[row, :3, 2] > _LOOK) & (np.abs(np.arange(len(frames)) - row) > _STEPS[-1])
+        near = np.flatnonzero(other)
+        near = near[np.argsort(distance[near])[:: max(1, len(near) // _NEAR)]][:_NEAR]  # some close, some farther
+        pairs |= {(min(row, k), max(row, k)) for k in near.tolist()}
+    return [(frames[a], frames[b]) for a, b in sorted(pairs)]
+
+
+def _meeting(
+    centre_a: NDArray[np.float64],
+    rays_a: NDArray[np.float64],
+    centre_b: NDArray[np.float64],
+    rays_b: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Midpoints between (M, 3) unit rays of two cameras, of those pairs that meet in front of both."""
+    way = centre_b - centre_a
+    cosine = np.einsum("mc,mc->m", rays_a, rays_b)
+    sine2 = np.maximum(1.0 - cosine**2, 1e-12)
+    along_a, along_b = rays_a @ way, rays_b @ way
+    a, b = (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
+    on_a, on_b = centre_a + a[:, None] * rays_a, centre_b + b[:, None] * rays_b
+    gap = np.linalg.norm(on_a - on_b, axis=1)
+    good = (a > 0) & (b > 0) & (sine2 > np.sin(_LEAST_ANGLE) ** 2) & (gap < _AGREES * np.minimum(a, b))
+    return np.asarray(0.5 * (on_a + on_b)[good])

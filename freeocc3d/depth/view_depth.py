@@ -1,0 +1,119 @@
+"""Dense depth of one view from the views around it: swept and refined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .cross_view_check import DepthImage
+from .photo_consistency import Matcher, View
+from .semi_global import aggregated, jumps
+
+_FEWEST, _MOST_HYPOTHESES = 32, 160
+_CONTRAST = 4.0 / 255.0  # a change of grey beyond this may be the edge of something
+_STEP, _JUMPS = 0.05, (0.3, 1.2)  # in units of 1 - correlation
+_RADIUS, _FINE_RADIUS = 2, 3
+_LEAST_SWEPT = 160  # pixels of the longer side: texture is lost in smaller images
+_REFINED = (1.0, 0.5)  # pixels between hypotheses about the depth so far
+_LEAST_SCORE = 0.5
+_SUREST, _UNSURE = 0.25, 1.0  # pixels: what no match is better than, and what is no match any more
+_STEADY = 1.5  # pixels by which refinement may still move
+
+
+def swept(view: View, others: Sequence[View], near: float, far: float, device: str) -> Tensor:
+    """(H, W) inverse depths of a small view, by plane sweep over near…far metres and semi-global aggregation."""
+    matcher = Matcher(view, others, _RADIUS, device)
+    least, most = 1.0 / far, 1.0 / near
+    count = int(np.clip(np.ceil((most - least) / matcher.pixel), _FEWEST, _MOST_HYPOTHESES))
+    hypotheses = torch.linspace(least, most, count, device=matcher.device)
+    costs = (1.0 - matcher.agreement(hypotheses[:, None, None])).permute(1, 2, 0).contiguous()
+    totals = aggregated(costs, _STEP, *jumps(matcher.grey, *_JUMPS, _CONTRAST))
+    best = totals.argmin(dim=-1, keepdim=True).clamp(1, count - 2)
+    shift, _ = _vertex(*(-totals.gather(-1, best + k)[..., 0] for k in (-1, 0, 1)))
+    return least + (best[..., 0] + shift.clamp(-0.5, 0.5)) * ((most - least) / (count - 1))
+
+
+def measured(
+    view: View, others: Sequence[View], apart: Sequence[View], near: float, far: float, device: str = "cpu"
+) -> DepthImage:
+    """What the photographs say: inverse depths where patches match well and in one place only, 0 elsewhere.
+
+    Matches are found among ``others``, in images of a quarter of the size (of half, where those would be small) and of
+    twice as much, and refined among views ``apart``, whose baselines are longer.
+
+    sigma: for n independent pixels, a correlation c at the peak and its curvature 2 k, the least-squares estimate has
+    the variance (1 - c) / (n k); no match is taken for better than a quarter of a pixel.
+    """
+    camera = view.intrinsics
+    longer = max(camera.width, camera.height)
+    first = min(longer / 2, max(longer / 4, _LEAST_SWEPT)) / longer
+    coarse = swept(_scaled(view, first), [_scaled(other, first) for other in others], near, far, device)
+    second = 2.0 * first
+    finder = Matcher(_scaled(view, second), [_scaled(other, second) for other in others], _RADIUS, device)
+    inverse = _all_refined(finder, coarse)[0]
+    matcher = Matcher(view, apart, _FINE_RADIUS, device)
+    inverse, before, score, sigma = _all_refined(matcher, inverse)
+    sure = (score > _LEAST_SCORE) & (sigma < _UNSURE * matcher.pixel)
+    sure &= ((inverse - before).abs() < _STEADY * matcher.pixel) & (inverse > 1.0 / far) & (inverse < 1.0 / near)
+    sigma = torch.sqrt(sigma.square() + (_SUREST * matcher.pixel) ** 2)
+    return DepthImage(_array(inverse * sure), _array(sigma), camera, view.T_world_cam)
+
+
+def median(image: Tensor) -> Tensor:
+    """(H, W) median of 5 x 5 pixels."""
+    if image.device.type == "cpu":
+        return torch.from_numpy(cv2.medianBlur(image.numpy(), 5))
+    return unfolded_median(image)
+
+
+def unfolded_median(image: Tensor) -> Tensor:
+    """``median`` by torch, on any device."""
+    padded = F.pad(image[None, None], (2, 2, 2, 2), mode="replicate")
+    return F.unfold(padded, 5).median(dim=1)[0].view(image.shape)
+
+
+def _scaled(view: View, by: float) -> View:
+    camera = view.intrinsics
+    return view.shrunk(round(camera.width * by), round(camera.height * by))
+
+
+def _all_refined(matcher: Matcher, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Inverse depths refined from those of a smaller image; those before the last step; scores; sigmas."""
+    inverse = F.interpolate(median(inverse)[None, None], matcher.grey.shape, mode="bilinear")[0, 0]
+    before = score = sigma = inverse
+    for pixels in _REFINED:
+        before = median(inverse)
+        inverse, score, sigma = _refined(matcher, before, pixels * matcher.pixel)
+    return inverse, before, score, sigma
+
+
+def _refined(matcher: Matcher, inverse: Tensor, step: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The best inverse depth near ``inverse``, its score, and its standard deviation."""
+    offsets = torch.arange(-2, 3, device=inverse.device) * step
+    scores = matcher.scores((inverse + offsets[:, None, None]).clamp_min(1e-4))
+    count = (len(scores) + 1) // 2
+    best_views = scores.amax(dim=1).topk(count, dim=0)[1]  # the same for all hypotheses, or the curve has steps
+    curve = scores.gather(0, best_views[:, None].expand(-1, len(offsets), -1, -1)).mean(dim=0)
+    best = curve.argmax(dim=0, keepdim=True).clamp(1, len(offsets) - 2)
+    before, peak, after = (curve.gather(0, best + k)[0] for k in (-1, 0, 1))
+    shift, curvature = _vertex(before, peak, after)
+    patch = (2 * matcher.radius + 1) ** 2 * count / 4.0  # neighbouring pixels of a resampled image are not independent
+    sigma = step * torch.sqrt((1.0 - peak).clamp_min(1e-3) / (patch * 0.5 * curvature.clamp_min(1e-6)))
+    return inverse + (best[0] - 2 + shift.clamp(-1.0, 1.0)) * step, peak, sigma
+
+
+def _vertex(before: Tensor, peak: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the parabola through three values at -1, 0, 1 has its maximum (0 if it has none), and 2 peak - before -
+    after."""
+    curvature = 2.0 * peak - before - after
+    return torch.where(curvature > 1e-5, 0.5 * (after - before) / curvature.clamp_min(1e-5), 0.0), curvature
+
+
+def _array(values: Tensor) -> NDArray[np.float32]:
+    return np.asarray(values.float().cpu().numpy())

@@ -1,0 +1,1 @@
+"""New maps from saved maps: another scale, finer voxels."""

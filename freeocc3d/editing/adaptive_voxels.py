@@ -1,0 +1,243 @@
+"""One map of several voxel sizes: coarse where the surface is flat and of one kind, fine where it is not.
+
+A block of 8 x 8 x 8 voxels is cut into eight of half its voxels' size where one voxel would hide something: where the
+surface leaves its plane by a tenth of a voxel, and by more than the depth's noise, or where the meaning of neighbouring
+Gaussians differs; but never to voxels smaller than that noise. What lies in such blocks is lifted again from the
+keyframes, in cells half as large, and looked at again, until the smallest size is reached. Every block is projected
+from the Gaussians of its own size.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..core.errors import MapError
+from ..core.hash_table import build_table, find
+from ..core.progress import Progress
+from ..core.transforms import depth_sigma
+from ..core.types import BLOCK, OCCUPIED, Gaussians, Occupancy, PosedFrame
+from ..gaussians.surface_cells import cell_keys
+from ..language.feature_codec import Codec
+from ..occupancy import build, carve, levels, splat
+from ..occupancy.voxel_blocks import pack, packed_key, unpack
+from ..settings import registry
+from ..settings.config import Config
+from ..storage import store
+from ..storage.store import Map, load_map
+from ..storage.work_folder import WorkFolder
+from .box_refinement import SMALLEST_VOXEL_M, features_again, lifted, settings_of
+
+_CUBE = 2
+"""Voxels along the edge of the cubes in which the surface is compared with a plane: 4 x 4 Gaussians on a flat one."""
+_FEWEST = 5  # Gaussians in a cube that tell whether they lie in a plane
+_UNEVEN = 0.1
+"""Root mean square distance to the plane, in voxels, from which a surface is not flat: a step of a quarter of a voxel,
+a corner of a room, or a ball of five voxels' radius."""
+_NEIGHBOURS, _ALIKE = 6, 0.8
+"""Gaussians around each whose features are compared with its own, and the cosine below which both are not alike."""
+_ROWS = 16384
+
+
+def halvings(voxel_size: float, finest: float) -> int:
+    """How often ``voxel_size`` is halved to reach ``finest``, metres. Raises MapError if it never is."""
+    count = round(math.log2(voxel_size / finest)) if 0 < finest <= voxel_size else -1
+    if count < 0 or finest < SMALLEST_VOXEL_M or abs(voxel_size / 2**count / finest - 1) > 1e-6:
+        sizes = [voxel_size / 2**n for n in range(1, 9) if voxel_size / 2**n >= SMALLEST_VOXEL_M]
+        offered = ", ".join(f"{size:g}" for size in sizes) or "none is large enough"
+        raise MapError(
+            f"Voxels of {voxel_size:g} m are cut by halves, never to {finest:g} m: take one of {offered} as the "
+            "smallest."
+        )
+    return count
+
+
+def adaptive(
+    base: Occupancy,
+    gaussians: Gaussians,
+    features: NDArray[np.float16],
+    posed: Callable[[], Iterator[PosedFrame]],
+    T_world_keyframe: NDArray[np.float64],
+    encode: Callable[[Gaussians], NDArray[np.float16]],
+    settings: Config,
+    finest: float,
+    progress: Progress,
+) -> Occupancy:
+    """The map ``base`` of one voxel size, with smaller voxels down to ``finest`` metres where they show more.
+
+    gaussians, features: the N Gaussians that it was made of, and what they mean, (N, D).  posed: gives the keyframes,
+    each time that it is called.  T_world_keyframe: (K, 4, 4).  encode: layer 3 for further Gaussians.  settings: the
+    map's configuration.  Raises MapError for a size that halving does not reach.
+    """
+    count = halvings(base.voxel_size, finest)
+    changing = _changing(gaussians.means, features)
+    tree = cKDTree(gaussians.means) if len(gaussians) else None
+    occupied = np.sort(pack(base.keys[(base.state == OCCUPIED).any(axis=1)]))
+    split = _detailed(occupied, gaussians, changing, base.origin, base.voxel_size) if count else occupied[:0]
+    whole = ~np.isin(pack(base.keys), split)
+    found: list[Gaussians] = []
+    leaves: list[NDArray[np.int64]] = []
+    for level in range(1, count + 1):
+        if not len(split):
+            break
+        size = base.voxel_size / 2**level
+        region = Blocks(split, base.origin, 2 * BLOCK * size)
+        made = lifted(posed, region, size, settings, T_world_keyframe, progress)
+        parts = np.sort(pack(levels.children(unpack(split))))
+        split = parts[:0]
+        if level < count and tree is not None and len(made):
+            nearest = np.asarray(tree.query(made.means, workers=-1)[1])
+            split = _detailed(parts, made, changing[nearest], base.origin, size)
+        found.append(made)
+        leaves.append(np.setdiff1d(parts, split, assume_unique=True))
+    if not found:
+        return base
+    all_features = encode(Gaussians.concatenated(found))
+    ends = np.cumsum([0, *(len(made) for made in found)])
+    carving: carve.Options = registry.build_options(carve, settings["carving"])
+    sizes = [base.voxel_size / 2**level for level in range(1, len(found) + 1)]
+    seen = [carve.Evidence(base.origin, size, carving, own) for size, own in zip(sizes, leaves, strict=True)]
+    progress.stage("occupancy", len(T_world_keyframe))
+    for done, look in enumerate(posed(), 1):
+        for evidence in seen:
+            evidence.add(look.frame, look.T_world_cam)
+        progress.advance(done)
+    levelled = [levels.chosen_blocks(base, whole)]
+    for n, (size, own, evidence) in enumerate(zip(sizes, leaves, seen, strict=True)):
+        splatting: splat.Options = registry.build_options(splat, {**settings["occupancy"], "voxel_size": size})
+        bins = splat.bin_gaussians(found[n], base.origin, splatting).only(own)
+        mine = all_features[ends[n] : ends[n + 1]]
+        part = build.of_blocks(own, bins, found[n], mine, evidence, splatting, carving)
+        levelled.append(levels.chosen_blocks(part, levels.says_something(part)))
+    return levels.combined(levelled)
+
+
+def refine_where_needed(
+    scan_map: Map, finest: float, output: str | Path, *, overwrite: bool = False, progress: Progress | None = None
+) -> Map:
+    """Write the whole of a map, with smaller voxels down to ``finest`` metres where they show more, to the folder
+    ``output``. Raises FreeOccError: a size that halving does not reach, a map that has several already, a folder that
+    exists."""
+    progress = progress or Progress()
+    base = scan_map.occupancy
+    if base.deepest:
+        raise MapError(f"{scan_map.path} has voxels of several sizes already: refine the map that it was made of.")
+    if not halvings(base.voxel_size, finest):
+        raise MapError(f"{scan_map.path} has voxels of {finest:g} m already: give a smaller size.")
+    work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
+    settings, trajectory = settings_of(scan_map), scan_map.trajectory
+    settings["occupancy"]["finest"] = finest
+
+    def posed() -> Iterator[PosedFrame]:
+        for row, (frame, T) in enumerate(zip(scan_map.keyframes, trajectory.T_world_keyframe, strict=True)):
+            yield PosedFrame(frame, T, row)
+
+    def encode(gaussians: Gaussians) -> NDArray[np.float16]:
+        return features_again(scan_map, scan_map.keyframes, trajectory.T_world_keyframe, gaussians, settings, progress)
+
+    occupancy = adaptive(
+        base, scan_map.gaussians, scan_map.gaussian_features, posed, trajectory.T_world_keyframe, encode, settings,
+        finest, progress,
+    )  # fmt: skip
+    progress.stage("saving")
+    with work.writing(Path(output), [str(scan_map.path), finest], settings) as folder:
+        shutil.copytree(scan_map.path / store.KEYFRAMES, folder / store.KEYFRAMES)
+        for name in (store.GAUSSIANS, store.TRAJECTORY, store.PATH_PICTURE, store.RENDER_PICTURE):
+            if (scan_map.path / name).is_file():
+                shutil.copy2(scan_map.path / name, folder / name)
+        store.write_occupancy(folder, occupancy, Codec.fit(np.asarray(occupancy.features)), scan_map.gaussian_features)
+        (folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
+        kept = {key: value for key, value in scan_map.manifest.items() if key not in ("format_version", "files")}
+        counts = {**kept["counts"], "voxels": store.counts(occupancy)}
+        refined = {"map": str(scan_map.path.absolute())}
+        store.write_manifest(folder, {**kept, **store.sizes(occupancy), "refined": refined, "counts": counts})
+    return load_map(output)
+
+
+def _detailed(
+    blocks: NDArray[np.int64],
+    gaussians: Gaussians,
+    changing: NDArray[np.bool_],
+    origin: NDArray[np.float64],
+    voxel_size: float,
+) -> NDArray[np.int64]:
+    """Those of the blocks, ascending packed keys, in which the surface is not flat or of several kinds.
+
+    gaussians: N of the blocks' size.  changing: (N,) whether the meaning changes at each.
+    """
+    edge = _CUBE * voxel_size
+    points = gaussians.means.astype(np.float64) - origin
+    _, first, cube = np.unique(cell_keys(points, edge), return_index=True, return_inverse=True)
+    index = np.floor(points / edge)
+    local = points - (index + 0.5) * edge
+    n = np.bincount(cube)
+    mean = np.stack([np.bincount(cube, local[:, i]) / n for i in range(3)], axis=1)
+    moments = np.empty((len(n), 3, 3))
+    for i in range(3):
+        for j in range(3):
+            moments[:, i, j] = np.bincount(cube, local[:, i] * local[:, j]) / n - mean[:, i] * mean[:, j]
+    off_plane = np.sqrt(np.maximum(np.linalg.eigvalsh(moments)[:, 0], 0.0))
+    noise = np.bincount(cube, depth_sigma(np.abs(gaussians.anchor_cam[:, 2]))) / n
+    uneven = (n >= _FEWEST) & (off_plane > np.hypot(_UNEVEN * voxel_size, noise))
+    uneven |= np.bincount(cube, changing) > 0
+    uneven &= noise <= 0.5 * voxel_size  # smaller voxels than that would show the noise
+    of_block = pack(index[first[uneven]].astype(np.int64) // (BLOCK // _CUBE))
+    return np.intersect1d(blocks, of_block)
+
+
+def _changing(means: NDArray[np.float32], features: NDArray[np.float16]) -> NDArray[np.bool_]:
+    """(N,) whether one of the nearest Gaussians means something else; what nothing is known of means nothing else."""
+    changing = np.zeros(len(means), bool)
+    count = min(_NEIGHBOURS, len(means) - 1)
+    if count < 1 or not features.shape[1]:
+        return changing
+    nearest = cKDTree(means).query(means, k=count + 1, workers=-1)[1][:, 1:]
+    known: NDArray[np.bool_] = np.asarray(features.any(axis=1))
+    for start in range(0, len(means), _ROWS):
+        rows = slice(start, start + _ROWS)
+        own = features[rows].astype(np.float32)
+        for column in nearest[rows].T:
+            cosine = np.einsum("nd,nd->n", own, features[column].astype(np.float32))
+            changing[rows] |= (cosine < _ALIKE) & known[rows] & known[column]
+    return changing
+
+
+class Blocks:
+    """A set of cubes of one lattice, given by packed keys: a region, as a ``refine.Box`` is one.
+
+    edge: of a cube, metres.
+    """
+
+    def __init__(self, packed: NDArray[np.int64], origin: NDArray[np.float64], edge: float):
+        self.origin, self.edge = origin, edge
+        self._table, self._rows = build_table(packed, len(packed))
+
+    def contains(self, points: NDArray[np.floating], margin: float) -> NDArray[np.bool_]:
+        """(P,) whether each of (P, 3) points is inside, or no farther outside than the margin along any axis; the
+        margin is at most half an edge."""
+        local = (np.asarray(points, np.float64) - self.origin) / self.edge
+        return np.asarray(_inside(local, margin / self.edge, self._table, self._rows))
+
+
+@njit(parallel=True, cache=True)
+def _inside(
+    points: NDArray[np.float64], margin: float, table: NDArray[np.int64], rows: NDArray[np.int32]
+) -> NDArray[np.bool_]:
+    """``Blocks.contains`` in units of edges."""
+    inside = np.zeros(len(points), np.bool_)
+    for p in prange(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        for i in range(math.floor(x - margin), math.floor(x + margin) + 1):
+            for j in range(math.floor(y - margin), math.floor(y + margin) + 1):
+                for k in range(math.floor(z - margin), math.floor(z + margin) + 1):
+                    if find(table, rows, packed_key(i, j, k)) >= 0:
+                        inside[p] = True
+    return inside

@@ -1,0 +1,242 @@
+"""The scale of a map whose unit is unknown: from a length, the cameras' height, or metric poses; and the map scaled.
+
+Everything in a map is proportional to its unit, so that scaling it is exact: poses, Gaussians with their anchors,
+voxels' edges and origin, keyframes' depth. What is no length (probabilities, features, images) is copied.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import associate, read_trajectory
+from ..core.errors import FreeOccError, MapError
+from ..core.transforms import back_project, transform
+from ..core.types import Gaussians, Submap, Trajectory
+from ..evaluation.scoring import capture_of
+from ..evaluation.trajectory_alignment import Poses, align, estimated_poses, read_poses
+from ..gaussians import rendered_views
+from ..gaussians.point_cloud import write_ply
+from ..occupancy.gravity_frame import floor_seen
+from ..settings import config, registry
+from ..settings.config import Config
+from ..storage import store
+from ..storage.store import Map, load_map
+from ..storage.work_folder import WorkFolder
+from ..viewer import render_pictures, trajectory_picture
+
+UNKNOWN = (
+    "The scale of this map is unknown: its lengths, also the edge of its voxels, are in a unit in which the scene is "
+    "about 2 deep. Give metres per unit with --scale, or scale the map by a known length: freeocc3d scale."
+)
+
+_NEAR_PX = 6
+_MOST_DEPTH_M = 65.535  # what 16 bits of millimetres hold
+_LEAST_VOXEL_M = 0.001
+_FITS = 0.1  # of the spread of the cameras: poses that are farther off are another scan's
+
+
+def scaled(scan_map: Map, factor: float, by: str, output: str | Path, *, overwrite: bool = False) -> Map:
+    """Write the map with every length times ``factor``, after which lengths are metres, to the folder ``output``.
+
+    by: where the factor is from, for the manifest. Raises MapError: no usable factor, or the folder exists.
+    """
+    if not (math.isfinite(factor) and factor > 0):
+        raise MapError(f"A map is scaled by a positive number, got {factor:g}.")
+    voxel = factor * float(scan_map.manifest.get("finest_voxel_m", scan_map.manifest["voxel_size_m"]))
+    farthest = factor * max((float(scan_map.keyframes.depth_m(row).max()) for row in _rows(scan_map)), default=0.0)
+    if voxel < _LEAST_VOXEL_M or farthest > _MOST_DEPTH_M:
+        raise MapError(
+            f"Times {factor:g}, voxels would have an edge of {voxel:.2g} m and depth would reach {farthest:.3g} m, of "
+            f"which a map holds {_LEAST_VOXEL_M:g} m and up, and up to {_MOST_DEPTH_M:.0f} m: check the length."
+        )
+    work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
+    settings = _settings(scan_map, factor)
+    trajectory = _trajectory(scan_map.trajectory, factor)
+    gaussians = _gaussians(scan_map.gaussians, factor)
+    report = _report(scan_map, factor)
+    with work.writing(Path(output), [str(scan_map.path), factor], settings) as folder:
+        for name in (store.OCCUPANCY, store.FEATURES):
+            shutil.copyfile(scan_map.path / name, folder / name)
+        scan_map.keyframes.write_scaled(folder / store.KEYFRAMES, factor)
+        write_ply(gaussians, folder / store.GAUSSIANS)
+        store.write_tum(folder / store.TRAJECTORY, trajectory)
+        (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
+        _draw(scan_map, folder, trajectory, gaussians, factor)
+        store.write_manifest(folder, _manifest(scan_map, factor, by))
+    return load_map(output)
+
+
+def by_length(scan_map: Map, ends: Sequence[str], metres: float) -> float:
+    """The factor by which two points are ``metres`` apart.
+
+    ends: two of ``FRAME:X,Y``, a pixel of a keyframe, or of a word, for the middle of the best region that it matches.
+    Raises MapError: no such keyframe, no depth near the pixel, nothing matched, one and the same point.
+    """
+    _require_metres(metres, "length")
+    first, second = (_point(scan_map, end) for end in ends)
+    length = float(np.linalg.norm(first - second))
+    if length < 1e-6:
+        raise MapError(f"{ends[0]} and {ends[1]} are one point of the map: name two that are apart.")
+    return metres / length
+
+
+def by_camera_height(scan_map: Map, metres: float) -> float:
+    """The factor by which the keyframes are ``metres`` above the floor, half of them more. Raises MapError where the
+    map shows no floor below them."""
+    _require_metres(metres, "camera height")
+    T_gravity_map, poses = scan_map.T_gravity_map, scan_map.trajectory.T_world_keyframe
+    if not floor_seen(T_gravity_map, poses, scan_map.gaussians):
+        raise MapError(f"{scan_map.path} shows no floor below the cameras: give a known length instead (--length).")
+    height = float(np.median(transform(T_gravity_map, poses[:, :3, 3])[:, 2]))
+    return metres / height
+
+
+def by_poses(scan_map: Map, path: str) -> float:
+    """The factor by which the cameras' way is that of metric poses: a capture's, or a file's in any form that
+    ``capture.read_trajectory`` knows. Raises FreeOccError: too few that match, or another way altogether."""
+    own = estimated_poses(scan_map.trajectory)
+    metric = _metric_poses(scan_map, path)
+    found = align(own, metric, "sim3")
+    rows, rows_metric = associate(own.timestamps, metric.timestamps)
+    centers = metric.centers[rows_metric]
+    off = float(np.median(np.linalg.norm(found.to_true(own.centers[rows]) - centers, axis=1)))
+    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean())
+    if off > _FITS * spread:
+        raise FreeOccError(
+            f"The poses of {path} are not this map's: brought together as well as can be, half of the cameras are "
+            f"{off:.2f} m and more apart, on a way that spreads over {spread:.2f} m. Do its times or names fit?"
+        )
+    return found.scale
+
+
+def _metric_poses(scan_map: Map, path: str) -> Poses:
+    """Those of a file that knows images by name are matched to the capture, if it is still there."""
+    if Path(path).is_file() and (found := read_trajectory(path)).names:
+        T = found.of_frames(capture := capture_of(scan_map))
+        has_pose = np.isfinite(T).all(axis=(1, 2))
+        return Poses(capture.timestamps[has_pose], T[has_pose])
+    return read_poses(path)
+
+
+def _point(scan_map: Map, end: str) -> NDArray[np.float64]:
+    """(3,) in the map's frame."""
+    match = re.fullmatch(r"(\d+):(\d+),(\d+)", end.strip())
+    if match is None:
+        result = scan_map.query(end)
+        if not result.regions:
+            raise MapError(
+                f"'{end}' matches nothing in {scan_map.path}: name what is there, or a keyframe's pixel, FRAME:X,Y."
+            )
+        return result.regions[0].centroid
+    frame, x, y = map(int, match.groups())
+    trajectory = scan_map.trajectory
+    rows = np.flatnonzero(trajectory.keyframes == frame)
+    if not len(rows):
+        nearest = sorted(trajectory.keyframes.tolist(), key=lambda index: abs(index - frame))[:3]
+        raise MapError(
+            f"Frame {frame} is no keyframe of {scan_map.path}; the nearest are {', '.join(map(str, sorted(nearest)))}. "
+            f"Their images are in {scan_map.path / store.KEYFRAMES}."
+        )
+    depth_m, camera = scan_map.keyframes.depth_m(int(rows[0])), scan_map.keyframes.views()[int(rows[0])][1]
+    if not (x < camera.width and y < camera.height):
+        raise MapError(f"Pixel {x},{y} is outside of keyframe {frame}: {camera.width} x {camera.height} pixels.")
+    left, top = max(x - _NEAR_PX, 0), max(y - _NEAR_PX, 0)
+    v, u = np.nonzero(depth_m[top : y + _NEAR_PX + 1, left : x + _NEAR_PX + 1])
+    if not len(u):
+        raise MapError(
+            f"Keyframe {frame} has no depth within {_NEAR_PX} pixels of {x},{y}: choose a pixel on something textured."
+        )
+    nearest_px = int(np.argmin((u + left - x) ** 2 + (v + top - y) ** 2))
+    z = float(depth_m[top + v[nearest_px], left + u[nearest_px]])
+    point = back_project(np.array((x, y), np.float64), np.float64(z), camera)  # type: ignore[arg-type]
+    return np.asarray(transform(trajectory.T_world_keyframe[rows[0]], point))
+
+
+def _require_metres(value: float, what: str) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise MapError(f"A {what} is a positive number of metres, got {value:g}.")
+
+
+def _rows(scan_map: Map) -> range:
+    return range(len(scan_map.keyframes))
+
+
+def _moved(T: NDArray[np.float64], factor: float) -> NDArray[np.float64]:
+    """(..., 4, 4) with the translations scaled."""
+    out = np.array(T, np.float64)
+    out[..., :3, 3] *= factor
+    return out
+
+
+def _trajectory(trajectory: Trajectory, factor: float) -> Trajectory:
+    return dataclasses.replace(trajectory, T_world_cam=_moved(trajectory.T_world_cam, factor))
+
+
+def _gaussians(gaussians: Gaussians, factor: float) -> Gaussians:
+    lengths = {name: getattr(gaussians, name) * np.float32(factor) for name in ("means", "scales", "anchor_cam")}
+    return dataclasses.replace(gaussians, **lengths)
+
+
+def _settings(scan_map: Map, factor: float) -> Config:
+    """The map's own, with the sizes that were chosen beside the scene."""
+    settings = config.load(scan_map.path / store.CONFIG)
+    for section, key in (("occupancy", "voxel_size"), ("occupancy", "finest"), ("gaussians", "cell_size")):
+        if settings[section][key] is not None:
+            settings[section][key] *= factor
+    return settings
+
+
+def _report(scan_map: Map, factor: float) -> dict[str, Any]:
+    report = dict(scan_map.report)
+    report["warnings"] = [text for text in report["warnings"] if text != UNKNOWN]
+    if (rendering := report.get("rendering")) and rendering.get("depth_l1_m") is not None:
+        report["rendering"] = {**rendering, "depth_l1_m": rendering["depth_l1_m"] * factor}
+    return report
+
+
+def _manifest(scan_map: Map, factor: float, by: str) -> dict[str, Any]:
+    kept = {key: value for key, value in scan_map.manifest.items() if key not in ("format_version", "files")}
+    for key in ("voxel_size_m", "finest_voxel_m"):
+        if key in kept:
+            kept[key] = factor * float(kept[key])
+    kept["origin"] = [factor * float(value) for value in kept["origin"]]
+    for key in ("T_world_map", "T_gravity_map"):
+        if key in kept:
+            kept[key] = _moved(np.array(kept[key], np.float64), factor).tolist()
+    if box := (kept.get("refined") or {}).get("box"):
+        kept["refined"] = {**kept["refined"], "box": [factor * float(value) for value in box]}
+    before = float(kept.get("scale", {}).get("factor", 1.0))
+    return {**kept, "scale": {"metric": True, "by": by, "factor": before * factor}}
+
+
+def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussians, factor: float) -> None:
+    """The pictures again, which tell lengths; of submaps only the mapped one, for the map holds no other."""
+    capture = Path(str(scan_map.manifest["capture"]["path"]))
+    frames = np.flatnonzero(trajectory.has_pose).astype(np.int32)
+    closures = [closure for submap in scan_map.report.get("submaps", [])[:1] for closure in submap["closures"]]
+    ends = np.array([closure[:2] for closure in closures], np.int32).reshape(-1, 2)
+    held = np.array([closure[2] for closure in closures], bool)
+    submap = Submap(frames, trajectory.T_world_cam[frames], trajectory.keyframes, ends, held)
+    trajectory_picture.path_picture(
+        folder / store.PATH_PICTURE, [submap], trajectory, gaussians, np.array(scan_map.manifest["up"]), capture
+    )
+    rasterizer = registry.load("gaussians.rasterizers", "cpu").load()
+    width = int(config.load(scan_map.path / store.CONFIG)["fitting"]["width"])
+    keyframes = scan_map.keyframes
+    shown = []
+    for row in np.unique(np.linspace(0, len(keyframes) - 1, render_pictures.SHOWN).astype(int)).tolist():
+        frame = keyframes[row]
+        frame = frame.scaled(factor)
+        view = rendered_views.view_of(frame, trajectory.T_world_keyframe[row], width, rasterizer.device)
+        shown.append((int(trajectory.keyframes[row]), view))
+    render_pictures.render_picture(folder / store.RENDER_PICTURE, gaussians, shown, rasterizer, capture)

@@ -1,0 +1,332 @@
+"""Builds the truth of a capture as the paper builds ReplicaOcc (supplement, "Benchmark Details").
+
+(i)   Every ``pixel_stride``-th pixel of every frame is back-projected with the capture's own pose; the points of a
+      voxel vote for its class by their class images' values.
+(ii)  The voxels are placed into a regular grid over their extent, lattice planes at ``lattice_offset`` + n * size.
+(iii) A voxel is observed if, in one of every ``frame_stride``-th frame, its centre lies in front of the camera, inside
+      the image and no farther than the measured depth plus ``tolerance`` voxels.
+
+An observed voxel has its class, or is free if it has none; all else is 255.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from ..capture import base as capture_base
+from ..capture import open_capture, read_ahead, used_frames
+from ..capture.base import Capture
+from ..core.errors import ConfigError, FrameError, FreeOccError
+from ..core.progress import Progress
+from ..core.transforms import back_project, invert, transform
+from ..core.types import FREE, UNKNOWN, Frame
+from ..settings import config, registry
+from ..settings.registry import require_positive
+from . import scored_classes as taxonomy
+from .ground_truth import GroundTruth
+
+_LARGEST_GRID = 1 << 29
+_ROWS_BEFORE_MERGE = 4_000_000
+_MOST_CLASSES = 254
+_FARTHEST_VOXEL = 1 << 20
+UNLABELLED = "occupied"
+"""Class of every surface where a capture has no class images."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """The protocol's parameters, with the paper's values."""
+
+    voxel_size: float = 0.08
+    """Edge of a voxel, metres."""
+    pixel_stride: int = 4
+    """Every n-th pixel, in both directions, is back-projected."""
+    frame_stride: int = 2
+    """Every n-th frame decides what was observed."""
+    max_range: float = 10.0
+    """Depth beyond this many metres counts as not measured."""
+    lattice_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Metres by which the lattice is shifted: half a voxel in z puts a floor at z = 0 inside a voxel, not on a face."""
+    min_points: int = 1
+    """Points that a voxel needs; the noise of a sensor scatters some into the voxels beside a surface."""
+    fill: str = "inside"
+    """"inside": a cell is occupied if a point lies in it; "within": also if a cell next to it, no farther than one
+    voxel from centre to centre, is."""
+    tolerance: float = 1.0
+    """Voxel edges that a voxel's centre may lie behind the measured depth and still be observed."""
+    dilation: int = 0
+    """Voxels by which what was observed is grown, across faces."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "voxel_size", "pixel_stride", "frame_stride", "max_range", "min_points")
+        if self.fill not in ("inside", "within"):
+            raise ConfigError(f"'fill' must be inside or within, got '{self.fill}'.")
+        if self.tolerance < 0 or self.dilation < 0:
+            raise ConfigError("'tolerance' and 'dilation' must not be negative.")
+
+
+def build(capture: str | Path, overrides: Sequence[str] = (), progress: Progress | None = None) -> GroundTruth:
+    """The truth of the capture in a folder. overrides: "name=value" of ``Options``, or "capture.name=value".
+
+    Raises FreeOccError: no poses, nothing measured, a grid too large for memory; ConfigError.
+    """
+    own, of_capture = {}, []
+    for override in overrides:
+        name, separator, text = override.partition("=")
+        if not separator:
+            raise ConfigError(f"An option reads name=value, got '{override}'.")
+        if name.startswith("capture."):
+            of_capture.append(override)
+        else:
+            own[name.strip()] = yaml.safe_load(text)
+    options: Options = registry.build_options(_this_module(), own)
+    settings = config.load(None, [f"capture.max_depth={options.max_range}", *of_capture])
+    section = registry.build_options(capture_base, config.options(settings, "capture"))
+    return from_capture(open_capture(capture, section, settings["capture"]), options, progress)
+
+
+def from_capture(capture: Capture, options: Options, progress: Progress | None = None) -> GroundTruth:
+    """The truth of an opened capture: poses and class images are its own. Frames without a pose are left out."""
+    progress = progress or Progress()
+    frames = [index for index in used_frames(capture) if capture.pose(index) is not None]
+    if not frames:
+        raise FreeOccError(f"{capture.path} has no poses, from which alone a ground truth could be built.")
+    names, labels_of = _classes(capture, frames)
+    votes = Votes(options, len(names))
+    _each(capture, frames, "points", progress, lambda frame, T: votes.add(frame, T, labels_of(frame)))
+    voxels, labels = votes.labelled()
+    if not len(voxels):
+        raise FreeOccError(f"{capture.path} measured nothing within {options.max_range:g} m, so there is no surface.")
+    low = voxels.min(axis=0)
+    grid = _grid(voxels - low, labels, options, str(capture.path))
+    origin = np.array(options.lattice_offset) + low * options.voxel_size
+    seen = np.zeros(grid.shape, bool)
+    _each(
+        capture,
+        frames[:: options.frame_stride],
+        "observed",
+        progress,
+        lambda frame, T: observe(seen, frame, T, origin, options),
+    )
+    for _ in range(options.dilation):
+        seen = _grown(seen)
+    return GroundTruth(np.where(seen, grid, UNKNOWN).astype(np.uint8), origin, options.voxel_size, names)
+
+
+class Votes:
+    """(i): the points of each voxel by class; grows with the surface, not with the frames."""
+
+    def __init__(self, options: Options, classes: int):
+        self.options = options
+        self.classes = classes
+        self._keys: list[NDArray[np.int64]] = []
+        self._counts: list[NDArray[np.int64]] = []
+
+    def add(self, frame: Frame, T_world_cam: NDArray[np.float64], labels: NDArray[np.uint8]) -> None:
+        """Take a frame. labels: (H, W) class image of the frame's size, 0 = no class."""
+        step = self.options.pixel_stride
+        depth = frame.depth_m[::step, ::step]
+        v, u = np.nonzero((depth > 0) & (depth <= self.options.max_range))
+        pixels = np.stack((u, v), axis=1).astype(np.float64) * step
+        points = transform(T_world_cam, back_project(pixels, depth[v, u].astype(np.float64), frame.intrinsics))
+        index = np.floor((points - self.options.lattice_offset) / self.options.voxel_size).astype(np.int64)
+        index += _FARTHEST_VOXEL
+        inside = ((index >= 0) & (index < 2 * _FARTHEST_VOXEL)).all(axis=1)
+        voxel = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+        label = labels[::step, ::step][v, u].astype(np.int64)
+        order = np.lexsort((label[inside], voxel[inside]))
+        pairs = np.stack((voxel[inside][order], label[inside][order]), axis=1)
+        self._append(pairs, np.ones(len(pairs), np.int64))
+        if sum(map(len, self._counts)) > _ROWS_BEFORE_MERGE:
+            self._merge()
+
+    def labelled(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """(V, 3) voxels in which points lie and (V,) the class of most of them; of equally many the first in the list.
+        Points without a class do not vote; a voxel that holds no others is 255, one with too few points is left out."""
+        self._merge()
+        if not self._keys:
+            return np.zeros((0, 3), np.int64), np.zeros(0, np.uint8)
+        (voxel, label), count = self._keys[0].T, self._counts[0]
+        order = np.lexsort((label, -np.where(label > 0, count, 0), voxel))
+        start = np.flatnonzero(np.diff(voxel[order], prepend=-1))
+        enough = np.add.reduceat(count[order], start) >= self.options.min_points
+        first = order[start[enough]]
+        mask = (1 << 21) - 1
+        key = voxel[first]
+        voxels = np.stack((key >> 42, (key >> 21) & mask, key & mask), axis=1) - _FARTHEST_VOXEL
+        return voxels, np.where(label[first] > 0, label[first], UNKNOWN).astype(np.uint8)
+
+    def _append(self, pairs: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
+        """Add (P, 2) sorted pairs (voxel, label) with their counts, equal ones summed."""
+        if len(pairs):
+            start = np.flatnonzero(np.append(True, (pairs[1:] != pairs[:-1]).any(axis=1)))
+            self._keys.append(pairs[start])
+            self._counts.append(np.add.reduceat(counts, start))
+
+    def _merge(self) -> None:
+        if len(self._keys) > 1:
+            pairs, counts = np.concatenate(self._keys), np.concatenate(self._counts)
+            order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+            self._keys, self._counts = [], []
+            self._append(pairs[order], counts[order])
+
+
+def observe(
+    seen: NDArray[np.bool_],
+    frame: Frame,
+    T_world_cam: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    options: Options,
+) -> None:
+    """(iii): mark in ``seen`` (X, Y, Z) the voxels of the lattice at ``origin`` that one frame observes."""
+    camera, T_cam_world = frame.intrinsics, invert(T_world_cam)
+    depth = np.where(frame.depth_m <= options.max_range, frame.depth_m, 0).astype(np.float32)
+    _observe(
+        seen,
+        T_cam_world[:3, :3] * options.voxel_size,
+        T_cam_world[:3, :3] @ origin + T_cam_world[:3, 3],
+        np.array((camera.fx, camera.fy, camera.cx, camera.cy)),
+        depth,
+        options.tolerance * options.voxel_size,
+    )
+
+
+@njit(parallel=True, cache=True)
+def _observe(
+    seen: NDArray[np.bool_],
+    R: NDArray[np.float64],  # voxels to metres in the camera's frame
+    t: NDArray[np.float64],
+    camera: NDArray[np.float64],
+    depth_m: NDArray[np.float32],
+    tolerance: float,
+) -> None:
+    fx, fy, cx, cy = camera
+    height, width = depth_m.shape
+    X, Y, Z = seen.shape
+    for i in prange(X):
+        for j in range(Y):
+            for k in range(Z):
+                if seen[i, j, k]:
+                    continue
+                x, y, z = i + 0.5, j + 0.5, k + 0.5
+                depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+                if depth <= 0:
+                    continue
+                u = fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / depth + cx
+                v = fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / depth + cy
+                column, row = math.floor(u + 0.5), math.floor(v + 0.5)
+                if column < 0 or row < 0 or column >= width or row >= height:
+                    continue
+                measured = depth_m[row, column]
+                seen[i, j, k] = measured > 0 and depth <= measured + tolerance
+
+
+def to_text(truth: GroundTruth, path: Path) -> str:
+    """What was built, for people."""
+    known = truth.labels != UNKNOWN
+    occupied = known & (truth.labels != FREE)
+    counts = np.bincount(truth.labels[occupied], minlength=len(truth.classes))
+    common = ", ".join(f"{truth.classes[k]} {counts[k]:,}" for k in np.argsort(-counts, kind="stable") if counts[k])
+    x, y, z = truth.shape
+    return (
+        f"{path}: {x} x {y} x {z} voxels of {truth.voxel_size:g} m, {int(known.sum()):,} observed, "
+        f"{int(occupied.sum()):,} occupied\nclasses: {common}"
+    )
+
+
+def _this_module() -> Any:
+    import sys
+
+    return sys.modules[__name__]
+
+
+def _classes(capture: Capture, frames: list[int]) -> tuple[tuple[str, ...], Callable[[Frame], NDArray[np.uint8]]]:
+    """The names of the classes, and what gives a frame's class image at the size of its depth."""
+    if len(capture.classes) < 2 or capture.labels(frames[0]) is None:
+        return (taxonomy.FREE, UNLABELLED), lambda frame: np.ones(frame.depth_m.shape, np.uint8)
+    if len(capture.classes) > _MOST_CLASSES + 1:
+        raise FreeOccError(f"{capture.path} names more than {_MOST_CLASSES} classes, which a byte cannot tell apart.")
+
+    def labels_of(frame: Frame) -> NDArray[np.uint8]:
+        image = capture.labels(frame.index)
+        if image is None:
+            return np.zeros(frame.depth_m.shape, np.uint8)
+        if image.max(initial=0) >= len(capture.classes):
+            image = np.where(image == UNKNOWN, 0, image)
+            if image.max(initial=0) >= len(capture.classes):
+                raise FreeOccError(
+                    f"The class image of frame {frame.index} of {capture.path} has value {image.max()}, but only "
+                    f"{len(capture.classes)} classes are named."
+                )
+        rows, columns = (
+            ((np.arange(size) + 0.5) * own / size).astype(np.int64)
+            for size, own in zip(frame.depth_m.shape, image.shape, strict=True)
+        )
+        return np.asarray(image[rows[:, None], columns])
+
+    return (taxonomy.FREE, *capture.classes[1:]), labels_of
+
+
+def _each(
+    capture: Capture,
+    frames: Sequence[int],
+    stage: str,
+    progress: Progress,
+    work: Callable[[Frame, NDArray[np.float64]], None],
+) -> None:
+    """Decode the frames and hand each to ``work`` with its pose; a broken one is told and left out."""
+    progress.stage(stage, len(frames))
+    for done, (index, frame) in enumerate(read_ahead(capture, frames), start=1):
+        T_world_cam = capture.pose(index)
+        if isinstance(frame, FrameError):
+            progress.warn(str(frame))
+        elif T_world_cam is not None:
+            work(frame, T_world_cam)
+        progress.advance(done)
+
+
+def _grid(voxels: NDArray[np.int64], labels: NDArray[np.uint8], options: Options, source: str) -> NDArray[np.uint8]:
+    """(ii): (X, Y, Z) labels over the voxels' extent, 0 where there is none."""
+    shape = voxels.max(axis=0) + 1
+    if math.prod(shape.tolist()) > _LARGEST_GRID:
+        size = " x ".join(str(n) for n in shape)
+        raise FreeOccError(
+            f"The points of {source} spread over {size} voxels of {options.voxel_size:g} m, too many for memory: are "
+            "its poses and depth scale right? Otherwise use larger voxels."
+        )
+    grid = np.zeros(shape, np.uint8)
+    grid[tuple(voxels.T)] = labels
+    if options.fill == "within":
+        inside = grid.copy()
+        for axis in range(3):  # of several neighbours at the same distance the first in this order counts
+            for ahead in (False, True):
+                here, there = _neighbours(axis, ahead)
+                free = grid[here] == 0
+                grid[here][free] = inside[there][free]
+    return grid
+
+
+def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask with the voxels that share a face with one of it."""
+    grown = mask.copy()
+    for axis in range(3):
+        for ahead in (False, True):
+            here, there = _neighbours(axis, ahead)
+            grown[here] |= mask[there]
+    return grown
+
+
+def _neighbours(axis: int, ahead: bool) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Slices that put each voxel beside its neighbour along an axis."""
+    low, high = [slice(None)] * 3, [slice(None)] * 3
+    low[axis], high[axis] = slice(None, -1), slice(1, None)
+    return (tuple(low), tuple(high)) if ahead else (tuple(high), tuple(low))

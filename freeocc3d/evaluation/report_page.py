@@ -1,0 +1,247 @@
+"""An evaluation as one HTML file that needs nothing beside it: figures, classes, confusions, trajectories, pictures."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from numpy.typing import NDArray
+
+from .. import __version__
+from ..core.atomic_files import write_whole
+from ..core.errors import DependencyError
+from ..viewer.grid_pictures import Grid, grid_pictures
+from ..viewer.palette import class_colors, ramp
+from ..viewer.scene_rendering import CUT, upright
+from .scoring import PRIMARY_MASK, TOP, Evaluation, Scene
+
+MOST_SEGMENTS = 2000
+"""Pieces that a drawn trajectory has at most."""
+
+NO_CLASS = "occupied, no class"
+NOT_OCCUPIED = "not occupied"
+_PLAIN = (120, 150, 190)  # of a voxel whose class nobody knows
+
+DIFFERENCES = {
+    "right": (176, 190, 176),
+    "wrong class": (245, 170, 40),
+    "missed": (40, 110, 220),
+    "invented": (220, 50, 50),
+}
+"""What the picture of differences tells apart, in its colours."""
+
+
+def write_report(evaluation: Evaluation, path: Path, overwrite: bool = False) -> None:
+    """Write the page; the same evaluation gives the same page. Where pictures cannot be rendered it says so instead.
+
+    Raises ExportError: it exists, or cannot be written.
+    """
+    page = _page(evaluation)
+    write_whole(path, lambda target: _write_text(target, page), overwrite)
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def _page(evaluation: Evaluation) -> str:
+    environment = Environment(
+        loader=PackageLoader("freeocc3d", "evaluation"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"percent": _percent, "cm": _cm, "count": lambda number: f"{number:,}"}
+    environment.globals |= {"rgb": _rgb}
+    scores = evaluation.scores
+    alone = [Evaluation((scene,), evaluation.classes, evaluation.how, evaluation.listed) for scene in evaluation.scenes]
+    return environment.get_template("report.html").render(
+        version=__version__,
+        evaluation=evaluation,
+        scores=scores,
+        mask=PRIMARY_MASK,
+        miou=evaluation.miou(),
+        masks=[(name, own, evaluation.miou(mask=name)) for name, own in evaluation.by_mask.items()],
+        lists=_lists(evaluation),
+        classes=_classes(evaluation),
+        confusion=_confusion(evaluation) if evaluation.has_classes else None,
+        scenes=[_scene(own) for own in alone],
+        differences=DIFFERENCES,
+        cut=CUT,
+    )
+
+
+def _lists(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """mIoU over each list of classes, or why there is none."""
+    rows = []
+    for name, names in evaluation.miou_over.items():
+        why = ""
+        if not evaluation.has_classes:
+            why = "the prediction has no classes"
+        elif names is None:
+            count = len(evaluation.scores.present)
+            top = name in {f"top_{k}" for k in TOP}
+            why = f"the truth holds {count} classes" if top else "the classes are other ones: map them with --classes"
+        absent = [c for c in names or () if c in evaluation.absent]
+        rows.append({
+            "name": name, "miou": None if why else evaluation.miou(names), "why": why, "names": names or (),
+            "absent": absent,
+        })  # fmt: skip
+    return rows
+
+
+def _classes(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """Each class that the truth or the prediction holds, most frequent first: its IoU, how much of it was found
+    occupied as whatever, and what it was taken for."""
+    scores = evaluation.scores
+    matrix = scores.matrix
+    colors = class_colors(list(evaluation.classes))
+    columns = [NOT_OCCUPIED, *evaluation.classes, NO_CLASS]
+    rows = []
+    for k in np.argsort(-scores.class_voxels, kind="stable"):
+        row = matrix[k + 1]
+        if not row.sum() and not matrix[:, k + 1].sum():
+            continue
+        others = [
+            int(c) for c in np.argsort(-row, kind="stable") if c != k + 1 and 100 * row[c] >= row.sum() and row[c]
+        ]
+        rows.append({
+            "name": evaluation.classes[k],
+            "color": colors[k + 1],
+            "iou": float(scores.class_iou[k]) if evaluation.has_classes else None,
+            "found": float(row[1:].sum() / row.sum()) if row.sum() else None,
+            "voxels": int(row.sum()),
+            "taken_for": [(columns[c], float(row[c] / row.sum())) for c in others[:3]],
+            "counted": evaluation.classes[k] in evaluation.classes_in_miou,
+        })  # fmt: skip
+    return rows
+
+
+def _confusion(evaluation: Evaluation) -> dict[str, Any]:
+    """The confusion matrix without the classes that occur in neither, as shares of its rows."""
+    matrix = evaluation.scores.matrix
+    occurs = matrix[1:].sum(axis=1) + matrix[:, 1:-1].sum(axis=0) > 0
+    kept = np.flatnonzero(np.concatenate(([True], occurs)))
+    columns = np.append(kept, matrix.shape[1] - 1)
+    shown = matrix[np.ix_(kept, columns)]
+    total = shown.sum(axis=1)
+    share = shown / np.maximum(total, 1)[:, None]
+    names = np.array(["free", *evaluation.classes], object)
+    return {
+        "rows": list(zip(names[kept], total.tolist(), shown.tolist(), share.tolist(), strict=True)),
+        "columns": [NOT_OCCUPIED, *names[kept[1:]], NO_CLASS],
+        "left_out": len(evaluation.classes) - int(occurs.sum()),
+    }
+
+
+def _scene(own: Evaluation) -> dict[str, Any]:
+    """What the page says of one scene."""
+    scene = own.scenes[0]
+    pictures, lacking = _pictures(own)
+    mask = scene.truth.masks()[PRIMARY_MASK]
+    known = np.unique(scene.truth.labels[mask])
+    if scene.predicted.labels is not None:
+        known = np.union1d(known, scene.predicted.labels[mask])
+    colors = class_colors(list(own.classes))
+    return {
+        "name": scene.name,
+        "scores": own.scores,
+        "miou": own.miou(),
+        "scene": scene,
+        "shape": scene.truth.shape,
+        "voxel_size": scene.truth.voxel_size,
+        "trajectory": None if scene.errors is None else _drawn_way(scene),
+        "pictures": pictures,
+        "lacking": lacking,
+        "legend": [(own.classes[k - 1], colors[k]) for k in known if k > 0],
+    }
+
+
+def _pictures(own: Evaluation) -> tuple[dict[str, str], str]:
+    """Data addresses of the pictures of the truth, the prediction and the difference, or why there are none."""
+    scene = own.scenes[0]
+    truth, predicted, mask = scene.truth, scene.predicted, scene.truth.masks()[PRIMARY_MASK]
+    true_way = np.zeros((0, 3)) if scene.errors is None else scene.errors.true
+    way = np.zeros((0, 3)) if scene.errors is None else scene.errors.aligned
+    palette = np.vstack((class_colors(list(own.classes)), [_PLAIN])).astype(np.uint8)
+    plain = len(palette) - 1
+    true = np.where(mask, truth.labels, 0)
+    occupied = predicted.occupied & mask
+    labels = np.zeros(truth.shape, np.uint8) if predicted.labels is None else predicted.labels
+    claimed = np.where(occupied, np.where(labels > 0, labels, plain), 0).astype(np.uint8)
+    grids = {
+        "Truth": Grid(true.astype(np.uint8), palette, true_way),
+        "Prediction": Grid(claimed, palette, way),
+        "Difference": Grid(differences(true, occupied, predicted.labels), _difference_colors(), way),
+    }
+    try:
+        pictures = grid_pictures(grids, truth.origin, truth.voxel_size, scene.up)
+    except DependencyError as error:
+        return {}, f"There are no pictures. {error}"
+    if not pictures:
+        return {}, "There are no pictures: neither the truth nor the prediction holds an occupied voxel."
+    return {
+        name: f"data:image/png;base64,{base64.b64encode(picture).decode()}" for name, picture in pictures.items()
+    }, ""
+
+
+def differences(
+    true: NDArray[np.integer], occupied: NDArray[np.bool_], labels: NDArray[np.integer] | None
+) -> NDArray[np.uint8]:
+    """(X, Y, Z) per voxel 0 where both say free, else 1 + the place in ``DIFFERENCES``.
+
+    true: (X, Y, Z), 0 free, k class k.  labels: (X, Y, Z), as ``Prediction.labels``; without them no class is wrong.
+    """
+    both = (true > 0) & occupied
+    wrong = both & (labels != true) if labels is not None else np.zeros_like(both)
+    out = np.zeros(true.shape, np.uint8)
+    for number, where in enumerate((both & ~wrong, wrong, (true > 0) & ~occupied, occupied & (true == 0))):
+        out[where] = number + 1
+    return out
+
+
+def _difference_colors() -> NDArray[np.uint8]:
+    return np.array([(0, 0, 0), *DIFFERENCES.values()], np.uint8)
+
+
+def _drawn_way(scene: Scene) -> dict[str, Any]:
+    """The trajectories from above, in centimetres, y downwards as on screens: points of the true one, and pieces of the
+    estimated one with the colour of their error."""
+    errors = scene.errors
+    assert errors is not None
+    R = upright(scene.up, errors.true)
+    step = max(1, -(-len(errors.true) // MOST_SEGMENTS))
+    true, way = (100 * (points @ R.T)[::step, :2] * (1, -1) for points in (errors.true, errors.aligned))
+    low = np.minimum(true.min(axis=0), way.min(axis=0))
+    extent = np.maximum(true.max(axis=0), way.max(axis=0)) - low
+    true, way = true - low, way - low
+    off = errors.errors_m[::step]
+    worst = max(float(errors.errors_m.max()), 1e-9)
+    colors = ramp(1 - 0.85 * off / worst)  # the palest of the colours would vanish on white
+    unit = max(float(extent.max()), 1.0)
+    return {
+        "box": (-0.04 * unit, -0.04 * unit, extent[0] + 0.08 * unit, extent[1] + 0.08 * unit),
+        "unit": unit,
+        "true": " ".join(f"{x:.1f},{y:.1f}" for x, y in true),
+        "pieces": [(*a, *b, _rgb(color)) for a, b, color in zip(way[:-1], way[1:], colors[1:], strict=True)],
+        "start": true[0],
+        "worst": worst,
+        "key": [_rgb(color) for color in ramp(1 - 0.85 * np.linspace(0, 1, 24))],
+    }
+
+
+def _rgb(color: Sequence[int]) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*(int(c) for c in color))
+
+
+def _percent(fraction: float | None) -> str:
+    return "not available" if fraction is None else f"{100 * fraction:.1f}"
+
+
+def _cm(metres: float | None) -> str:
+    return "not available" if metres is None else f"{100 * metres:.2f} cm"

@@ -1,0 +1,107 @@
+"""Which classes are scored, and how the names of other taxonomies map to them.
+
+A class file is YAML::
+
+    classes: [ceiling, floor, wall]     # scored, in this order
+    map:                                # optional: other names -> one of these, or null: not scored
+      carpet: floor
+      ceiling lamp: null
+
+or a bare list of names, in YAML or one a line. It is used in both directions: the truth's names are turned into the
+scored classes, and a map is asked for every name that the file knows, each voxel taking the class that its best name
+maps to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from ..core.errors import FreeOccError
+from ..core.types import UNKNOWN
+from .ground_truth import GroundTruth
+
+EMBODIEDOCC = (
+    "ceiling", "floor", "wall", "window", "chair", "bed", "sofa", "table", "tvs", "furniture", "objects",
+)  # fmt: skip
+"""The 11 classes of Occ-ScanNet and EmbodiedOcc-ScanNet, labels 1 … 11."""
+
+SHARED = EMBODIEDOCC[:8]
+"""The 8 of them that ReplicaOcc shares (paper, Sec. "Datasets and Metrics")."""
+
+FREE = "free"
+"""Name of label 0."""
+
+_MOST_CLASSES = 254
+
+
+@dataclass(frozen=True)
+class ClassMap:
+    """classes: names of the scored classes, label k being ``classes[k - 1]``.
+
+    labels: label of every known name in lower case, 0 for a name that is not scored.
+    """
+
+    classes: tuple[str, ...]
+    labels: dict[str, int]
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Every name that stands for a scored class: what a map is asked."""
+        return tuple(name for name, label in self.labels.items() if label)
+
+    def apply(self, truth: GroundTruth, source: str) -> GroundTruth:
+        """The truth in terms of the scored classes; voxels of classes that are not scored become 255.
+
+        source: the class file's name, for messages. Raises FreeOccError: a class that the truth holds is not known.
+        """
+        table = np.full(256, UNKNOWN, np.uint8)
+        table[0] = 0
+        occurring = np.unique(truth.labels[(truth.labels != 0) & (truth.labels != UNKNOWN)])
+        unknown = [truth.classes[k] for k in occurring if truth.classes[k].lower() not in self.labels]
+        if unknown:
+            raise FreeOccError(
+                f"{source} says nothing of {', '.join(repr(name) for name in unknown)}, which the ground truth holds: "
+                "add each to its 'map', with one of its classes or null."
+            )
+        for k in occurring:
+            table[k] = self.labels[truth.classes[k].lower()] or UNKNOWN
+        return replace(truth, labels=table[truth.labels], classes=(truth.classes[0], *self.classes))
+
+
+def identity(classes: tuple[str, ...]) -> ClassMap:
+    """Every class for itself. classes: as in ``GroundTruth``, the first is not used."""
+    return ClassMap(classes[1:], {name.lower(): k for k, name in enumerate(classes) if k})
+
+
+def load_class_map(path: Path) -> ClassMap:
+    """Read a class file. Raises FreeOccError: no such file, not of this form, a target that is no class."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = yaml.safe_load(text) if path.suffix in (".yaml", ".yml", ".json") else text.splitlines()
+    except OSError as error:
+        raise FreeOccError(f"Cannot read the class file {path}: {(error.strerror or str(error)).lower()}.") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise FreeOccError(f"The class file {path} is not valid YAML: {' '.join(str(error).split())}.") from error
+    if isinstance(content, list):
+        content = {"classes": [name for name in content if not isinstance(name, str) or name.strip()]}
+    if not isinstance(content, dict) or not set(content) <= {"classes", "map"}:
+        raise FreeOccError(f"The class file {path} must hold 'classes', a list of names, and perhaps 'map'.")
+    classes, mapped = content.get("classes"), content.get("map") or {}
+    if not isinstance(classes, list) or not classes or not all(isinstance(name, str) for name in classes):
+        raise FreeOccError(f"'classes' of {path} must be a list of names (quote a name like \"no\").")
+    names = tuple(name.strip() for name in classes)
+    if len({name.lower() for name in names}) < len(names) or len(names) > _MOST_CLASSES:
+        raise FreeOccError(f"'classes' of {path} must be at most {_MOST_CLASSES} different names.")
+    if not isinstance(mapped, dict) or not all(isinstance(name, str) for name in mapped):
+        raise FreeOccError(f"'map' of {path} must read 'name: class', a name a line.")
+    labels = {name.lower(): label for label, name in enumerate(names, start=1)}
+    targets = dict(labels)
+    for name, target in mapped.items():
+        if target is not None and str(target).lower() not in targets:
+            raise FreeOccError(f"{path} maps '{name}' to '{target}', which is none of its classes.")
+        labels[name.strip().lower()] = 0 if target is None else targets[str(target).lower()]
+    return ClassMap(names, labels)

@@ -1,0 +1,527 @@
+"""Scenes scored one by one and pooled: what ``freeocc3d evaluate`` does.
+
+A scene is a truth, a claim about its voxels and, where there is one, a trajectory. Which classes are scored, under
+which masks, and what could not be scored is part of the result: a figure never stands without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import __version__
+from ..capture import base as capture_base
+from ..capture import open_capture
+from ..capture.base import Capture
+from ..core.errors import FreeOccError
+from ..core.types import UNKNOWN
+from ..gaussians.splat_ply import read_standard_ply
+from ..occupancy.up_direction import estimate_up
+from ..settings import config, registry
+from ..settings.config import Config
+from ..storage.store import CONFIG, Map, load_map
+from . import predictions
+from .confusion import Prediction, Scores, confusion
+from .embodiedocc import find_package, read_split
+from .ground_truth import GroundTruth, load_ground_truth
+from .scored_classes import EMBODIEDOCC, SHARED, ClassMap, identity, load_class_map
+from .trajectory_alignment import Alignment, Poses, align, estimated_poses, read_poses, true_poses
+from .trajectory_errors import TrajectoryErrors, trajectory_errors
+
+PRIMARY_MASK = "label"
+TOP = (10, 20, 30, 40)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One scored scene.
+
+    name: of the map, file or folder that was scored.  truth: in terms of the scored classes.
+    alignment: of the estimate's world with the true one.  errors: of the trajectory, None where there is none.
+    frames: of the capture, or with a true pose.  frames_with_pose: of those, with an estimated pose.
+    up: (3,) unit vector towards the ceiling in the true world, for pictures.
+    notes: sentences about what should be known when the figures are read.
+    """
+
+    name: str
+    truth: GroundTruth
+    predicted: Prediction
+    alignment: Alignment
+    errors: TrajectoryErrors | None
+    frames: int | None
+    frames_with_pose: int | None
+    up: NDArray[np.float64]
+    notes: tuple[str, ...]
+
+
+def score_map(
+    scan_map: Map,
+    truth: GroundTruth,
+    classes: ClassMap,
+    poses: Poses | None = None,
+    how: str = "se3",
+    overrides: Sequence[str] = (),
+) -> Scene:
+    """Score a map. poses: the true ones, by default those of the capture that the map was made of.
+
+    overrides: options of layer 4, ``occupancy.threshold=0.4``, in place of those that the map was made with.
+    Raises FreeOccError: no true poses, an alignment that is not determined.
+    """
+    settings = config.load(scan_map.path / CONFIG, list(overrides))
+    estimated = estimated_poses(scan_map.trajectory)
+    if poses is None:
+        try:
+            poses = true_poses(capture_of(scan_map, settings))
+        except FreeOccError:
+            if how != "none":
+                raise
+    alignment = Alignment.identity() if poses is None else align(estimated, poses, how)
+    predicted, note = predictions.of_map(scan_map, settings, alignment, truth, classes)
+    notes = [note] if note else []
+    if not scan_map.metric and how != "sim3":
+        notes.append("The map's scale is unknown: --align sim3 compares it at the true one.")
+    return Scene(
+        name=str(scan_map.path),
+        truth=truth,
+        predicted=predicted,
+        alignment=alignment,
+        errors=None if poses is None else trajectory_errors(estimated, poses, alignment),
+        frames=len(scan_map.trajectory),
+        frames_with_pose=len(estimated),
+        up=alignment.rotation @ scan_map.up,
+        notes=tuple(notes),
+    )
+
+
+def score_gaussians(
+    ply: Path,
+    truth: GroundTruth,
+    classes: ClassMap,
+    trajectory: Poses | None,
+    poses: Poses | None,
+    how: str = "se3",
+    overrides: Sequence[str] = (),
+) -> Scene:
+    """Score the Gaussians of another system: a 3DGS PLY and the trajectory that belongs to it.
+
+    trajectory: the system's own, whose world the Gaussians are in; None if they are in the true frame (``how`` none).
+    poses: the true ones. Raises FreeOccError as ``score_map``, and for a PLY that cannot be read.
+    """
+    alignment, errors = _aligned(trajectory, poses, how, ply)
+    gaussians, labels = read_standard_ply(ply)
+    semantics = predictions.one_hot(labels, classes, ply)
+    predicted = predictions.of_gaussians(gaussians, semantics, config.load(None, list(overrides)), alignment, truth)
+    notes = [] if labels is not None else [f"The Gaussians of {ply.name} have no classes: mIoU is not available."]
+    return _other(ply, truth, predicted, alignment, errors, trajectory, poses, notes)
+
+
+def score_frames(
+    folder: Path, truth: GroundTruth, classes: ClassMap, poses: Poses, overrides: Sequence[str] = ()
+) -> Scene:
+    """Score per-frame Gaussians fused by true poses (``project.of_frames``)."""
+    predicted, fused = predictions.of_frames(folder, poses, config.load(None, list(overrides)), truth, classes)
+    notes = [f"The Gaussians of {fused} frames were fused by true poses."]
+    scene = _other(folder, truth, predicted, Alignment.identity(), None, None, poses, notes)
+    return scene
+
+
+def score_grid(
+    path: Path,
+    truth: GroundTruth,
+    classes: ClassMap,
+    trajectory: Poses | None = None,
+    poses: Poses | None = None,
+    how: str = "se3",
+) -> Scene:
+    """Score a finished voxel grid. Without a trajectory it is in the true frame already."""
+    alignment, errors = _aligned(trajectory, poses, how if trajectory is not None else "none", path)
+    predicted, note = predictions.of_grid(path, alignment, truth, classes)
+    return _other(path, truth, predicted, alignment, errors, trajectory, poses, [note] if note else [])
+
+
+def _aligned(
+    trajectory: Poses | None, poses: Poses | None, how: str, path: Path
+) -> tuple[Alignment, TrajectoryErrors | None]:
+    if trajectory is None or poses is None:
+        if how != "none":
+            lacking = (
+                "the trajectory that it was made with (--trajectory)" if trajectory is None else "true poses (--poses)"
+            )
+            raise FreeOccError(
+                f"{path} is aligned by camera centres, for which {lacking} must be given; if it is in the frame of the "
+                "true poses already, use --align none."
+            )
+        return Alignment.identity(), None
+    alignment = align(trajectory, poses, how)
+    return alignment, trajectory_errors(trajectory, poses, alignment)
+
+
+def _other(
+    path: Path,
+    truth: GroundTruth,
+    predicted: Prediction,
+    alignment: Alignment,
+    errors: TrajectoryErrors | None,
+    trajectory: Poses | None,
+    poses: Poses | None,
+    notes: Sequence[str],
+) -> Scene:
+    """A scene of another system's."""
+    return Scene(
+        name=str(path),
+        truth=truth,
+        predicted=predicted,
+        alignment=alignment,
+        errors=errors,
+        frames=None if poses is None else len(poses),
+        frames_with_pose=None if trajectory is None else len(trajectory),
+        up=_up(truth, poses),
+        notes=tuple(notes),
+    )
+
+
+def _up(truth: GroundTruth, poses: Poses | None) -> NDArray[np.float64]:
+    """(3,) where up is in the true world; without poses z, as in the published data sets."""
+    if poses is None:
+        return np.array((0.0, 0.0, 1.0))
+    return estimate_up(poses.T_world_cam, truth.centers()[(truth.labels > 0) & (truth.labels != UNKNOWN)])
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be scored: maps, or one of ``gaussians``, ``grid`` and ``frames``, as on the command line.
+
+    ground_truths: one for each map, or one folder of packages, or none: the captures' own ``ground_truth.npz``.
+    poses: one for each map, or none: the captures' own.  classes: a class file.  split: a file that lists the scenes to
+    score.  overrides: options of layer 4.  align: se3, sim3 or none; None = se3, and sim3 if a map's scale is unknown.
+    """
+
+    maps: Sequence[Path] = ()
+    gaussians: Path | None = None
+    grid: Path | None = None
+    frames: Path | None = None
+    trajectory: Path | None = None
+    ground_truths: Sequence[Path] = ()
+    poses: Sequence[str] = ()
+    align: str | None = None
+    classes: Path | None = None
+    split: Path | None = None
+    overrides: Sequence[str] = ()
+
+
+def evaluate(asked: Asked) -> Evaluation:
+    """Read what is asked for, score each scene, pool. Raises FreeOccError with one sentence about what does not fit."""
+    maps = [load_map(path) for path in asked.maps]
+    how = asked.align or ("se3" if all(scan_map.metric for scan_map in maps) else "sim3")
+    if asked.split is not None:
+        maps = _in_split(maps, asked.split)
+    count = max(len(maps), 1)
+    listed = None if asked.classes is None else load_class_map(asked.classes)
+    captures = [str(scan_map.manifest["capture"]["path"]) for scan_map in maps] or list(asked.poses)
+    truths = _truths(captures, asked.ground_truths, count, listed)
+    if len(asked.poses) not in (0, count):
+        raise FreeOccError(
+            f"--poses is given {len(asked.poses)} times for {count} scenes: once for each, or not at all."
+        )
+    poses: list[Poses | None] = [read_poses(path) for path in asked.poses] or [None] * count
+    classes = listed or common_classes(truths)
+    truths = [classes.apply(truth, str(asked.classes)) for truth in truths]
+    trajectory = None if asked.trajectory is None else read_poses(asked.trajectory)
+    for other in (asked.gaussians, asked.grid, asked.frames):
+        if other is not None and not other.exists():
+            raise FreeOccError(f"There is no {other} to score.")
+    if maps:
+        scenes = [
+            score_map(scan_map, truth, classes, true, how, asked.overrides)
+            for scan_map, truth, true in zip(maps, truths, poses, strict=True)
+        ]
+    elif asked.gaussians is not None:
+        scenes = [score_gaussians(asked.gaussians, truths[0], classes, trajectory, poses[0], how, asked.overrides)]
+    elif asked.grid is not None:
+        scenes = [score_grid(asked.grid, truths[0], classes, trajectory, poses[0], how)]
+    elif asked.frames is not None:
+        if poses[0] is None:
+            raise FreeOccError("Per-frame Gaussians are fused by true poses: name them with --poses.")
+        scenes = [score_frames(asked.frames, truths[0], classes, poses[0], asked.overrides)]
+    else:
+        raise FreeOccError("There is nothing to score: give a map, or --gaussians, --grid or --frames.")
+    return Evaluation(tuple(scenes), classes.classes, how, listed is not None)
+
+
+def scene_name(scan_map: Map) -> str:
+    """A map's scene: the name of the capture's folder."""
+    return Path(str(scan_map.manifest["capture"]["path"])).name
+
+
+def _in_split(maps: list[Map], split: Path) -> list[Map]:
+    """The maps of the scenes that a split lists, in its order. Raises FreeOccError if one is missing."""
+    by_name = {scene_name(scan_map): scan_map for scan_map in maps}
+    scenes = read_split(split)
+    missing = [name for name in scenes if name not in by_name]
+    if missing:
+        raise FreeOccError(
+            f"{split} lists {len(missing)} scenes of which no map is given, the first is {missing[0]}: a score over "
+            "part of a split is not that split's."
+        )
+    return [by_name[name] for name in scenes]
+
+
+def _truths(captures: Sequence[str], paths: Sequence[Path], count: int, classes: ClassMap | None) -> list[GroundTruth]:
+    """The truth of each scene. captures: their folders, whose own truths are taken if no paths are given.
+
+    classes: the class file's, which names the labels of packages that do not.
+    """
+    if len(paths) == 1 and paths[0].is_dir():
+        paths = [find_package(paths[0], Path(capture).name) for capture in captures]
+    elif not paths:
+        paths = [Path(capture) / "ground_truth.npz" for capture in captures if not Path(capture).is_file()]
+        if not paths or not all(path.is_file() for path in paths):
+            absent = f"there is no {paths[0]}" if paths else "no capture is named that could bring it"
+            raise FreeOccError(f"The truth is lacking, {absent}: name it with --ground-truth.")
+    if len(paths) != count:
+        raise FreeOccError(f"{len(paths)} ground truths are given for {count} scenes: give one for each.")
+    names = None if classes is None else ("free", *classes.classes)
+    return [load_ground_truth(path, names) for path in paths]
+
+
+def capture_of(scan_map: Map, settings: Config | None = None) -> Capture:
+    """The capture that a map was made of, opened as it was then. Raises FreeOccError if it is not there any more."""
+    settings = settings or config.load(scan_map.path / CONFIG)
+    path = scan_map.manifest["capture"]["path"]
+    if not str(path).startswith("builtin:") and not Path(path).exists():
+        raise FreeOccError(
+            f"The capture {path}, of which {scan_map.path} was made, is not there: name the true poses with --poses."
+        )
+    options = registry.build_options(capture_base, config.options(settings, "capture"))
+    return open_capture(path, options, settings["capture"])
+
+
+def common_classes(truths: Sequence[GroundTruth]) -> ClassMap:
+    """All classes that some truths name, each for itself."""
+    names = dict.fromkeys(name for truth in truths for name in truth.classes[1:])
+    return identity(("", *names))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores over all scenes, pooled by voxels. how: "se3", "sim3" or "none".
+
+    Which classes make up mIoU: those that the truth holds, or, where a class file was given (``listed``), all that it
+    lists, as EmbodiedOcc counts them, absent ones as 0.
+    """
+
+    scenes: tuple[Scene, ...]
+    classes: tuple[str, ...]
+    how: str
+    listed: bool = False
+
+    @cached_property
+    def by_mask(self) -> dict[str, Scores]:
+        """Scores under "label" and, where every scene has masks of its frames, under "frames"."""
+        masks = [scene.truth.masks() for scene in self.scenes]
+        return {
+            name: Scores(
+                np.sum(
+                    [
+                        confusion(scene.truth.labels, scene.predicted, own[name], len(self.classes))
+                        for scene, own in zip(self.scenes, masks, strict=True)
+                    ],
+                    axis=0,
+                ),
+                self.classes,
+            )
+            for name in masks[0]
+            if all(name in own for own in masks)
+        }
+
+    @property
+    def scores(self) -> Scores:
+        """Under the primary mask."""
+        return self.by_mask[PRIMARY_MASK]
+
+    @property
+    def has_classes(self) -> bool:
+        """Whether every claim names classes; without, there is no mIoU."""
+        return all(scene.predicted.labels is not None for scene in self.scenes)
+
+    @property
+    def classes_in_miou(self) -> tuple[str, ...]:
+        """The classes whose mean is mIoU."""
+        return self.classes if self.listed else self.scores.present
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Listed classes that the truth does not hold."""
+        return tuple(name for name in self.classes if name not in self.scores.present)
+
+    @cached_property
+    def miou_over(self) -> dict[str, tuple[str, ...] | None]:
+        """Lists of classes over which mIoU is usually given; None for one that does not apply to these classes."""
+        known = {name.lower() for name in self.classes}
+        lists: dict[str, tuple[str, ...] | None] = {"present": self.scores.present, "listed": self.classes}
+        for name, wanted in (("shared_8", SHARED), ("embodiedocc_11", EMBODIEDOCC)):
+            fits = known.issuperset(wanted)
+            lists[name] = tuple(c for c in self.classes if c.lower() in wanted) if fits else None
+        for count in TOP:
+            enough = len(self.scores.present) >= count
+            lists[f"top_{count}"] = self.scores.most_frequent(count) if enough else None
+        return lists
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What should be known when the figures are read."""
+        apart = [
+            f"{scene.name} claims no voxel inside the truth: if they are not in one frame, name true poses in the "
+            "truth's frame with --poses."
+            for scene in self.scenes
+            if not confusion(scene.truth.labels, scene.predicted, scene.truth.masks()[PRIMARY_MASK], len(self.classes))[
+                :, 1:
+            ].any()
+        ]
+        return tuple(dict.fromkeys([*(note for scene in self.scenes for note in scene.notes), *apart]))
+
+    @property
+    def ate_rmse_m(self) -> float | None:
+        """Mean over the scenes, None where one has no trajectory."""
+        errors = [scene.errors.ate_rmse_m for scene in self.scenes if scene.errors is not None]
+        return float(np.mean(errors)) if len(errors) == len(self.scenes) else None
+
+    def miou(self, names: Sequence[str] | None = None, mask: str = PRIMARY_MASK) -> float | None:
+        """Mean IoU over some classes, by default ``classes_in_miou``; None where no classes were claimed."""
+        names = self.classes_in_miou if names is None else names
+        return self.by_mask[mask].miou(names) if self.has_classes and names else None
+
+    def to_json(self) -> dict[str, Any]:
+        """The document that ``evaluate --json`` prints: fractions 0…1, metres, seconds."""
+        scores = self.scores
+        first = self.scenes[0] if len(self.scenes) == 1 else None
+        per_class = dict(zip(self.classes, scores.class_iou.tolist(), strict=True))
+        counted = self.classes_in_miou if self.has_classes else ()
+        document: dict[str, Any] = {
+            "version": __version__,
+            "scored": [scene.name for scene in self.scenes],
+            "iou": scores.iou,
+            "precision": scores.precision,
+            "recall": scores.recall,
+            "miou": self.miou(),
+            "classes_in_miou": list(counted),
+            "per_class": {name: per_class[name] for name in counted},
+            "absent": list(self.absent),
+            "miou_over": {
+                name: None if names is None else {"miou": self.miou(names), "classes": list(names)}
+                for name, names in self.miou_over.items()
+            },
+            "mask": PRIMARY_MASK,
+            "by_mask": {
+                name: {
+                    "iou": own.iou,
+                    "miou": self.miou(mask=name),
+                    "precision": own.precision,
+                    "recall": own.recall,
+                    "voxels": own.voxels,
+                }
+                for name, own in self.by_mask.items()
+            },
+            "classes": list(self.classes),
+            "ate_rmse_m": self.ate_rmse_m,
+            "frames_with_pose": _total(scene.frames_with_pose for scene in self.scenes),
+            "frames": _total(scene.frames for scene in self.scenes),
+            "align": self.how,
+            "alignment": first.alignment.to_json() if first else None,
+            "trajectory": first.errors.to_json() if first and first.errors else None,
+            "confusion": {
+                "rows_true": ["free", *self.classes],
+                "columns_predicted": ["not occupied", *self.classes, "occupied, no class"],
+                "voxels": scores.matrix.tolist(),
+            },
+            "notes": list(self.notes),
+        }
+        if first is None:
+            document["scenes"] = [
+                Evaluation((scene,), self.classes, self.how, self.listed).to_json() for scene in self.scenes
+            ]
+        return document
+
+    def to_text(self) -> str:
+        """Tables for people; per cent and centimetres."""
+        scores = self.scores
+        exact = f"precision {_percent(scores.precision)}, recall {_percent(scores.recall)}"
+        lines = [
+            f"IoU        {_percent(scores.iou)}  {exact}",
+            *(
+                f"  mask {name:<9} IoU {_percent(own.iou)}, mIoU {_percent(self.miou(mask=name))}, "
+                f"{own.voxels:,} voxels"
+                for name, own in self.by_mask.items()
+            ),
+            f"mIoU       {_percent(self.miou())}  over {_list(self.classes_in_miou)}",
+        ]
+        if self.has_classes:
+            lines += self._lists_as_text()
+        for scene in self.scenes:
+            if len(self.scenes) > 1:
+                own = Evaluation((scene,), self.classes, self.how, self.listed)
+                lines.append(f"{scene.name}: IoU {_percent(own.scores.iou)}, mIoU {_percent(own.miou())}")
+            if scene.errors is not None:
+                lines += _trajectory_lines(scene, self.how)
+        if self.has_classes:
+            lines.append("class                     IoU   true voxels")
+            order = np.argsort(-scores.class_voxels, kind="stable")
+            lines += [
+                f"  {self.classes[k]:<20} {_percent(scores.class_iou[k])}  {scores.class_voxels[k]:12,}"
+                for k in order
+                if scores.class_voxels[k]
+            ]
+        return "\n".join(lines + [f"note: {note}" for note in self.notes])
+
+    def _lists_as_text(self) -> list[str]:
+        """mIoU over the lists of classes that are usually given."""
+        lines, lacking = [], []
+        for name, names in self.miou_over.items():
+            if names is None:
+                lacking.append(name)
+            elif name == "listed":
+                absent = f", absent ones as 0: {', '.join(self.absent)}" if self.absent else ""
+                lines.append(f"  {name:<14} {_percent(self.miou(names))}  over all {len(names)} classes{absent}")
+            elif names != self.classes_in_miou:
+                lines.append(f"  {name:<14} {_percent(self.miou(names))}  over {_list(names)}")
+        named = [name for name in lacking if not name.startswith("top_")]
+        top = [name for name in lacking if name.startswith("top_")]
+        if named:
+            lines.append(f"  not available  {', '.join(named)} (the classes are other ones: map them with --classes)")
+        if top:
+            lines.append(f"  not available  {', '.join(top)} (the truth holds {len(self.scores.present)} classes)")
+        return lines
+
+
+def _trajectory_lines(scene: Scene, how: str) -> list[str]:
+    errors = scene.errors
+    assert errors is not None
+    lines = [
+        f"ATE        {100 * errors.ate_rmse_m:.2f} cm RMSE, {100 * errors.errors_m.max():.2f} cm at most, "
+        f"{len(errors.errors_m)} frames, aligned by {how}"
+        + (f" (scale {scene.alignment.scale:.4f})" if how == "sim3" else "")
+    ]
+    return lines + [
+        f"  RPE over {e.distance_m:g} m   {100 * e.translation_rmse_m:.2f} cm, {e.rotation_rmse_deg:.2f} deg "
+        f"({e.pairs} pairs)"
+        for e in errors.relative
+    ]
+
+
+def _percent(fraction: float | None) -> str:
+    return "    –" if fraction is None else f"{100 * fraction:5.1f}"
+
+
+def _list(names: Sequence[str]) -> str:
+    return f"{len(names)} class{'es' if len(names) != 1 else ''}: {', '.join(names) or 'none'}"
+
+
+def _total(counts: Any) -> int | None:
+    known = [count for count in counts if count is not None]
+    return sum(known) if known else None

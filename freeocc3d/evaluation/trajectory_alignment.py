@@ -1,0 +1,140 @@
+"""The estimated trajectory against the true one: which poses belong together, and the best alignment of the two worlds.
+
+Sources: S. Umeyama, PAMI 1991 (``geometry.umeyama``) on the camera centres of the frames that have a pose in both
+(paper, "Coordinate System Alignment"); J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS
+2012, for the association by time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import associate, open_capture, read_trajectory
+from ..capture.base import Capture
+from ..core.errors import CaptureError, FreeOccError
+from ..core.transforms import umeyama
+from ..core.types import Trajectory
+
+ALIGNMENTS = ("se3", "sim3", "none")
+"""Rigid, for trajectories with a metric scale; with a scale, for monocular ones; as they are."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses of some frames: timestamps (M,) seconds and T_world_cam (M, 4, 4), all finite. They are kept in the order
+    of time, in whatever order they are given."""
+
+    timestamps: NDArray[np.float64]
+    T_world_cam: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        order = np.argsort(self.timestamps, kind="stable")
+        object.__setattr__(self, "timestamps", self.timestamps[order])
+        object.__setattr__(self, "T_world_cam", self.T_world_cam[order])
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """(M, 3) camera centres."""
+        return self.T_world_cam[:, :3, 3]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The similarity that takes the estimate's world to the true one: x_true = scale * rotation @ x_est + translation.
+
+    scale: 1 unless it was asked for.  rotation: (3, 3).  translation: (3,) metres.
+    """
+
+    scale: float
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    @staticmethod
+    def identity() -> Alignment:
+        """Both worlds are the same."""
+        return Alignment(1.0, np.eye(3), np.zeros(3))
+
+    def to_true(self, points_est: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(..., 3) points of the estimate's world in the true world."""
+        return np.asarray(self.scale * points_est @ self.rotation.T + self.translation)
+
+    def to_estimate(self, points_true: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(..., 3) points of the true world in the estimate's world: the inverse of ``to_true``."""
+        return np.asarray((points_true - self.translation) @ self.rotation / self.scale)
+
+    def poses(self, T_est_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., 4, 4) camera poses of the estimate's world in the true world; rotations stay rotations."""
+        T_true_cam = T_est_cam.copy()
+        T_true_cam[..., :3, :3] = self.rotation @ T_est_cam[..., :3, :3]
+        T_true_cam[..., :3, 3] = self.to_true(T_est_cam[..., :3, 3])
+        return T_true_cam
+
+    def to_json(self) -> dict[str, Any]:
+        """``alignment`` of ``evaluate --json``."""
+        return {
+            "scale": self.scale,
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+        }
+
+
+def align(estimated: Poses, true: Poses, how: str = "se3") -> Alignment:
+    """The alignment of the camera centres of the frames that have a pose in both.
+
+    Raises FreeOccError: fewer than three frames match, their centres lie on one line, unknown ``how``.
+    """
+    if how not in ALIGNMENTS:
+        raise FreeOccError(f"Trajectories are aligned by {', '.join(ALIGNMENTS)}, not by '{how}'.")
+    if how == "none":
+        return Alignment.identity()
+    rows_est, rows_true = associate(estimated.timestamps, true.timestamps)
+    scale, R, t = umeyama(estimated.centers[rows_est], true.centers[rows_true], with_scale=how == "sim3")
+    return Alignment(scale, np.asarray(R, np.float64), np.asarray(t, np.float64))
+
+
+def estimated_poses(trajectory: Trajectory) -> Poses:
+    """The frames of a trajectory that have a pose."""
+    rows = np.flatnonzero(trajectory.has_pose)
+    return Poses(trajectory.timestamps[rows], trajectory.T_world_cam[rows])
+
+
+def true_poses(capture: Capture) -> Poses:
+    """The poses that a capture states. Raises FreeOccError if it has none at all."""
+    stated = [(index, T) for index in range(len(capture)) if (T := capture.pose(index)) is not None]
+    if not stated:
+        raise FreeOccError(f"{capture.path} brings no poses to compare with: name a file of true poses with --poses.")
+    rows, poses = zip(*stated, strict=True)
+    return Poses(capture.timestamps[list(rows)], np.stack(poses))
+
+
+def read_poses(path: str | Path) -> Poses:
+    """Poses of a capture (its folder, or ``builtin:room``) or of a file in any of the forms that
+    ``capture.read_trajectory`` knows; one that states no times counts frames. Raises FreeOccError."""
+    if str(path).startswith("builtin:"):
+        return true_poses(open_capture(path))
+    if not Path(path).exists():
+        raise FreeOccError(f"There is no file or capture {path} to take poses from.")
+    if Path(path).is_dir():
+        try:
+            capture = open_capture(path)
+            if capture.metric_poses:
+                return true_poses(capture)
+        except CaptureError as no_capture:
+            try:
+                found = read_trajectory(path)
+            except CaptureError:
+                raise no_capture from None
+        else:  # a reconstruction: its images are some of the frames, which are known by the numbers in their names
+            found = read_trajectory(path)
+    else:
+        found = read_trajectory(path)
+    finite = np.isfinite(found.T_world_cam).all(axis=(1, 2))
+    return Poses(found.times()[finite], found.T_world_cam[finite])

@@ -1,0 +1,131 @@
+"""Errors of a trajectory after its alignment: absolute (ATE) and relative by travelled distance (RPE).
+
+Sources: J. Sturm et al., IROS 2012, Sec. IV; pairs of frames as evo's ``--all_pairs --pairs_from_reference -u m``
+chooses them (M. Grupp, evo, https://github.com/MichaelGrupp/evo), so that figures compare: from each frame to the one
+whose travelled distance along the true path is nearest to the asked one, within a tenth of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import associate
+from ..core.errors import FreeOccError
+from ..core.transforms import invert
+from .trajectory_alignment import Alignment, Poses
+
+DISTANCES_M = (0.1, 0.5, 1.0, 2.0)
+"""Travelled distances of the relative errors."""
+
+_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """Root mean square over pairs of frames that are ``distance_m`` of path apart: metres and degrees."""
+
+    distance_m: float
+    pairs: int
+    translation_rmse_m: float
+    rotation_rmse_deg: float
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """What is left after the alignment, over the M frames that have a pose in both.
+
+    timestamps: (M,) of the estimate.  true, aligned: (M, 3) camera centres in the true world, metres.
+    relative: one per distance that some pair of frames is apart.
+    """
+
+    timestamps: NDArray[np.float64]
+    true: NDArray[np.float64]
+    aligned: NDArray[np.float64]
+    relative: tuple[RelativeError, ...]
+
+    @property
+    def errors_m(self) -> NDArray[np.float64]:
+        """(M,) distances of the aligned camera centres from the true ones, metres."""
+        return np.asarray(np.linalg.norm(self.aligned - self.true, axis=1))
+
+    @property
+    def ate_rmse_m(self) -> float:
+        """Absolute trajectory error, root mean square, metres."""
+        return float(np.sqrt((self.errors_m**2).mean()))
+
+    def to_json(self) -> dict[str, Any]:
+        """``trajectory`` of ``evaluate --json``."""
+        errors = self.errors_m
+        return {
+            "frames_matched": len(errors),
+            "ate_m": {
+                "rmse": self.ate_rmse_m,
+                "mean": float(errors.mean()),
+                "median": float(np.median(errors)),
+                "max": float(errors.max()),
+            },
+            "rpe": [vars(error) for error in self.relative],
+        }
+
+
+def trajectory_errors(
+    estimated: Poses, true: Poses, alignment: Alignment, distances_m: tuple[float, ...] = DISTANCES_M
+) -> TrajectoryErrors:
+    """Raises FreeOccError if no frame has a pose in both."""
+    rows_est, rows_true = associate(estimated.timestamps, true.timestamps)
+    if not len(rows_est):
+        raise FreeOccError(
+            "No frame has both an estimated and a true pose: do the timestamps belong to the same recording? "
+            f"Estimated: {_span(estimated)}; true: {_span(true)}."
+        )
+    T_est = alignment.poses(estimated.T_world_cam[rows_est])
+    T_true = true.T_world_cam[rows_true]
+    relative = tuple(error for d in distances_m if (error := relative_error(T_est, T_true, d)) is not None)
+    return TrajectoryErrors(estimated.timestamps[rows_est], T_true[:, :3, 3], T_est[:, :3, 3], relative)
+
+
+def relative_error(T_est: NDArray[np.float64], T_true: NDArray[np.float64], distance_m: float) -> RelativeError | None:
+    """Of (M, 4, 4) matched poses; None if no two frames are that far apart."""
+    first, second = pairs_by_path(T_true[:, :3, 3], distance_m)
+    if not len(first):
+        return None
+    moved_true = invert(T_true[first]) @ T_true[second]
+    moved_est = invert(T_est[first]) @ T_est[second]
+    error = invert(moved_true) @ moved_est
+    # The angle by its sine and cosine: near zero the cosine alone loses half of the digits.
+    R = error[:, :3, :3]
+    sine = 0.5 * np.linalg.norm(
+        np.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), axis=1), axis=1
+    )
+    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1))
+    translation = np.linalg.norm(error[:, :3, 3], axis=1)
+    return RelativeError(
+        distance_m,
+        len(first),
+        float(np.sqrt((translation**2).mean())),
+        float(np.rad2deg(np.sqrt((angle**2).mean()))),
+    )
+
+
+def pairs_by_path(centers: NDArray[np.float64], distance_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows (P,), (P,) of the (M, 3) centres between which the path is ``distance_m`` long, within a tenth of it."""
+    path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(centers, axis=0), axis=1))))
+    first = np.arange(len(path) - 1)
+    beyond = np.maximum(np.searchsorted(path, path[first] + distance_m), first + 1)
+    # Of the last point before the distance and the first beyond it the nearer; of a camera that rests, its first frame.
+    before = np.maximum(np.searchsorted(path, path[np.maximum(beyond - 1, 0)]), first + 1)
+    beyond = np.minimum(beyond, len(path) - 1)
+    off_before, off_beyond = (np.abs(path[end] - path[first] - distance_m) for end in (before, beyond))
+    second = np.where(off_before <= off_beyond, before, beyond)
+    near = np.minimum(off_before, off_beyond) <= _TOLERANCE * distance_m
+    return first[near], second[near]
+
+
+def _span(poses: Poses) -> str:
+    if not len(poses):
+        return "no poses"
+    return f"{len(poses)} from {poses.timestamps[0]:g} to {poses.timestamps[-1]:g} s"

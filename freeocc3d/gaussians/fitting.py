@@ -1,0 +1,251 @@
+"""Fits Gaussians to the keyframes' images while their means stay where layer 1 put them.
+
+Paper, "Geometrically Anchored Gaussian Updates": over scales, rotations, opacities and colours,
+
+    min sum_t |I^_t - I_t|^2 + beta |D^_t - D_t|^2   s.t.  mu = P
+
+over the pixels that have a depth: what lies beyond has no anchor, and Gaussians beside it would grow to paint it.
+
+A camera sees the outline of a Gaussian, not its extent along the ray, nor how much room it takes where others lie
+behind. What images cannot tell stays as the initialisation has it: an anchored Gaussian keeps its axis along its
+keyframe's ray and its extent on it; across the ray, the outline's two axes turn and change their ratio, while their
+mean precision stays, for alpha(x) of the occupancy is exp(-1/2 d^T Sigma^-1 d). Opacities and colours are free.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core.errors import ConfigError
+from ..core.types import Gaussians
+from ..settings.registry import require_positive
+from .rasterizers.base import ALPHA_MIN, Rasterizer, Rendered
+from .rendered_views import View
+from .surface_cells import cell_keys
+
+_RATES = {"outline": 1e-2, "turn": 1e-2, "shape": 1e-2, "quats": 5e-3, "means": 2e-4, "logits": 5e-2, "colors": 1e-2}
+"""Adam's step of each parameter: natural logarithms, radians, metres, logits, 0…1."""
+_DECAY, _DECAY_FROM = 0.1, 0.3
+"""Steps shrink to this share of their size, from this share of the way on."""
+_LARGEST_LOGIT = 6.0
+_LARGEST_CHANGE = math.log(4.0)
+"""Of a scale, natural logarithm: what no image has, such as a frame of one colour, lets none grow without bounds."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Layer 2: how Gaussians are fitted to the images."""
+
+    rasterizer: str = "cpu"
+    """What renders: "cpu" (compiled), "gsplat" (CUDA), or "reference" (plain PyTorch, slow)."""
+    passes: int = 6
+    """Times that every keyframe is rendered and compared; 0 = Gaussians stay as they were initialised."""
+    means: str = "anchored"
+    """"anchored": means stay on the measured surface, and shapes near the initialisation; "free": everything is moved
+    by the images, as elsewhere (for comparison; costs occupancy)."""
+    width: int = 320
+    """Columns of the rendered images."""
+    depth_weight: float = 1.0
+    """beta: a depth wrong by a metre weighs as much as a colour wrong by its whole range."""
+    shape_weight: float = 0.1
+    """Pull of anchored Gaussians' outlines to the initialisation: weight of the mean squared logarithm of their
+    change. Smaller renders better (0.02: + 0.4 dB) and loses occupancy (0.5 to 1 point of IoU)."""
+    window: int = 10
+    """Keyframes that a map is fitted to while frames come in one by one."""
+    window_passes: int = 2
+    """Times that each of these is rendered for every new keyframe."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "width", "depth_weight", "window", "window_passes")
+        if self.passes < 0 or self.shape_weight < 0:
+            raise ConfigError("'passes' and 'shape_weight' must not be negative.")
+        if self.means not in ("anchored", "free"):
+            raise ConfigError(f"'means' must be anchored or free, got '{self.means}'.")
+
+
+def fitted(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    rasterizer: Rasterizer,
+    options: Options,
+    passes: int,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Gaussians:
+    """The Gaussians after ``passes`` over the views in random order (always the same), less those that became
+    invisible. progress: called with the number of images rendered."""
+    if passes == 0 or not views or not len(gaussians):
+        return gaussians
+    with _one_torch_thread():
+        return _fitted(gaussians, views, rasterizer, options, passes, progress)
+
+
+@contextlib.contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """torch's threads and numba's wait for each other spinning: on a machine that does something else besides, two of
+    each take six times as long as one of torch's, whose work here is small."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _fitted(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    rasterizer: Rasterizer,
+    options: Options,
+    passes: int,
+    progress: Callable[[int], None],
+) -> Gaussians:
+    parameters = (_Free if options.means == "free" else _Anchored)(gaussians, options, rasterizer.device)
+    groups = [{"params": [tensor], "lr": _RATES[name]} for name, tensor in parameters.optimised.items()]
+    optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+    generator = np.random.default_rng(0)
+    steps = passes * len(views)
+    order = np.concatenate([generator.permutation(len(views)) for _ in range(passes)])
+    for step, index in enumerate(order):
+        late = max(0.0, step / steps - _DECAY_FROM) / (1 - _DECAY_FROM)
+        for group, rate in zip(optimiser.param_groups, map(_RATES.get, parameters.optimised), strict=True):
+            group["lr"] = rate * _DECAY**late
+        view = views[index]
+        rendered = rasterizer.render(*parameters.splats(), view.T_cam_world, view.camera)
+        loss = _loss(rendered, view, options.depth_weight) + parameters.prior()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        parameters.clamp()
+        progress(step + 1)
+    return parameters.gaussians(gaussians)
+
+
+def _loss(rendered: Rendered, view: View, depth_weight: float) -> Tensor:
+    """Mean over the image's pixels of the squared errors, none where there is no depth."""
+    color = ((rendered.image - view.image) ** 2).sum(dim=2)
+    depth = (rendered.depth - view.depth_m) ** 2
+    return ((color + depth_weight * depth) * view.measured).mean()
+
+
+class _Parameters:
+    """What is optimised, by its name in ``_RATES``; ``splats`` makes Gaussians of it."""
+
+    def __init__(self, gaussians: Gaussians, device: torch.device):
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(np.array(array, np.float32)).to(device)
+
+        self.means = tensor(gaussians.means)
+        self.log_scales = tensor(np.log(gaussians.scales))
+        self.quats = tensor(gaussians.quats_wxyz)
+        self.optimised = {
+            "logits": torch.logit(tensor(gaussians.opacities), 1e-3),
+            "colors": tensor(gaussians.colors) / 255,
+        }
+
+    def _optimise(self, **tensors: Tensor) -> None:
+        self.optimised |= tensors
+        for tensor in self.optimised.values():
+            tensor.requires_grad_()
+
+    def shapes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Means, scales, quaternions."""
+        raise NotImplementedError
+
+    def splats(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Means, scales, quaternions, opacities, colours."""
+        return *self.shapes(), torch.sigmoid(self.optimised["logits"]), self.optimised["colors"]
+
+    def prior(self) -> Tensor:
+        """What keeps shapes near the initialisation."""
+        return torch.zeros((), device=self.means.device)
+
+    @torch.no_grad()
+    def clamp(self) -> None:
+        """Back to where parameters make sense."""
+        self.optimised["logits"].clamp_(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+        self.optimised["colors"].clamp_(0, 1)
+
+    @torch.no_grad()
+    def gaussians(self, before: Gaussians) -> Gaussians:
+        """The Gaussians as they are now."""
+        means, scales, quats, opacities, colors = (tensor.cpu().numpy() for tensor in self.splats())
+        after = replace(
+            before,
+            means=means,
+            scales=scales,
+            quats_wxyz=quats / np.linalg.norm(quats, axis=1, keepdims=True),
+            opacities=opacities,
+            colors=np.rint(255 * colors).astype(np.uint8),
+        )
+        return after[opacities >= ALPHA_MIN]  # the others are never drawn
+
+
+class _Anchored(_Parameters):
+    """outline (N, 2): logarithms of the change of the two scales across the ray.  turn (N,): radians about the ray."""
+
+    def __init__(self, gaussians: Gaussians, options: Options, device: torch.device):
+        super().__init__(gaussians, device)
+        n = len(gaussians)
+        self._weight = options.shape_weight
+        self._optimise(outline=torch.zeros((n, 2), device=device), turn=torch.zeros(n, device=device))
+
+    def shapes(self) -> tuple[Tensor, Tensor, Tensor]:
+        outline, turn = self.optimised["outline"], self.optimised["turn"]
+        kept = outline + 0.5 * torch.log(torch.exp(-2 * outline).mean(dim=1, keepdim=True))  # mean of 1 / change^2 is 1
+        change = torch.cat((kept, torch.zeros_like(turn)[:, None]), dim=1)
+        w, x, y, z = self.quats.unbind(1)
+        c, s = torch.cos(0.5 * turn), torch.sin(0.5 * turn)
+        turned = torch.stack((w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s), dim=1)  # q * (c, 0, 0, s)
+        return self.means, torch.exp(self.log_scales + change), turned
+
+    def prior(self) -> Tensor:
+        return self._weight * (self.optimised["outline"] ** 2).mean()
+
+    @torch.no_grad()
+    def clamp(self) -> None:
+        super().clamp()
+        self.optimised["outline"].clamp_(-0.5 * _LARGEST_CHANGE, 0.5 * _LARGEST_CHANGE)
+
+
+class _Free(_Parameters):
+    """means, shape (N, 3) logarithms of the scales, quats: as in 3D Gaussian splatting."""
+
+    def __init__(self, gaussians: Gaussians, options: Options, device: torch.device):
+        super().__init__(gaussians, device)
+        self._optimise(means=self.means.clone(), shape=self.log_scales.clone(), quats=self.quats.clone())
+
+    def shapes(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.optimised["means"], torch.exp(self.optimised["shape"]), self.optimised["quats"]
+
+    @torch.no_grad()
+    def clamp(self) -> None:
+        super().clamp()
+        shape = self.optimised["shape"]
+        shape.copy_(
+            torch.maximum(torch.minimum(shape, self.log_scales + _LARGEST_CHANGE), self.log_scales - _LARGEST_CHANGE)
+        )
+        self.optimised["quats"].copy_(torch.nn.functional.normalize(self.optimised["quats"], dim=1))
+
+
+def carried_over(fresh: Gaussians, before: Gaussians, cell_size: float) -> Gaussians:
+    """``fresh`` with shapes, opacities and colours of those of ``before`` that lie in the same cells: what was fitted
+    to earlier keyframes stays, and new surface starts as it was initialised. Both at the same poses."""
+    keys, row = np.unique(cell_keys(before.means.astype(np.float64), cell_size), return_index=True)
+    if not len(keys):
+        return fresh
+    wanted = cell_keys(fresh.means.astype(np.float64), cell_size)
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    known = keys[place] == wanted
+    source = row[place[known]]
+    changed = {}
+    for name in ("scales", "quats_wxyz", "opacities", "colors"):
+        changed[name] = getattr(fresh, name).copy()
+        changed[name][known] = getattr(before, name)[source]
+    return replace(fresh, **changed)

@@ -1,0 +1,106 @@
+"""Lifts image features onto the Gaussians that an image shows, and fuses them over keyframes.
+
+Paper, Sec. "Open-vocabulary Semantic Association": per-pixel embeddings z_t(u) are lifted to 3D with the depth and
+attached to the Gaussian anchored there. Here each Gaussian collects them from every keyframe that sees it
+(``visibility``), those that the other keyframes contradict are left out (``fusion``), and an encoder that takes long is
+given only the keyframes that say the most (``choice``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import ConfigError, FrameError
+from ..core.progress import Progress
+from ..core.types import Frame, Gaussians
+from ..settings.registry import require_positive
+from .encoders.base import Encoder
+from .feature_fusion import FeatureFusion
+from .keyframe_choice import choose, sharpness
+from .visibility import seen
+
+
+@dataclass(frozen=True)
+class Options:
+    """Layer 3: what is known of the Gaussians in words."""
+
+    encoder: str = "colour"
+    """What turns images and words into features; "colour" needs no network and knows colour names only."""
+    keyframes: float = 1.0
+    """Keyframes that are encoded: up to 1 their share of all, above it their number. Fewer are chosen so that they are
+    sharp and together show the most surface; layer 3's time falls in proportion."""
+    visible_within: float = 0.02
+    """A Gaussian is seen if the depth image shows something within this many metres of it…"""
+    visible_share: float = 0.01
+    """…plus this share of its depth, plus its own standard deviation along the ray; otherwise it is hidden. Where
+    nothing was measured, the Gaussians' own rendered depth decides."""
+    near: float = 0.5
+    """Views count in proportion to 1 / depth^2, those nearer than this all the same, metres."""
+    border: float = 0.1
+    """Share of the image's height, from its edge inwards, over which views come to count in full: encoders see things
+    cut off there."""
+    disagreement: float | None = 0.6
+    """Regions of a view are left out that differ from what the other views say by more than this share of what two
+    random places of the scene differ by; null = none are."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "visible_within", "near", "keyframes", "disagreement")
+        if self.visible_share < 0:
+            raise ConfigError(f"'visible_share' must not be negative, got {self.visible_share}.")
+        if not 0 <= self.border <= 0.5:
+            raise ConfigError(f"'border' must be from 0 to 0.5, got {self.border}.")
+
+
+def lift(
+    gaussians: Gaussians,
+    frames: Sequence[Frame],
+    T_world_cam: NDArray[np.float64],
+    encoder: Encoder,
+    options: Options | None = None,
+    progress: Progress | None = None,
+) -> NDArray[np.float16]:
+    """(N, D) unit features of the Gaussians from some keyframes at their poses (K, 4, 4); zero where nothing is known.
+
+    A keyframe that cannot be encoded is left out, with a warning: the others see most of what it showed.
+    """
+    options, progress = options or Options(), progress or Progress()
+    fusion = FeatureFusion(len(gaussians), encoder.dimension, options.disagreement)
+    chosen = chosen_keyframes(gaussians, frames, T_world_cam, options)
+    progress.stage("language", len(chosen))
+    for done, row in enumerate(chosen, start=1):
+        frame = frames[row]
+        try:
+            features = _encoded(encoder, frame)
+        except FrameError as error:
+            progress.warn(str(error))
+        else:
+            fusion.add(seen(gaussians, frame, T_world_cam[row], options), features)
+        progress.advance(done)
+    return fusion.features()
+
+
+def _encoded(encoder: Encoder, frame: Frame) -> NDArray[np.float16]:
+    """The frame's features. Raises FrameError if they are not finite: a network in half precision may overflow."""
+    features = encoder.encode(frame)
+    if not np.isfinite(features).all():
+        raise FrameError(f"The encoder gives numbers that are not finite for frame {frame.index}: it is left out.")
+    return features
+
+
+def chosen_keyframes(
+    gaussians: Gaussians, frames: Sequence[Frame], T_world_cam: NDArray[np.float64], options: Options
+) -> list[int]:
+    """Rows of the keyframes that are encoded, ascending: as many as ``options.keyframes`` allows."""
+    count = len(frames)
+    most = max(1, round(options.keyframes * count)) if options.keyframes <= 1 else int(options.keyframes)
+    if most >= count:
+        return list(range(count))
+    views, sharp = [], []
+    for frame, T in zip(frames, T_world_cam, strict=True):
+        views.append(seen(gaussians, frame, T, options))
+        sharp.append(sharpness(frame.color))
+    return choose(views, sharp, len(gaussians), most)

@@ -1,0 +1,199 @@
+"""Fetches model packages, or checkpoints to make them of, from the Hugging Face hub.
+
+Every file is compared with the hub's hash before it gets its name, an interrupted download goes on where it stopped,
+and a package is whole or it is not there. Only ONNX, safetensors, JSON, YAML and plain text are fetched. The
+environment variable HF_ENDPOINT names another hub.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import ModelError
+from ..core.progress import Progress
+from . import model_packages
+
+NAMES = {
+    "clip-b16-openai": "timm/vit_base_patch16_clip_224.openai",
+    "clip-b16-laion": "laion/CLIP-ViT-B-16-laion2B-s34B-b88K",
+    "siglip-b16": "google/siglip-base-patch16-224",
+    "dino-b16": "facebook/dino-vitb16",
+    "dinov2-b14": "facebook/dinov2-base",
+    "sam-b": "facebook/sam-vit-base",
+}
+"""Short names of repositories whose checkpoints ``tools/export_encoder.py`` takes."""
+
+CHECKPOINTS = ".checkpoints"
+"""Folder in the models folder for what is not a package yet."""
+
+_CONFIGS = ("config.json", "open_clip_config.json", "preprocessor_config.json", "README.md")
+_WEIGHTS = ("open_clip_model.safetensors", "model.safetensors")
+_TIMEOUT_S = 15
+
+
+@dataclass(frozen=True)
+class _Remote:
+    """A file on the hub: its size in bytes, and its sha256, or else its git blob's sha1."""
+
+    name: str
+    size: int
+    sha256: str | None
+    blob: str | None
+
+    @property
+    def identity(self) -> str:
+        return (self.sha256 or self.blob or "")[:12]
+
+    def is_content_of(self, path: Path) -> bool:
+        if self.sha256:
+            return model_packages.sha256(path) == self.sha256
+        content = path.read_bytes()
+        return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest() == self.blob
+
+
+def pull(name: str, revision: str = "main", progress: Progress | None = None) -> Path:
+    """Fetch the repository OWNER/NAME, or one of NAMES, and return the folder that it is in: a package by its name in
+    the models folder, a checkpoint in its sub-folder CHECKPOINTS. What is there already, and whole, is not fetched.
+
+    Raises ModelError: no network, no such repository, nothing usable in it, or content that differs from its hash.
+    """
+    progress = progress or Progress()
+    repository = NAMES.get(name, name)
+    if not re.fullmatch(r"[\w.-]+/\w[\w.-]*", repository):
+        raise ModelError(
+            f"'{name}' is not OWNER/NAME of a repository on the hub{model_packages.nearest(name, NAMES)}; "
+            f"short names are {', '.join(NAMES)}."
+        )
+    local = name if name in NAMES else repository.split("/")[1]
+    remote = _listed(repository, revision)
+    manifest = next((remote[n] for n in model_packages.MANIFESTS if n in remote), None)
+    root = model_packages.models_folder() if manifest else model_packages.models_folder() / CHECKPOINTS
+    target, partial = root / local, root / f"{local}.partial"
+    if target.exists():
+        if manifest:
+            model_packages.verify(model_packages.read(target))
+        return target
+    try:
+        partial.mkdir(parents=True, exist_ok=True)
+        if manifest:
+            _fetch(repository, revision, manifest, partial, progress)
+            own = partial / manifest.name
+            package = model_packages.parse(model_packages.load_manifest(own), partial, own)
+            wanted = list(package.files)
+        else:
+            wanted = _checkpoint_files(repository, remote)
+        if lacking := [file for file in wanted if file not in remote]:
+            raise ModelError(f"{repository} lacks {', '.join(lacking)}, which its manifest lists.")
+        for file in wanted:
+            _fetch(repository, revision, remote[file], partial, progress)
+        if manifest:
+            model_packages.verify(model_packages.read(partial))
+        for rest in partial.glob("*.incomplete"):  # of another revision
+            rest.unlink()
+        partial.rename(target)
+    except OSError as error:
+        raise ModelError(f"Cannot write to {error.filename or partial}: {error.strerror}.") from error
+    return target
+
+
+def _checkpoint_files(repository: str, remote: dict[str, _Remote]) -> list[str]:
+    """Names of what an export needs of a checkpoint. Raises ModelError if its weights are not safetensors."""
+    weights = next((file for file in _WEIGHTS if file in remote), None)
+    if weights is None:
+        raise ModelError(
+            f"{repository} holds neither a model package ({model_packages.MANIFESTS[0]}) nor weights as "
+            "safetensors; other weights are not read, for they may run code."
+        )
+    words = ["tokenizer.json"] if "tokenizer.json" in remote else ["vocab.json", "merges.txt"]
+    return [file for file in (*_CONFIGS, *words, weights) if file in remote]
+
+
+def _endpoint() -> str:
+    return os.environ.get("HF_ENDPOINT", "https://huggingface.co").rstrip("/")
+
+
+def _listed(repository: str, revision: str) -> dict[str, _Remote]:
+    """The repository's files by name; those in sub-folders are left out."""
+    hub = _library()
+    try:
+        info = hub.HfApi(endpoint=_endpoint()).model_info(
+            repository, revision=revision, files_metadata=True, timeout=_TIMEOUT_S
+        )
+    except Exception as error:  # the library's transport, whose exceptions these are, changes with its versions
+        raise _told(error, repository, revision) from error
+    return {
+        file.rfilename: _Remote(file.rfilename, file.size or 0, file.lfs.sha256 if file.lfs else None, file.blob_id)
+        for file in info.siblings or []
+        if Path(file.rfilename).name == file.rfilename and not file.rfilename.startswith(".")
+    }
+
+
+def _fetch(repository: str, revision: str, remote: _Remote, folder: Path, progress: Progress) -> None:
+    """Bring one file to the folder, going on where an earlier download of the same content stopped."""
+    path = folder / remote.name
+    if path.is_file() and remote.is_content_of(path):
+        return
+    progress.stage(f"{remote.name} ({remote.size / 1e6:.1f} MB)")
+    hub = _library()
+    from huggingface_hub.file_download import http_get
+    from huggingface_hub.utils import build_hf_headers
+
+    incomplete = folder / f"{remote.name}.{remote.identity}.incomplete"
+    free = shutil.disk_usage(folder).free
+    if remote.size > free:
+        raise ModelError(f"{remote.name} needs {remote.size:,} bytes, of which {folder} has {free:,} free.")
+    with incomplete.open("ab") as stream:
+        done = stream.tell()
+        if done > remote.size:
+            done = 0
+            stream.truncate(0)
+        try:
+            url = hub.hf_hub_url(repository, remote.name, revision=revision, endpoint=_endpoint())
+            headers = build_hf_headers()
+            if done < remote.size:
+                http_get(url, stream, resume_size=done, headers=headers, expected_size=remote.size)
+        except OSError as error:
+            if error.filename is not None:  # ours, not the network's
+                raise
+            raise _told(error, repository, revision) from error
+        except Exception as error:
+            raise _told(error, repository, revision) from error
+    if not remote.is_content_of(incomplete):
+        incomplete.unlink()
+        raise ModelError(
+            f"{remote.name} of {repository} is not what the hub's hash says that it is: it was dropped; pull again."
+        )
+    incomplete.rename(path)
+
+
+def _library() -> Any:
+    try:
+        import huggingface_hub
+        from huggingface_hub.utils import logging
+    except ImportError as error:
+        raise ModelError("Pulling models needs huggingface_hub: pip install 'freeocc3d[models]'.") from error
+    logging.set_verbosity_error()  # what goes wrong is told here
+    return huggingface_hub
+
+
+def _told(error: Exception, repository: str, revision: str) -> ModelError:
+    """What went wrong between here and the hub, in one sentence."""
+    status = getattr(getattr(error, "response", None), "status_code", None)
+    if status in (401, 403, 404):
+        return ModelError(
+            f"{_endpoint()} has no repository {repository} with revision {revision} that anyone can read: check its "
+            "name, or log in with 'hf auth login'."
+        )
+    if status is not None:
+        return ModelError(f"{_endpoint()} answered {status} when asked for {repository}: try again later.")
+    said = " ".join(str(error).split())[:120] or type(error).__name__
+    return ModelError(
+        f"{repository} could not be fetched from {_endpoint()}: {said}. What is there already is kept: pull again once "
+        f"the network is back, or copy the model's folder to {model_packages.models_folder()}."
+    )

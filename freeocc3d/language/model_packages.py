@@ -1,0 +1,321 @@
+"""Model packages: a folder with a manifest, networks as ONNX files and a tokenizer, that an encoder is made of.
+
+    manifest.yaml (or .json)   what the package is, the parts it has, and the sha256 of every file
+    image.onnx  head.onnx  text.onnx  tokenizer.json   … by kind, see ``KINDS``
+
+``tools/export_encoder.py`` writes packages, ``freeocc3d models`` fetches, lists and verifies them. They lie in the
+models folder (the environment variable FREEOCC3D_MODELS, else ~/.cache/freeocc3d/models) or anywhere else. Nothing in
+a package is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ..core.errors import ModelError
+from ..core.onnx_session import load_session
+from ..settings.registry import nearest
+
+MANIFESTS = ("manifest.yaml", "manifest.json")
+FORMAT = 1
+SUFFIXES = (".onnx", ".safetensors", ".json", ".yaml")
+"""Of the files that a package may hold."""
+
+_LARGEST_MANIFEST = 1 << 20
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Names of the inputs and outputs that a part of a package must have; more outputs may be there."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+_TEXT = Graph(("tokens",), ("features",))
+
+KINDS: dict[str, dict[str, Graph]] = {
+    "clip": {
+        "image": Graph(("image",), ("queries", "keys", "values", "stream")),
+        "head": Graph(("mixed", "stream"), ("features", "reduced", "pooled")),
+        "text": _TEXT,
+    },
+    "dense": {"image": Graph(("image",), ("features",)), "text": _TEXT},
+    "masks": {"image": Graph(("image",), ("masks", "embeddings")), "text": _TEXT},
+    "backbone": {"image": Graph(("image",), ("features",))},
+    "sam": {
+        "image": Graph(("image",), ("features", "attention")),
+        "masks": Graph(("features", "points"), ("masks", "scores")),
+    },
+}
+"""Kind of package -> its networks. B images of H x W pixels; N = prefix tokens + h w patches, row by row.
+
+clip (CLIP and SigLIP): ``image`` (B, 3, H, W), normalised, runs up to the last block, and gives that block's
+``queries``, ``keys`` and ``values``, each (B, heads, N, d), and its residual ``stream`` (B, N, heads d). What attention
+makes of the values, ``mixed`` (B, N, heads d), goes into ``head``: ``features`` (B, N, D) with the block's residual and
+its feed-forward part, ``reduced`` (B, N, D) without both, ``pooled`` (B, D) the embedding of the whole image. ``text``:
+``tokens`` (T, L) int64 to ``features`` (T, D).
+dense: patch ``features`` (B, h, w, D) that are in the text's space already.
+masks: ``masks`` (B, Q, h, w) logits and ``embeddings`` (B, Q, D) in the text's space.
+backbone: patch ``features`` (B, h, w, C) of their own space.
+sam: ``features`` (B, C, h, w) and the last block's ``attention`` (B, h w, h w), mean over heads; ``masks`` takes
+``points`` (B, P, 2), x and y in the pixels of the input, and gives for each ``masks`` (B, P, 3, 4 h, 4 w) logits and
+``scores`` (B, P, 3), the network's own estimates of their IoU.
+"""
+
+
+@dataclass(frozen=True)
+class Package:
+    """A model package whose manifest has been read and found whole.
+
+    parts: part ("image", "text", "tokenizer"…) -> file name.  files: file name -> sha256.  dimension: D of features.
+    mean, std: (3,) of RGB in 0…1.  patch: edge of a patch in pixels.  input_size: edge in pixels of the images that it
+    was trained on.  prefix_tokens: tokens before those of the patches.  logit_scale: factor of the cosines in training,
+    one over the softmax temperature.
+    """
+
+    folder: Path
+    name: str
+    kind: str
+    dimension: int
+    precision: str
+    licence: str
+    source: str
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+    patch: int
+    input_size: int
+    prefix_tokens: int
+    logit_scale: float
+    parts: Mapping[str, str]
+    files: Mapping[str, str]
+
+    @property
+    def bytes(self) -> int:
+        """Size of its files."""
+        return sum((self.folder / name).stat().st_size for name in self.files)
+
+    @property
+    def text_sha256(self) -> str:
+        """What tells text sides apart: a hash of the text network's and the tokenizer's."""
+        own = "".join(self.files[self.parts[part]] for part in ("text", "tokenizer"))
+        return hashlib.sha256(own.encode()).hexdigest()
+
+    def file(self, part: str) -> Path:
+        """The part's file, its content checked. Raises ModelError."""
+        path = self.folder / self.parts[part]
+        found = sha256(path)
+        if found != self.files[self.parts[part]]:
+            raise ModelError(
+                f"{path} is damaged: its sha256 is {found[:12]}…, the manifest says "
+                f"{self.files[self.parts[part]][:12]}…: pull or export the model again."
+            )
+        return path
+
+    def session(self, part: str, device: str = "cpu") -> Any:
+        """The part's network, its inputs, outputs and dimension checked. Raises ModelError."""
+        path = self.file(part)
+        session = load_session(path, device)
+        expected = KINDS[self.kind][part]
+        inputs = [node.name for node in session.get_inputs()]
+        outputs = {node.name: node.shape for node in session.get_outputs()}
+        if sorted(inputs) != sorted(expected.inputs) or set(expected.outputs) - set(outputs):
+            raise ModelError(
+                f"{path} takes {', '.join(inputs)} and gives {', '.join(outputs)}; the {part} network of a "
+                f"'{self.kind}' model takes {', '.join(expected.inputs)} and gives {', '.join(expected.outputs)}: "
+                "export it again with tools/export_encoder.py."
+            )
+        for name in ("features", "reduced", "pooled", "embeddings") if "text" in self.parts else ():
+            if part == "image" and self.kind == "clip":
+                continue  # not yet in the text's space
+            last = (outputs.get(name) or [None])[-1]
+            if isinstance(last, int) and last != self.dimension:
+                raise ModelError(
+                    f"{path} gives {name} of {last} dimensions, the manifest says {self.dimension}: image and text "
+                    "networks must be of one model."
+                )
+        return session
+
+
+def models_folder() -> Path:
+    """Where packages are looked for by name."""
+    given = os.environ.get("FREEOCC3D_MODELS")
+    return Path(given) if given else Path.home() / ".cache" / "freeocc3d" / "models"
+
+
+def find(model: str, kinds: tuple[str, ...], option: str) -> Package:
+    """The package of one of ``kinds`` in the folder ``model``, or of that name in the models folder; ``option`` is the
+    key that named it. Raises ModelError."""
+    if not model:
+        raise ModelError(
+            f"{option} names no model: give the folder of one, or its name ({_known()}); "
+            "tools/export_encoder.py makes them, 'freeocc3d models pull' fetches them."
+        )
+    folder = Path(model).expanduser()
+    if not folder.is_dir():
+        if folder.name != model or not (models_folder() / model).is_dir():
+            close = nearest(model, (path.name for path in _folders()))
+            raise ModelError(f"There is no model '{model}'{close}, neither as a folder nor by name ({_known()}).")
+        folder = models_folder() / model
+    package = read(folder)
+    if package.kind not in kinds:
+        raise ModelError(f"{option} needs a model of kind {' or '.join(kinds)}; {folder} is of kind {package.kind}.")
+    return package
+
+
+def find_text(name: str, folder: str, text_sha256: str) -> Package:
+    """The package with that text side: in ``folder``, by its name, or by any other. Raises ModelError."""
+    for candidate in (Path(folder), models_folder() / Path(name).name, *_folders()):
+        try:
+            package = read(candidate)
+        except ModelError:
+            continue
+        if "text" in package.parts and package.text_sha256 == text_sha256:
+            return package
+    raise ModelError(
+        f"The words of this map need the text side of the model '{name}' ({text_sha256[:12]}…), which is neither in "
+        f"{folder} nor in {models_folder()}: copy its folder there, or map again with a model that is there."
+    )
+
+
+def installed() -> dict[str, Package | ModelError]:
+    """Name -> package in the models folder, or what is wrong with it."""
+    found: dict[str, Package | ModelError] = {}
+    for folder in _folders():
+        try:
+            found[folder.name] = read(folder)
+        except ModelError as error:
+            found[folder.name] = error
+    return found
+
+
+def verify(package: Package) -> None:
+    """Compare every file's content with the manifest's hash. Raises ModelError for the first that differs."""
+    by_file = {name: part for part, name in package.parts.items()}
+    for name in package.files:
+        package.file(by_file[name])
+
+
+def read(folder: Path) -> Package:
+    """The package in a folder: its manifest is checked, and that its files are there; not yet what is in them.
+
+    Raises ModelError.
+    """
+    if not folder.is_dir():
+        raise ModelError(f"There is no model folder {folder}.")
+    path = next((folder / name for name in MANIFESTS if (folder / name).is_file()), None)
+    if path is None:
+        raise ModelError(
+            f"{folder} is no model package: it lacks a {MANIFESTS[0]}; tools/export_encoder.py writes one."
+        )
+    package = parse(load_manifest(path), folder, path)
+    for name in package.files:
+        if not (folder / name).is_file():
+            raise ModelError(f"The model {folder} lacks its {name}: pull or export it again.")
+    return package
+
+
+def load_manifest(path: Path) -> Any:
+    """What a manifest file holds. Raises ModelError."""
+    try:
+        if path.stat().st_size > _LARGEST_MANIFEST:
+            raise ModelError(f"{path} is no manifest: it has more than a megabyte.")
+        text = path.read_text(encoding="utf-8")
+        return json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
+        raise ModelError(f"{path} cannot be read: {' '.join(str(error).split())}.") from error
+
+
+def parse(manifest: Any, folder: Path, path: Path) -> Package:
+    """The package that a manifest describes; ``path`` is named in errors. Raises ModelError."""
+
+    def refuse(why: str) -> ModelError:
+        return ModelError(f"{path} is no usable manifest: {why}.")
+
+    def get(key: str, kind: type, default: Any = None) -> Any:
+        value = manifest.get(key, default)
+        value = float(value) if kind is float and isinstance(value, int) else value
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise refuse(f"'{key}' is missing or not a {kind.__name__}")
+        return value
+
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise refuse(f"it must state format: {FORMAT}")
+    kind = get("kind", str)
+    if kind not in KINDS:
+        raise refuse(f"kind '{kind}' is not one of {', '.join(KINDS)}")
+    parts, files = get("parts", dict), get("files", dict)
+    needed = {*KINDS[kind], *(["tokenizer"] if "text" in KINDS[kind] else [])}
+    if lacking := sorted(needed - set(parts)):
+        raise refuse(f"'parts' lacks {', '.join(lacking)}")
+    for name, digest in files.items():
+        if not isinstance(name, str) or Path(name).name != name or name.startswith(".") or "\\" in name:
+            raise refuse(f"'{name}' is not the plain name of a file in its folder")
+        if not name.endswith(SUFFIXES):
+            raise refuse(f"'{name}' is not a file of {', '.join(SUFFIXES)}")
+        if not isinstance(digest, str) or len(digest) != 64 or set(digest) - set("0123456789abcdef"):
+            raise refuse(f"the sha256 of '{name}' is not 64 hexadecimal digits")
+    if sorted(map(str, parts.values())) != sorted(files):
+        raise refuse("'parts' and 'files' must name the same files")
+    mean, std = (get(key, list) for key in ("mean", "std"))
+    if any(len(values) != 3 or not all(isinstance(v, int | float) for v in values) for values in (mean, std)):
+        raise refuse("'mean' and 'std' must be three numbers")
+    if not all(math.isfinite(v) for v in (*mean, *std)):
+        raise refuse("'mean' and 'std' must be finite")
+    dimension, patch, input_size = (get(key, int) for key in ("dimension", "patch", "input_size"))
+    prefix_tokens, logit_scale = get("prefix_tokens", int, 0), get("logit_scale", float, 100.0)
+    if min(dimension, patch, input_size, *std, logit_scale) <= 0 or max(dimension, input_size) > 1 << 16:
+        raise refuse("'dimension', 'patch', 'input_size', 'std' and 'logit_scale' must be greater than 0, and usual")
+    if prefix_tokens < 0 or input_size < patch:
+        raise refuse("'prefix_tokens' must not be negative, nor 'input_size' less than 'patch'")
+    return Package(
+        folder=folder,
+        name=get("name", str),
+        kind=kind,
+        dimension=dimension,
+        precision=get("precision", str),
+        licence=get("licence", str),
+        source=get("source", str),
+        mean=tuple(float(v) for v in mean),
+        std=tuple(float(v) for v in std),
+        patch=patch,
+        input_size=input_size,
+        prefix_tokens=prefix_tokens,
+        logit_scale=logit_scale,
+        parts=parts,
+        files=files,
+    )
+
+
+def sha256(path: Path) -> str:
+    """Hexadecimal digest of a file's content. Raises ModelError."""
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as stream:
+            while chunk := stream.read(_CHUNK):
+                digest.update(chunk)
+    except OSError as error:
+        raise ModelError(f"Cannot read {path}: {error.strerror}.") from error
+    return digest.hexdigest()
+
+
+def _folders() -> list[Path]:
+    root = models_folder()
+    if not root.is_dir():
+        return []
+    return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith(".") and p.suffix != ".partial")
+
+
+def _known() -> str:
+    names = ", ".join(path.name for path in _folders())
+    return f"in {models_folder()} there are: {names}" if names else f"there are none in {models_folder()} yet"

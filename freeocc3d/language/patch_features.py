@@ -1,0 +1,112 @@
+"""From a frame to the images that a ViT takes, and from its patches back to the frame: resizing, windows, splicing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .model_packages import Package
+
+_BATCH_PATCHES = 4096
+"""Of windows that are encoded at once, so that memory does not grow with the frame."""
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """A frame as (rows, columns) patches, and the windows of (h, w) patches that cover them.
+
+    patch: edge of a patch in pixels.  tops, lefts: first patch row and column of the windows.
+    """
+
+    grid: tuple[int, int]
+    window: tuple[int, int]
+    tops: tuple[int, ...]
+    lefts: tuple[int, ...]
+    patch: int
+
+    @classmethod
+    def of(cls, height: int, width: int, package: Package, short_side: int, window: int) -> Tiling:
+        """Of a frame that is resized to ``short_side`` pixels; windows of at most ``window`` pixels (0 = the whole
+        frame) that overlap by half."""
+        scale = short_side / min(height, width)
+        rows, columns = (max(1, round(size * scale / package.patch)) for size in (height, width))
+        most = max(1, window // package.patch) if window else max(rows, columns)
+        h, w = min(most, rows), min(most, columns)
+        return cls((rows, columns), (h, w), _starts(rows, h), _starts(columns, w), package.patch)
+
+    def image(self, rgb: NDArray[np.uint8], mean: tuple[float, ...], std: tuple[float, ...]) -> NDArray[np.float32]:
+        """(3, rows patch, columns patch) the frame resized, and normalised as the network wants it."""
+        rows, columns = self.grid
+        size = columns * self.patch, rows * self.patch
+        shrinks = size[0] < rgb.shape[1]
+        resized = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+        normal = (resized.astype(np.float32) / np.float32(255) - np.array(mean, np.float32)) / np.array(std, np.float32)
+        return np.ascontiguousarray(normal.transpose(2, 0, 1))
+
+    def windows(self, image: NDArray[np.float32]) -> Iterator[tuple[NDArray[np.float32], list[tuple[int, int]]]]:
+        """Batches (B, 3, h patch, w patch) of windows of an image, with their first patch rows and columns."""
+        corners = [(top, left) for top in self.tops for left in self.lefts]
+        (h, w), patch = self.window, self.patch
+        at_once = max(1, _BATCH_PATCHES // (h * w))
+        for start in range(0, len(corners), at_once):
+            own = corners[start : start + at_once]
+            crops = [image[:, t * patch : (t + h) * patch, left * patch : (left + w) * patch] for t, left in own]
+            yield np.stack(crops), own
+
+
+class Splice:
+    """The mean over windows of what each says of the patches that it covers."""
+
+    def __init__(self, tiling: Tiling, dimension: int):
+        self.tiling = tiling
+        self._sum = np.zeros((*tiling.grid, dimension), np.float32)
+        self._count = np.zeros(tiling.grid, np.float32)
+
+    def add(self, features: NDArray[np.float32], corners: list[tuple[int, int]]) -> None:
+        """Take (B, h, w, C) features of windows in."""
+        h, w = self.tiling.window
+        for own, (top, left) in zip(features, corners, strict=True):
+            self._sum[top : top + h, left : left + w] += own
+            self._count[top : top + h, left : left + w] += 1
+
+    def mean(self) -> NDArray[np.float32]:
+        """(rows, columns, C)."""
+        return self._sum / self._count[..., None]
+
+
+def finished(patches: NDArray[np.float32], rgb: NDArray[np.uint8], stride: int) -> NDArray[np.float16]:
+    """Unit features (rows, columns, D) of patches as an encoder gives them: upsampled along the edges of the frame's
+    (H, W, 3) pixels, one feature every ``stride`` of them; 0 = as they are."""
+    if stride == 0:
+        return patches.astype(np.float16)
+    from .guided_upsampling import upsample
+
+    return upsample(patches, rgb, stride)
+
+
+def resampled(features: NDArray[np.float32], grid: tuple[int, int]) -> NDArray[np.float32]:
+    """(h, w, C) features at the cells of another grid that covers the same, linearly in between."""
+    rows, columns = (_linear(own, wanted) for own, wanted in zip(features.shape[:2], grid, strict=True))
+    return np.asarray(np.einsum("ri,cj,ijk->rck", rows, columns, features, optimize=True), np.float32)
+
+
+def _linear(own: int, wanted: int) -> NDArray[np.float32]:
+    """(wanted, own) weights of linear interpolation between the centres of cells; constant beyond the outermost."""
+    at = np.clip((np.arange(wanted) + 0.5) * own / wanted - 0.5, 0, own - 1)
+    return np.maximum(1 - np.abs(at[:, None] - np.arange(own)), 0).astype(np.float32)
+
+
+def unit(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(..., D) of unit length; zeros stay."""
+    norms = np.linalg.norm(features, axis=-1, keepdims=True)
+    return np.asarray(features / np.where(norms > 0, norms, 1), np.float32)
+
+
+def _starts(length: int, window: int) -> tuple[int, ...]:
+    """Where windows begin that cover ``length``, half of one apart, the last ending with it."""
+    step = max(1, window // 2)
+    return (*range(0, length - window, step), length - window)

@@ -1,0 +1,181 @@
+"""The word side of an encoder whose text network is a part of a model package.
+
+Restored from what a map saved, it finds the package again by its content, not by trust in a path. onnxruntime and
+tokenizers are imported when a word is encoded for the first time ever: embeddings are kept on disk, and a repeated
+query needs neither.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import ConfigError, MapError, ModelError
+from . import model_packages
+from .encoders.base import TextEncoder, TextFeatures
+
+TEMPLATES = ("a photo of a {}.", "a photo of the {} in a room.", "there is a {} in the scene.", "a bad photo of a {}.",
+             "a photo of a small {}.", "a photo of a large {}.", "{}")  # fmt: skip
+"""Prompts whose mean stands for a word: the form of CLIP's own ensemble, for things in rooms."""
+
+CONTRAST = (
+    "wall", "floor", "ceiling", "door", "window", "table", "chair", "sofa", "bed", "cabinet", "shelf", "desk",
+    "curtain", "lamp", "picture", "plant", "pillow", "television", "sink", "toilet", "object", "things", "stuff",
+    "texture",
+)  # fmt: skip
+"""What a voxel could be instead: what most rooms hold, and LERF's "canonical" words."""
+
+_KEPT = 4096  # embeddings that a cache file holds, the latest
+_LONGEST = 200  # characters of a word that is worth keeping
+_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Wording:
+    """How words become prompts, and what they compete with."""
+
+    templates: tuple[str, ...] = TEMPLATES
+    contrast: tuple[str, ...] = CONTRAST
+    threshold: float = 0.0
+
+    def check(self) -> None:
+        """Raises ConfigError for templates without a place for the word."""
+        if not self.templates or any("{}" not in template for template in self.templates):
+            raise ConfigError("'templates' must each hold {}, where the word goes.")
+        if any(not word.strip() for word in self.contrast):
+            raise ConfigError("'contrast' must not hold empty words.")
+
+    def state(self, package: model_packages.Package) -> dict[str, Any]:
+        """What ``ModelWords`` is restored from."""
+        return {
+            "model": package.name,
+            "folder": str(package.folder.resolve()),
+            "text_sha256": package.text_sha256,
+            "dimension": package.dimension,
+            "temperature": 1.0 / package.logit_scale,
+            "templates": list(self.templates),
+            "contrast": list(self.contrast),
+            "threshold": self.threshold,
+        }
+
+
+class ModelWords(TextEncoder):
+    """Any words; those that it was never trained on come out somewhere all the same."""
+
+    open_vocabulary = True
+    knows = "words in the language of its text network"
+
+    def __init__(self, state: dict[str, Any]):
+        try:
+            self.threshold, self.temperature = float(state["threshold"]), float(state["temperature"])
+            self._dimension = int(state["dimension"])
+            self._templates = [str(template) for template in state["templates"]]
+            self._contrast = [str(word) for word in state["contrast"]]
+            self._model, self._folder, self._sha256 = (str(state[k]) for k in ("model", "folder", "text_sha256"))
+        except (KeyError, TypeError, ValueError) as error:
+            raise MapError(f"The map's encoder is damaged: its state lacks a usable {error}.") from error
+        key = hashlib.sha256("\n".join((self._sha256, *self._templates)).encode()).hexdigest()[:32]
+        self._cache = model_packages.models_folder() / ".embeddings" / f"{key}.npz"
+        self._known: dict[str, NDArray[np.float32]] | None = None
+        self._text: TextNetwork | None = None
+
+    def contrast_words(self) -> list[str]:
+        return self._contrast
+
+    def encode_words(self, words: list[str]) -> TextFeatures:
+        """(W, D) unit means of the prompts' embeddings. Raises ModelError if the text side cannot be found."""
+        plain = [" ".join(word.lower().split()) for word in words]
+        if self._known is None:
+            self._known = _read_cache(self._cache, self._dimension)
+        new = [word for word in dict.fromkeys(plain) if word and word not in self._known]
+        if new:
+            if self._text is None:
+                package = model_packages.find_text(self._model, self._folder, self._sha256)
+                self._text = TextNetwork(package)
+                if package.dimension != self._dimension:
+                    raise ModelError(
+                        f"The text side of {package.folder} has {package.dimension} dimensions, the map's features "
+                        f"{self._dimension}: map again."
+                    )
+            prompts = [template.replace("{}", word) for word in new for template in self._templates]
+            embedded = self._text.embed(prompts).reshape(len(new), len(self._templates), -1).mean(axis=1)
+            embedded /= np.linalg.norm(embedded, axis=1, keepdims=True)
+            self._known.update(zip(new, embedded, strict=True))
+            _write_cache(self._cache, self._known)
+        empty = np.zeros(self._dimension, np.float32)
+        features = [self._known[word] if word else empty for word in plain]
+        return TextFeatures(np.array(features, np.float32).reshape(len(words), self._dimension), tuple(plain))
+
+
+class TextNetwork:
+    """A package's text network with its tokenizer. Raises ModelError for files that do not fit."""
+
+    def __init__(self, package: model_packages.Package):
+        try:
+            from tokenizers import Tokenizer
+        except ImportError as error:
+            raise ModelError("Encoding words needs the package tokenizers: pip install 'freeocc3d[models]'.") from error
+        path = package.file("tokenizer")
+        try:
+            self._tokenizer = Tokenizer.from_file(str(path))
+        except Exception as error:  # tokenizers raises bare Exceptions
+            raise ModelError(f"{path} is not a tokenizer.json: {' '.join(str(error).split())}.") from error
+        self._package = package
+        self._session = package.session("text")
+
+    def tokens(self, texts: list[str]) -> NDArray[np.int64]:
+        """(T, L) token numbers; the tokenizer file says how texts are cut and padded."""
+        rows = [encoding.ids for encoding in self._tokenizer.encode_batch(texts)]
+        if len({len(row) for row in rows}) > 1:
+            raise ModelError(
+                f"{self._package.folder}/{self._package.parts['tokenizer']} does not pad: export it again."
+            )
+        return np.array(rows, np.int64)
+
+    def embed(self, texts: list[str]) -> NDArray[np.float32]:
+        """(T, D) unit embeddings."""
+        parts = []
+        for start in range(0, len(texts), _AT_ONCE):
+            (features,) = self._session.run(["features"], {"tokens": self.tokens(texts[start : start + _AT_ONCE])})
+            parts.append(features / np.linalg.norm(features, axis=1, keepdims=True))
+        features = np.concatenate(parts).astype(np.float32)
+        if features.shape[1] != self._package.dimension or not np.isfinite(features).all():
+            raise ModelError(
+                f"The text network of {self._package.folder} gives {features.shape[1]} dimensions or numbers that are "
+                f"not finite; its manifest says {self._package.dimension} dimensions."
+            )
+        return features
+
+
+def _read_cache(path: Path, dimension: int) -> dict[str, NDArray[np.float32]]:
+    """Embeddings by word; a file that cannot be used counts as none."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            words, features = arrays["words"], arrays["features"]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return {}
+    fit = words.dtype.kind == "U" and words.ndim == 1 and features.shape == (len(words), dimension)
+    if not fit or features.dtype != np.float32 or not np.isfinite(features).all():
+        return {}
+    return dict(zip(words.tolist(), features, strict=True))
+
+
+def _write_cache(path: Path, known: dict[str, NDArray[np.float32]]) -> None:
+    """Keep embeddings for later processes; where that is not possible, they are computed again."""
+    kept = [word for word in list(known)[-_KEPT:] if len(word) <= _LONGEST]
+    temporary = path.with_name(f"{path.stem}.{os.getpid()}.tmp.npz")
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            np.savez(temporary, words=np.array(kept, dtype=str), features=np.array([known[word] for word in kept]))
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)

@@ -1,0 +1,82 @@
+"""Connected components of very many voxels, compiled: neighbours are looked up in blocks of 8 x 8 x 8."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ..core.hash_table import build_table, find
+from ..core.types import BLOCK
+from .voxel_blocks import pack, packed_key, unpack
+
+_VOXELS = BLOCK**3
+SPARSEST = 16
+"""Voxels in a block on average, at least: fewer would waste memory, 2 KB a block."""
+
+
+def connected(voxels: NDArray[np.int32]) -> NDArray[np.int32] | None:
+    """(V,) component number of each of (V, 3) distinct voxels, in the order in which the components come first; voxels
+    that share a face, edge or corner are connected. None for voxels that lie too far apart for this way."""
+    packed = pack(voxels >> 3)
+    starts = np.flatnonzero(np.diff(packed, prepend=packed[:1] - 1))  # a map's voxels come block by block
+    blocks = np.unique(packed[starts])
+    if len(voxels) < SPARSEST * len(blocks):
+        return None
+    table, rows = build_table(blocks, len(blocks))
+    return np.asarray(_connected(voxels, packed, unpack(blocks), table, rows))
+
+
+@njit(cache=True)
+def _root(parent: NDArray[np.int32], voxel: int) -> int:
+    while parent[voxel] != voxel:
+        parent[voxel] = parent[parent[voxel]]
+        voxel = parent[voxel]
+    return voxel
+
+
+@njit(cache=True)
+def _connected(
+    voxels: NDArray[np.int32],
+    packed: NDArray[np.int64],
+    keys: NDArray[np.int32],
+    table: NDArray[np.int64],
+    rows: NDArray[np.int32],
+) -> NDArray[np.int32]:
+    at = np.full((len(keys), _VOXELS), np.int32(-1), np.int32)  # row of each voxel that there is
+    block, last = 0, np.int64(-1)
+    for n in range(len(voxels)):
+        if packed[n] != last:
+            block, last = find(table, rows, packed[n]), packed[n]
+        at[block, ((voxels[n, 0] & 7) * BLOCK + (voxels[n, 1] & 7)) * BLOCK + (voxels[n, 2] & 7)] = n
+    parent = np.arange(len(voxels)).astype(np.int32)
+    near = np.empty(27, np.int32)  # rows of the block's neighbours, itself in the middle
+    for b in range(len(keys)):
+        for side in range(27):
+            i, j, k = side // 9 - 1, side // 3 % 3 - 1, side % 3 - 1
+            near[side] = find(table, rows, packed_key(keys[b, 0] + i, keys[b, 1] + j, keys[b, 2] + k))
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                for k in range(BLOCK):
+                    here = at[b, (i * BLOCK + j) * BLOCK + k]
+                    if here < 0:
+                        continue
+                    for step in range(14, 27):  # half of the neighbours: the others look this way
+                        x, y, z = i + step // 9 - 1, j + step // 3 % 3 - 1, k + step % 3 - 1
+                        side = near[((x >> 3) + 1) * 9 + ((y >> 3) + 1) * 3 + (z >> 3) + 1]
+                        if side < 0:
+                            continue
+                        there = at[side, ((x & 7) * BLOCK + (y & 7)) * BLOCK + (z & 7)]
+                        if there >= 0:
+                            a, c = _root(parent, here), _root(parent, there)
+                            parent[max(a, c)] = min(a, c)
+    number = np.empty(len(voxels), np.int32)
+    count = 0
+    for n in range(len(voxels)):  # a root is the first of its component
+        root = _root(parent, n)
+        if root == n:
+            number[n] = count
+            count += 1
+        else:
+            number[n] = number[root]
+    return number

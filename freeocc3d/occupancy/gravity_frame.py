@@ -1,0 +1,140 @@
+"""The frame that robots plan in: z up, the floor at z = 0, the walls along x and y."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ..core.transforms import invert
+from ..core.types import Gaussians
+from .up_direction import estimate_up
+
+_SAMPLES = 20_000
+_NEIGHBOURS = 24
+_FLAT = 0.3  # thickness of flat surroundings over their width
+_LEVEL = np.cos(np.deg2rad(20.0))  # a normal within this of up belongs to a level surface
+_UPRIGHT = np.sin(np.deg2rad(15.0))  # … and below this to a wall
+_BIN = 0.02  # metres
+_FLOOR_SHARE = 0.25  # of the largest level surface below the cameras: less is not a floor
+_BAND = (0.08, 0.05, 0.03)  # metres around the floor within which it is fitted, in turn
+_LARGEST_TURN = np.deg2rad(3.0)
+_EXTENT = 0.5  # metres: standard deviation of a floor's points along its narrow side; a smaller one says no tilt
+
+
+def gravity_frame(T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> NDArray[np.float64]:
+    """(4, 4) rigid ``T_gravity_map``: z up, z = 0 on the floor, x along the walls in the direction that is nearest to
+    where the first camera looked, x = y = 0 below that camera.
+
+    T_map_cam: (K, 4, 4) poses of the keyframes. The floor is the lowest of the large level surfaces below the cameras;
+    without one, z = 0 is the level of the lowest surface points. Without walls, x is where the first camera looked.
+    """
+    if len(T_map_cam) == 0:
+        T_map_cam = np.eye(4)[None]
+    up = estimate_up(T_map_cam, gaussians.means)
+    points, normals = _planes(gaussians.means)
+    cameras = T_map_cam[:, :3, 3]
+    level = points[np.abs(normals @ up) > _LEVEL]
+    height = floor_height(level @ up, float(np.median(cameras @ up)))
+    if height is None:
+        lowest = gaussians.means @ up.astype(np.float32) if len(gaussians) else cameras @ up
+        height = float(np.percentile(lowest, 1))
+    else:
+        up, height = _fitted(up, height, level)
+    x = _along_walls(up, T_map_cam[0, :3, 2], -T_map_cam[0, :3, 1], normals)
+    R = np.stack((x, np.cross(up, x), up))
+    T_gravity_map = np.eye(4)
+    T_gravity_map[:3, :3] = R
+    T_gravity_map[:3, 3] = (*(-R[:2] @ cameras[0]), -height)
+    return T_gravity_map
+
+
+def floor_seen(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> bool:
+    """Whether z = 0 of ``gravity_frame`` is a floor, and not just the lowest that there is."""
+    points, normals = _planes(gaussians.means)
+    up = T_gravity_map[2, :3]
+    level = (points @ up + T_gravity_map[2, 3])[np.abs(normals @ up) > _LEVEL]
+    cameras = T_map_cam[:, :3, 3] @ up + T_gravity_map[2, 3]
+    height = floor_height(level, float(np.median(cameras))) if len(cameras) else None
+    return height is not None and abs(height) < 2 * _BAND[0]
+
+
+def first_camera_frame(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) rigid ``T_first_map``: z up, the origin at the centre of the camera ``T_map_cam`` (4, 4), x where it
+    looked, as robots take the place that they start from."""
+    T_gravity_cam = T_gravity_map @ T_map_cam
+    x = _heading(np.array((0.0, 0.0, 1.0)), T_gravity_cam[:3, 2], -T_gravity_cam[:3, 1])
+    T_gravity_first = np.eye(4)
+    T_gravity_first[:3, :3] = np.stack((x, (-x[1], x[0], 0.0), (0.0, 0.0, 1.0)), axis=1)
+    T_gravity_first[:3, 3] = T_gravity_cam[:3, 3]
+    return np.asarray(invert(T_gravity_first) @ T_gravity_map)
+
+
+def floor_height(heights: NDArray[np.float64], camera_height: float) -> float | None:
+    """The height of the floor from (N,) heights of points on level surfaces: of the peaks of their histogram below the
+    cameras, the lowest that has a quarter of the largest one's points; None without points there."""
+    below = heights[heights < camera_height - 0.2]
+    if not len(below):
+        return None
+    low = float(below.min())
+    count = np.bincount(((below - low) / _BIN).astype(np.int64), minlength=3).astype(np.float64)
+    smooth = np.convolve(count, (0.25, 0.5, 1.0, 0.5, 0.25), "same")
+    padded = np.pad(smooth, 1)
+    is_peak = (smooth >= padded[:-2]) & (smooth >= padded[2:]) & (smooth >= _FLOOR_SHARE * smooth.max())
+    return low + (int(np.flatnonzero(is_peak)[0]) + 0.5) * _BIN
+
+
+def _fitted(up: NDArray[np.float64], height: float, level: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Up and the floor's height after a least-squares plane through the points near the floor, in ever narrower bands;
+    up as it is where these points do not spread over both directions or would turn it by more than 3 degrees."""
+    normal = up
+    for band in _BAND:
+        near = level[np.abs(level @ normal - height) < band]
+        if len(near) < 10:
+            return up, height
+        center = near.mean(axis=0)
+        spread, axes = np.linalg.eigh(np.cov((near - center).T))
+        fitted = axes[:, 0] * np.sign(axes[:, 0] @ up)
+        if spread[1] > _EXTENT**2 and fitted @ up > np.cos(_LARGEST_TURN):
+            normal = fitted
+        height = float(center @ normal)
+    return normal, height
+
+
+def _along_walls(
+    up: NDArray[np.float64], forward: NDArray[np.float64], above: NDArray[np.float64], normals: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(3,) level unit vector along or across the walls: where the walls' normals, folded into a quarter turn, pile up
+    most; of the four directions, the one nearest to ``forward``."""
+    x = _heading(up, forward, above)
+    walls = normals[np.abs(normals @ up) < _UPRIGHT]
+    if not len(walls):
+        return x
+    quarter = np.degrees(np.arctan2(walls @ np.cross(up, x), walls @ x)) % 90.0
+    count = np.bincount(quarter.astype(np.int64) % 90, minlength=90)
+    piled = sum(np.roll(count, shift) for shift in range(-2, 3))
+    peak = int(np.argmax(piled)) + 0.5
+    off = (quarter - peak + 45.0) % 90.0 - 45.0
+    turn = np.deg2rad((peak + float(np.median(off[np.abs(off) < 3.0])) + 45.0) % 90.0 - 45.0)
+    return np.asarray(np.cos(turn) * x + np.sin(turn) * np.cross(up, x))
+
+
+def _heading(up: NDArray[np.float64], forward: NDArray[np.float64], above: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) level unit vector where a camera looks; of one that looks straight down or up, where its image's top or
+    bottom edge is."""
+    looks = forward if abs(forward @ up) < 0.95 else above * -np.sign(forward @ up)
+    flat = looks - (looks @ up) * up
+    return np.asarray(flat / np.linalg.norm(flat))
+
+
+def _planes(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(P, 3) some of the points, evenly spread over storage, that lie on something flat, and the (P, 3) normals of
+    planes through their neighbours. Gaussians have none of their own: by default they are spheres."""
+    if len(means) < _NEIGHBOURS:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    points = means[:: max(1, len(means) // _SAMPLES)].astype(np.float64)
+    near = means[KDTree(means).query(points, _NEIGHBOURS)[1]].astype(np.float64)
+    off = near - near.mean(axis=1, keepdims=True)
+    spread, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", off, off))
+    flat = spread[:, 0] < _FLAT**2 * spread[:, 1]
+    return points[flat], axes[flat, :, 0]

@@ -1,0 +1,83 @@
+"""The projection written out in plain NumPy and SciPy, every pair evaluated: what ``splat`` is tested against."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.transforms import quats_to_rotations
+from ..core.types import Gaussians
+from .splat import Options
+
+
+def contributions(
+    gaussians: Gaussians, points: NDArray[np.float64], options: Options, least_scale: float = 0.0
+) -> NDArray[np.float64]:
+    """(P, N) c_k at voxels whose centres are the (P, 3) world points; cutoff included, except for "released", whose
+    neighbourhood is a box of the lattice: there it is all space. least_scale: s_min, which those two do without."""
+    if options.projection == "integrated":
+        return _masses(gaussians, points, options)
+    o = gaussians.opacities.astype(np.float64)
+    if options.projection == "released":
+        R = quats_to_rotations(gaussians.quats_wxyz.astype(np.float64))
+        offset = points[:, None] - gaussians.means.astype(np.float64)[None]
+        squared = ((np.einsum("pni,nij->pnj", offset, R) * gaussians.scales) ** 2).sum(axis=2)
+        return np.asarray(1 - np.exp(-o * np.exp(-0.5 * squared)))
+    wide = replace(gaussians, scales=np.maximum(gaussians.scales, least_scale))
+    squared = _squared_distances(wide, points)
+    volumes = (g.scales.astype(np.float64).prod(axis=1) for g in (gaussians, wide))
+    phi = np.where(squared <= options.cutoff**2, np.exp(-0.5 * squared), 0.0) * np.divide(*volumes) ** (2 / 3)
+    return phi if options.projection == "probabilistic" else np.asarray(1 - np.exp(-o * phi))
+
+
+def probability(
+    gaussians: Gaussians, points: NDArray[np.float64], options: Options, least_scale: float = 0.0
+) -> NDArray[np.float64]:
+    """(P,) alpha of voxels, given by their centres: equation (B)."""
+    return np.asarray(1.0 - np.prod(1.0 - contributions(gaussians, points, options, least_scale), axis=1))
+
+
+def posterior_mean(
+    gaussians: Gaussians, points: NDArray[np.float64], values: NDArray[np.floating], options: Options
+) -> NDArray[np.float64]:
+    """(P, D) posterior expectation of values (N, D) at voxels, given by their centres: equations (C) and (D)."""
+    o = gaussians.opacities.astype(np.float64)
+    if options.projection == "integrated":
+        weight = contributions(gaussians, points, options) * o
+    elif options.projection == "released":
+        weight = -np.log(1 - contributions(gaussians, points, options))
+    else:
+        squared = _squared_distances(gaussians, points)
+        density = np.exp(-0.5 * squared) / gaussians.scales.astype(np.float64).prod(axis=1)
+        weight = np.where(squared <= options.cutoff**2, density, 0.0) * o
+    total = weight.sum(axis=1, keepdims=True)
+    return np.asarray((weight / np.where(total > 0, total, 1.0)) @ values)
+
+
+def _squared_distances(gaussians: Gaussians, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P, N) squared Mahalanobis distances."""
+    R = quats_to_rotations(gaussians.quats_wxyz.astype(np.float64))
+    offset = points[:, None] - gaussians.means.astype(np.float64)[None]
+    along_axes = np.einsum("pni,nij->pnj", offset, R) / gaussians.scales.astype(np.float64)
+    return np.asarray((along_axes**2).sum(axis=2))
+
+
+def _masses(gaussians: Gaussians, points: NDArray[np.float64], options: Options) -> NDArray[np.float64]:
+    """(P, N) mass of each Gaussian in the voxel around each point, by SciPy's quadrature; 0 where the voxel does not
+    touch the Gaussian's bounding box at the cutoff."""
+    from scipy.stats import multivariate_normal
+
+    half = 0.5 * options.voxel_size
+    masses = np.zeros((len(points), len(gaussians)))
+    R = quats_to_rotations(gaussians.quats_wxyz.astype(np.float64))
+    for n in range(len(gaussians)):
+        mean, axes = gaussians.means[n].astype(np.float64), R[n] * gaussians.scales[n].astype(np.float64)
+        covariance = axes @ axes.T
+        near = (np.abs(points - mean) <= half + options.cutoff * np.sqrt(np.diag(covariance))).all(axis=1)
+        for p in np.flatnonzero(near):
+            masses[p, n] = multivariate_normal.cdf(
+                points[p] + half, mean, covariance, lower_limit=points[p] - half, abseps=1e-6, releps=1e-6
+            )
+    return masses

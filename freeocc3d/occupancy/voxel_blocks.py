@@ -1,0 +1,97 @@
+"""Sparse blocks of 8 x 8 x 8 voxels: which exist, and where a block is found."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ..core.hash_table import put
+from ..core.types import BLOCK
+from ..core.voxel_keys import packed_voxels, unpacked_voxels
+
+KEY_LIMIT = 1 << 20
+"""Block indices lie in [-KEY_LIMIT, KEY_LIMIT) along each axis. Single precision of positions ends far earlier: a
+kilometre from the origin it costs tenths of a millimetre."""
+
+
+pack, unpack = packed_voxels, unpacked_voxels
+"""(B, 3) block indices to (B,) integers and back."""
+
+
+def union(*packed: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Ascending unique packed keys of all arguments."""
+    return np.unique(np.concatenate(packed)) if packed else np.zeros(0, np.int64)
+
+
+def blocks_along_rays(
+    points_world: NDArray[np.floating],
+    center_world: NDArray[np.floating],
+    origin: NDArray[np.float64],
+    voxel_size: float,
+) -> NDArray[np.int64]:
+    """Ascending packed keys of all blocks that the segments from a camera's centre to (P, 3) points pass through."""
+    edge = BLOCK * voxel_size
+    ends = (np.asarray(points_world, np.float64) - origin) / edge
+    return np.sort(_walked((np.asarray(center_world, np.float64) - origin) / edge, ends))
+
+
+@njit(cache=True)
+def packed_key(i: int, j: int, k: int) -> int:
+    """``pack`` for one block index."""
+    return ((i + KEY_LIMIT) << 42) | ((j + KEY_LIMIT) << 21) | (k + KEY_LIMIT)
+
+
+@njit(cache=True, nogil=True)
+def touched_blocks(lo: NDArray[np.int32], hi: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Distinct packed keys of the blocks that boxes of voxels, (N, 3) first and last index, touch; empty boxes
+    (lo > hi) touch none."""
+    table = np.full(1024, -1, np.int64)
+    count = 0
+    last = np.int64(-1)  # neighbours in memory are mostly neighbours in space
+    for g in range(len(lo)):
+        if lo[g, 0] > hi[g, 0] or lo[g, 1] > hi[g, 1] or lo[g, 2] > hi[g, 2]:
+            continue
+        for i in range(lo[g, 0] >> 3, (hi[g, 0] >> 3) + 1):
+            for j in range(lo[g, 1] >> 3, (hi[g, 1] >> 3) + 1):
+                for k in range(lo[g, 2] >> 3, (hi[g, 2] >> 3) + 1):
+                    key = packed_key(i, j, k)
+                    if key != last:
+                        last = key
+                        table, count = put(table, count, key)
+    return table[table != -1]
+
+
+@njit(cache=True, nogil=True)
+def _walked(start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Distinct packed keys of the unit cells on the segments from one point to (P, 3) others.
+
+    Source: J. Amanatides, A. Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, Eurographics 1987.
+    """
+    table = np.full(1024, -1, np.int64)
+    count = 0
+    cell, step = np.empty(3, np.int64), np.empty(3, np.int64)
+    next_face, between = np.empty(3), np.empty(3)  # as shares of the segment
+    for p in range(len(ends)):
+        faces = 0
+        for i in range(3):
+            cell[i] = math.floor(start[i])
+            length = ends[p, i] - start[i]
+            step[i] = 1 if length > 0 else -1
+            faces += abs(np.int64(math.floor(ends[p, i])) - cell[i])
+            between[i] = 1.0 / abs(length) if length != 0 else np.inf
+            ahead = cell[i] + 1 - start[i] if length > 0 else start[i] - cell[i]
+            next_face[i] = ahead * between[i] if length != 0 else np.inf
+        table, count = put(table, count, packed_key(cell[0], cell[1], cell[2]))
+        for _ in range(faces):
+            i = 0
+            if next_face[1] < next_face[i]:
+                i = 1
+            if next_face[2] < next_face[i]:
+                i = 2
+            cell[i] += step[i]
+            next_face[i] += between[i]
+            table, count = put(table, count, packed_key(cell[0], cell[1], cell[2]))
+    return table[table != -1]

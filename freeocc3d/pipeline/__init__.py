@@ -1,0 +1,1 @@
+"""All four layers together: frames in, a map out."""

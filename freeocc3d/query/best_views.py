@@ -1,0 +1,83 @@
+"""Which keyframes show a region best, and where in their images it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.transforms import invert, project, transform
+from ..core.types import Occupancy, Trajectory
+from ..storage.keyframes import Keyframes
+from .regions import Region
+
+MOST = 3
+"""Views of a region that are told."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A keyframe that shows a region.
+
+    frame: index of the keyframe's frame in the capture.  box: x0, y0, x1, y1, pixels of its image around the voxels
+    that it shows, the last ones included.  visible: 0…1, share of the region's voxels that it shows.
+    """
+
+    frame: int
+    box: tuple[int, int, int, int]
+    visible: float
+
+
+def best_views(
+    occupancy: Occupancy, trajectory: Trajectory, keyframes: Keyframes, regions: Sequence[Region], most: int = MOST
+) -> list[list[View]]:
+    """For each region, at most so many of the keyframes that show a part of it: those that show most voxels, to a tenth
+    of what the best one shows, and of these the ones in whose images it is largest.
+
+    A keyframe shows a voxel whose centre falls on a pixel with a depth that differs from the centre's by no more than
+    the voxel's edge. Raises MapError for a broken keyframe.
+    """
+    voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
+    centers = [occupancy.centers(voxels[region.rows], edges[region.rows]) for region in regions]
+    sizes = [edges[region.rows] * occupancy.finest for region in regions]
+    found: list[list[View]] = [[] for _ in regions]
+    cameras = [camera for _, camera in keyframes.views()]
+    poses = zip(trajectory.keyframes, trajectory.T_world_keyframe, cameras, strict=True)
+    for row, (frame, T, camera) in enumerate(poses):
+        depth_m = None
+        for region, points, size in zip(range(len(regions)), centers, sizes, strict=True):
+            pixels, z = project(transform(invert(T), points), camera)
+            with np.errstate(invalid="ignore"):
+                at = np.rint(pixels)
+                inside = ((at >= 0) & (at < (camera.width, camera.height))).all(axis=1)
+            if not inside.any():
+                continue
+            depth_m = keyframes.depth_m(row) if depth_m is None else depth_m
+            u, v = at[inside].astype(np.int64).T
+            measured = depth_m[v, u]
+            shown = (measured > 0) & (np.abs(measured - z[inside]) <= size[inside])
+            if shown.any():
+                half = 0.5 * np.stack((camera.fx, camera.fy)) * (size / z)[inside][shown, None]
+                box = _box(pixels[inside][shown], half, camera.width, camera.height)
+                found[region].append(View(int(frame), box, float(shown.sum() / len(points))))
+    return [_best(views)[:most] for views in found]
+
+
+def _box(pixels: NDArray[np.float64], half: NDArray[np.float64], width: int, height: int) -> tuple[int, int, int, int]:
+    """Pixels around (P, 2) voxels' centres that reach (P, 2) pixels to each side, within the image."""
+    x0, y0 = np.maximum(np.floor((pixels - half).min(axis=0) + 0.5), 0).astype(int).tolist()
+    x1, y1 = np.minimum(np.floor((pixels + half).max(axis=0) + 0.5), (width - 1, height - 1)).astype(int).tolist()
+    return x0, y0, x1, y1
+
+
+def _best(views: list[View]) -> list[View]:
+    """The views, best first."""
+    most = max((view.visible for view in views), default=1.0)
+
+    def worth(view: View) -> tuple[float, int]:
+        x0, y0, x1, y1 = view.box
+        return round(view.visible / most, 1), (x1 + 1 - x0) * (y1 + 1 - y0)
+
+    return sorted(views, key=worth, reverse=True)

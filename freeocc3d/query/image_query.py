@@ -1,0 +1,137 @@
+"""Asking by picture: where the map looks like a part of an image. Imports little, to start fast."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import FreeOccError
+from ..core.types import Frame, Intrinsics, Occupancy
+from ..language.feature_codec import Features, cosines, known
+from ..settings import config, registry
+from .word_query import Options, QueryResult, found_regions
+
+if TYPE_CHECKING:
+    from ..language.encoders.base import Encoder
+
+_ALIKE = 0.5
+"""Cosine, to the mean of the map, from which something is as a picture shows it."""
+
+Box = tuple[int, int, int, int]
+
+
+def image_encoder(name: str, config_file: Path) -> Encoder:
+    """The image side of a map's encoder, as the map's configuration tells.
+
+    Raises FreeOccError for one that takes more than an image, or that cannot be had again.
+    """
+    module = registry.load("language.encoders", name)
+    if getattr(module, "NEEDS_CAPTURE", True):
+        raise FreeOccError(
+            f"The map's encoder '{name}' reads what the capture brings and cannot look at a picture: ask for words."
+        )
+    options = config.load(config_file)["language"].get(name, {})
+    encoder: Encoder = module.load(registry.build_options(module, options), None)
+    return encoder
+
+
+def patch_feature(
+    encoder: Encoder, image: str | Path | NDArray[np.uint8], box: Box | None = None
+) -> NDArray[np.float32]:
+    """(D,) unit mean of an encoder's features over a part of an image, each as sure as the encoder is of it.
+
+    image: a file, or (H, W, 3) uint8 RGB.  box: x0, y0, x1, y1, pixels, the last ones included; the whole image by
+    default. The encoder sees the whole image. Raises FreeOccError: not an image, a box outside of it, nothing to say.
+    """
+    rgb = image if isinstance(image, np.ndarray) else _read(Path(image))
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or not rgb.size:
+        raise FreeOccError(f"A picture is (H, W, 3) uint8 RGB, got {rgb.dtype} {rgb.shape}.")
+    height, width = rgb.shape[:2]
+    x0, y0, x1, y1 = box or (0, 0, width - 1, height - 1)
+    if not (0 <= x0 <= x1 < width and 0 <= y0 <= y1 < height):
+        raise FreeOccError(
+            f"The box {x0} {y0} {x1} {y1} does not lie in the picture, whose pixels go from 0 0 to {width - 1} "
+            f"{height - 1}: give x0 y0 x1 y1 with x0 <= x1 and y0 <= y1."
+        )
+    camera = Intrinsics(width, height, float(width), float(width), (width - 1) / 2, (height - 1) / 2)
+    features = encoder.encode(Frame(0, 0.0, rgb, np.zeros((height, width), np.float32), camera)).astype(np.float32)
+    rows, columns = features.shape[:2]
+    inside = features[y0 * rows // height : y1 * rows // height + 1, x0 * columns // width : x1 * columns // width + 1]
+    mean = inside.reshape(-1, features.shape[2]).sum(axis=0)
+    length = float(np.linalg.norm(mean))
+    if not np.isfinite(length) or length == 0:
+        raise FreeOccError("The map's encoder has nothing to say of this part of the picture: choose another.")
+    return np.asarray(mean / length, np.float32)
+
+
+def query_feature(
+    occupancy: Occupancy,
+    feature: NDArray[np.float32],
+    name: str,
+    options: Options | None = None,
+    up: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 1.0),
+) -> QueryResult:
+    """Where the map's features are as a given one, (D,) of unit length.
+
+    A voxel's score is the cosine of what sets both apart from the map's mean feature, m: (f - m)^T (q - m) over the
+    lengths, for features of images have much in common with each other, whatever they show. There are no contrast
+    words: a region's confidence is the mean score of its voxels. Raises FreeOccError for a length of another encoder.
+    """
+    options = options or Options()
+    if options.scores != "cosine":
+        raise FreeOccError("A picture is compared by cosines: leave --scores to words.")
+    features = occupancy.features
+    if len(features) and features.shape[1] != len(feature):
+        raise FreeOccError(
+            f"The map's features have {features.shape[1]} dimensions, those of pictures {len(feature)}: make the map "
+            "again with this version."
+        )
+    scores = _apart_from_mean(features, feature)
+    threshold = _ALIKE if options.threshold is None else options.threshold
+    rows = np.flatnonzero(scores >= min(options.grow * threshold, threshold)) if len(scores) else np.zeros(0, np.int64)
+    regions = found_regions(occupancy, rows, scores[rows], scores[rows], threshold, options, up, name)
+    note = ""
+    if not len(scores):
+        note = "The map has no occupied voxels."
+    elif not regions:
+        note = f"Nothing in this map looks like {name}: the best score is {scores.max():.2f}, below {threshold:.2f}."
+    return QueryResult(name, name, note, regions, scores)
+
+
+def _apart_from_mean(features: Features, feature: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(V,) cosines of unit features and one, all less their mean; 0 where nothing is known."""
+    says = known(features)
+    if not says.any():
+        return np.zeros(len(features), np.float32)
+    mean = _mean(features, says)
+    products = cosines(features, np.stack((feature, mean)))
+    squared = float(mean @ mean)
+    length = np.sqrt(np.maximum(1 - 2 * products[:, 1] + squared, 1e-12))
+    own = float(np.sqrt(max(1 - 2 * float(feature @ mean) + squared, 1e-12)))
+    score = (products[:, 0] - products[:, 1] - float(feature @ mean) + squared) / (length * own)
+    return np.where(says, np.clip(score, -1, 1), 0).astype(np.float32)
+
+
+def _mean(features: Features, says: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(D,) mean of the features of which something is known."""
+    total, at_once = np.zeros(features.shape[1]), 1 << 14
+    for start in range(0, len(features), at_once):
+        total += np.asarray(features[start : start + at_once]).astype(np.float32).sum(axis=0)
+    return np.asarray(total / np.count_nonzero(says), np.float32)
+
+
+def _read(path: Path) -> NDArray[np.uint8]:
+    import cv2
+
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise FreeOccError(f"Cannot read the picture {path}: {error.strerror}.") from error
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if image is None:
+        raise FreeOccError(f"{path} is not a picture that can be read: give a PNG or JPEG file.")
+    return np.asarray(image[..., ::-1])

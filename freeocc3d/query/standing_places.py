@@ -1,0 +1,131 @@
+"""Where a robot could stand on the floor and see a region."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from ..core.errors import MapError
+from ..core.transforms import invert, transform
+from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
+from ..occupancy.resampling import resampled
+from .regions import Region
+
+_MOST_CELLS = 1 << 29
+_DRIVEN_OVER = 0.1  # metres above the floor up to which nothing is an obstacle
+_MIN_FREE = 0.5  # share of a column's voxels that were seen through
+_HALF_DIAGONAL = 0.5**0.5  # cells: no part of an obstacle's cell is nearer than its centre by more
+_SAMPLES = 16  # of a region's voxels that are looked at
+_SEEN = 0.25  # share of these that have to be seen
+_AT_ONCE = 256  # places that are tried together
+
+
+@dataclass(frozen=True)
+class Robot:
+    """An upright cylinder that looks from the middle of its top.
+
+    radius, height: metres.
+    """
+
+    radius: float = 0.3
+    height: float = 1.5
+
+
+def standing_places(
+    occupancy: Occupancy, T_gravity_map: NDArray[np.float64], regions: Sequence[Region], robot: Robot | None = None
+) -> list[NDArray[np.float64] | None]:
+    """For each region the place on the floor, (3,) map frame, that is nearest to its voxels as seen from above, where
+    the robot has room and sees a quarter of the region at least; None where there is no such place.
+
+    T_gravity_map: (4, 4) rigid, to the frame with z up and the floor at z = 0. There is room where, within the radius,
+    nothing is occupied from 10 cm above the floor up to the height and half of it or more is known to be free, and the
+    floor is known in the middle. A voxel is seen if no occupied voxel that is not the region's lies between its centre
+    and the robot's top. Raises MapError for a map that is too large.
+    """
+    robot = robot or Robot()
+    plain = occupancy.replace(features=np.zeros((len(occupancy.colors), 0), np.float16))
+    one = plain
+    if occupancy.deepest:
+        from ..occupancy.levels import uniform
+
+        one = uniform(plain)
+    level, rows = resampled(one, T_gravity_map, np.array((0.0, 0.0, -0.5 * one.voxel_size)))
+    if not len(level.voxels(OCCUPIED)):
+        return [None] * len(regions)
+    cells = _Cells(level)
+    places = cells.with_room(robot)
+    centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
+    centers = transform(T_gravity_map, centers)
+    if occupancy.deepest:
+        rows = KDTree(centers).query(level.centers(level.occupied_voxels()))[1]
+    T_map_gravity = invert(T_gravity_map)
+    found: list[NDArray[np.float64] | None] = []
+    for region in regions:
+        own = level.occupied_voxels()[np.isin(rows, region.rows)]
+        place = cells.nearest(places, centers[region.rows], own, robot.height)
+        found.append(None if place is None else np.asarray(transform(T_map_gravity, np.array((*place, 0.0)))))
+    return found
+
+
+class _Cells:
+    """The states of all voxels of a level map's known box."""
+
+    def __init__(self, level: Occupancy):
+        self.size = level.voxel_size
+        voxels = {state: level.voxels(state) for state in (FREE, OCCUPIED)}
+        known = np.concatenate(list(voxels.values()))
+        self.corner = known.min(axis=0).astype(np.int64)
+        shape = known.max(axis=0) - self.corner + 1
+        if shape.prod() > _MOST_CELLS:
+            raise MapError(f"Standing places cannot be sought in {shape.prod():.3g} voxels: map with larger ones.")
+        self.origin = level.origin + self.corner * self.size
+        self.state = np.full(shape, UNKNOWN, np.uint8)
+        for state, at in voxels.items():
+            self.state[tuple((at - self.corner).T)] = state
+
+    def with_room(self, robot: Robot) -> NDArray[np.float64]:
+        """(P, 2) x, y where the robot has room to stand."""
+        heights = self.origin[2] + (np.arange(self.state.shape[2]) + 0.5) * self.size
+        body = self.state[:, :, (heights >= _DRIVEN_OVER) & (heights <= robot.height)]
+        layers = max(1, int((robot.height - _DRIVEN_OVER) / self.size))
+        room = ~(body == OCCUPIED).any(axis=2) & ((body == FREE).sum(axis=2) >= _MIN_FREE * layers)
+        to_obstacle = ndimage.distance_transform_edt(np.pad(room, 1))[1:-1, 1:-1]  # of the cells' centres
+        floor = (self.state[:, :, np.abs(heights) < 1.25 * self.size] == OCCUPIED).any(axis=2)
+        cells = np.argwhere(floor & ((to_obstacle - _HALF_DIAGONAL) * self.size >= robot.radius))
+        return np.asarray(self.origin[:2] + (cells + 0.5) * self.size)
+
+    def nearest(
+        self, places: NDArray[np.float64], targets: NDArray[np.float64], own: NDArray[np.int32], eye: float
+    ) -> NDArray[np.float64] | None:
+        """(2,) the nearest of the places to the targets, (N, 3) centres of a region, that sees them."""
+        distance = KDTree(targets[:, :2]).query(places)[0] if len(places) else np.zeros(0)
+        order = np.argsort(distance, kind="stable")
+        some = targets[np.unique(np.linspace(0, len(targets) - 1, _SAMPLES).astype(np.int64))]
+        blocks = self.state == OCCUPIED
+        blocks[tuple((own - self.corner).T)] = False
+        for start in range(0, len(order), _AT_ONCE):
+            tried = places[order[start : start + _AT_ONCE]]
+            eyes = np.concatenate((tried, np.full((len(tried), 1), eye)), axis=1)
+            sees = self._open(blocks, eyes, some).mean(axis=1) >= _SEEN
+            if sees.any():
+                return np.asarray(tried[int(np.argmax(sees))])
+        return None
+
+    def _open(
+        self, blocks: NDArray[np.bool_], eyes: NDArray[np.float64], targets: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """(E, N) whether nothing that blocks lies between each of (E, 3) eyes and each of (N, 3) targets, looked up at
+        steps of half a voxel."""
+        way = targets - eyes[:, None]
+        steps = max(1, int(np.ceil(np.linalg.norm(way, axis=-1).max() / (0.5 * self.size))))
+        blocked = np.zeros(way.shape[:2], bool)
+        for share in np.arange(steps) / steps:  # the eye's own cell too, which may be above the map
+            at = np.floor((eyes[:, None] + share * way - self.origin) / self.size).astype(np.int64)
+            inside = ((at >= 0) & (at < blocks.shape)).all(axis=-1)
+            blocked[inside] |= blocks[tuple(at[inside].T)]
+        return ~blocked

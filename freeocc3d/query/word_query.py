@@ -1,0 +1,360 @@
+"""Words to voxels to regions: what ``freeocc3d query`` and ``Map.query`` do. Imports little, to start fast.
+
+A voxel's score for a word is the paper's s(x, c) = f(x)^T t_c, the cosine of its feature and the word's, over the
+cosine that the word allows (see ``TextFeatures.attainable``), or that in relation to other words (``matching``). It
+matches when the score reaches the threshold and no contrast word (what the voxel could be instead) is nearer to it:
+similarities alone do not tell "is" from "is a little like". Voxels that hang together with these and fit nearly as well
+match, too. Matching voxels that touch form a region.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import __version__
+from ..core.errors import ConfigError, FreeOccError, MapError
+from ..core.types import Occupancy
+from ..language import word_matching
+from ..language.feature_codec import Features, cosines, known
+from ..occupancy.connected_components import connected
+from ..settings.registry import nearest, require_positive
+from .region_splitting import told_apart
+from .regions import Region, best_regions
+
+if TYPE_CHECKING:
+    from ..language.encoders.base import TextEncoder, TextFeatures
+
+_LONGEST_WORD = 200
+_MISSPELT = 0.75  # of difflib's ratio: "soffa" is, "canoe" for "camera" is not
+_SCORES = ("cosine", "softmax", "relevancy")
+_EVEN = 0.5  # a probability
+_ROWS = 16384  # voxels worked on at once, so that float32 copies of all features never exist
+_MANY_ROWS = 1 << 18  # by compiled code, whose threads are worth starting for many only
+
+
+@dataclass(frozen=True)
+class Options:
+    """What counts as a match, and which regions are reported."""
+
+    scores: str = "cosine"
+    """What a score is: "cosine" (over the cosine that the word allows), "softmax" (the word's probability against the
+    contrast words) or "relevancy" (the least against each of some phrases that fit anything, as in LERF)."""
+    threshold: float | None = None
+    """Least score of a matching voxel, -1…1; null = the encoder's own for cosines, 0.5 for probabilities."""
+    grow: float = 0.8
+    """A region goes on over voxels that touch it down to this share of the threshold; 1 = it does not."""
+    top_k: int = 20
+    """At most so many regions a word."""
+    min_voxels: int = 2
+    """Smaller regions are left out, unless all are smaller."""
+    min_share: float = 0.001
+    """Regions of less than this share of the volume of the word's largest one are left out, and those of one to three
+    voxels within half a metre of one that they are less than 50 times the share of: specks beside a thing. 0 = none."""
+    narrow: float = 0.5
+    """Things that touch are told apart where their region, seen from above, narrows to less than this share of the
+    narrower one, and to four voxels or less; 0 = regions stay whole."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "top_k", "min_voxels")
+        if self.threshold is not None and not -1 <= self.threshold <= 1:
+            raise ConfigError(f"'threshold' must lie between -1 and 1, got {self.threshold:g}.")
+        for name in ("narrow", "min_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"'{name}' must lie between 0 and 1, got {getattr(self, name):g}.")
+        if not 0 < self.grow <= 1:
+            raise ConfigError(f"'grow' must be greater than 0 and at most 1, got {self.grow:g}.")
+        if self.scores not in _SCORES:
+            raise ConfigError(f"'scores' must be one of {', '.join(_SCORES)}, got '{self.scores}'.")
+
+
+@dataclass(frozen=True)
+class QueryResult:
+    """The answer to one word.
+
+    understood: the part of the word that was used.  note: one sentence if nothing matched, or only a part of the word
+    was understood; else empty.  regions: best score first.  scores: (V,) score of every occupied voxel, 0 where nothing
+    is known of it.
+    """
+
+    word: str
+    understood: str
+    note: str
+    regions: list[Region]
+    scores: NDArray[np.float32]
+
+    @property
+    def matched(self) -> bool:
+        """Whether anything matched."""
+        return bool(self.regions)
+
+
+def query(
+    occupancy: Occupancy,
+    text_encoder: TextEncoder,
+    words: list[str],
+    options: Options | None = None,
+    contrast: Sequence[str] = (),
+    negative: Sequence[str] = (),
+    up: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 1.0),
+) -> list[QueryResult]:
+    """Ask for several words; one that nothing matches gives no regions.
+
+    contrast: words for what else is there, besides those that the encoder names itself.  negative: words for what is
+    not meant: a voxel whose plain cosine with one of them is higher than with the word does not match, though the word
+    should include it, as "table" includes a coffee table.  up: (3,) unit vector, map frame.
+    Raises FreeOccError for an empty, endless or excluded word or a negative one without a meaning, MapError if the
+    map's features are not the encoder's.
+    """
+    options = options or Options()
+    for word in (*words, *negative):
+        if not word.strip():
+            raise FreeOccError("An empty word cannot be looked for: give at least one word.")
+        if len(word) > _LONGEST_WORD:
+            raise FreeOccError(f"'{word[:30]}…' has {len(word)} characters; a query may have up to {_LONGEST_WORD}.")
+    text = text_encoder.encode_words(words)
+    excluded = text_encoder.encode_words(list(negative))
+    for word, part in zip(negative, excluded.understood, strict=True):
+        if not part:
+            raise FreeOccError(f"'{word}' cannot be excluded{_only_known(word, text_encoder)}")
+        if part in text.understood:
+            raise FreeOccError(f"'{word}' is asked for and excluded: leave one out.")
+    others = text_encoder.encode_words(list(dict.fromkeys((*text_encoder.contrast_words(), *contrast, *negative))))
+    features = occupancy.features
+    if len(features) and features.shape[1] != text.features.shape[1]:
+        raise MapError(
+            f"The map's features have {features.shape[1]} dimensions, its encoder's words "
+            f"{text.features.shape[1]}: make the map again with this version."
+        )
+    expressed = others.features.any(axis=1)
+    competes = (cosines(text.features, others.features) < text_encoder.same_word) & expressed
+    cosine = similarity(features, text)
+    says = known(features)
+    plain = options.scores == "cosine"
+    default = text_encoder.threshold if plain else _EVEN
+    threshold = default if options.threshold is None else options.threshold
+    every_score = cosine
+    if not plain:
+        every_score = np.stack(
+            [
+                _probability(features, cosine[:, w], _some(others, competes[w]), text_encoder, options.scores)
+                for w in range(len(words))
+            ],
+            axis=1,
+        )
+    understood = np.array([bool(part) for part in text.understood])
+    candidates = says[:, None] & (every_score >= min(options.grow * threshold, threshold)) & understood
+    best = _not_beaten(features, cosine, candidates, others, competes, text_encoder.temperature)
+    results = []
+    for w, (word, part) in enumerate(zip(words, text.understood, strict=True)):
+        scores = every_score[:, w]
+        rows, confidence = best[w]
+        if negative and len(rows):
+            meant = cosines(features[rows], text.features[w : w + 1])[:, 0]
+            allowed = meant >= cosines(features[rows], excluded.features).max(axis=1)
+            rows, confidence = rows[allowed], confidence[allowed]
+        regions = found_regions(occupancy, rows, scores[rows], confidence, threshold, options, up, word)
+        note = _note(word, part, text_encoder, scores, threshold, bool(regions))
+        results.append(QueryResult(word, part, note, regions, np.ascontiguousarray(scores)))
+    return results
+
+
+def found_regions(
+    occupancy: Occupancy,
+    rows: NDArray[np.int64],
+    scores: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    threshold: float,
+    options: Options,
+    up: Sequence[float] | NDArray[np.float64],
+    label: str,
+) -> list[Region]:
+    """The regions of candidates, (n,) rows of occupied voxels with (n,) scores and confidences: what hangs together
+    with a voxel that reaches the threshold, things that touch apart."""
+    seeds = scores >= threshold
+    if not seeds.any():
+        return []
+    component = connected(occupancy.occupied_voxels()[rows], occupancy.occupied_edges()[rows])
+    kept = word_matching.grown(seeds, component)
+    rows, scores, confidence, component = rows[kept], scores[kept], confidence[kept], component[kept]
+    component = told_apart(occupancy, rows, component, scores, np.asarray(up), options.narrow)
+    least = options.min_voxels, options.min_share
+    return best_regions(occupancy, rows, component, scores, confidence, *least, options.top_k, label)
+
+
+def similarity(features: Features, text: TextFeatures) -> NDArray[np.float32]:
+    """(V, W) scores of (V, D) unit features for W words: cosine over attainable cosine, at most 1."""
+    score = cosines(features, text.features)
+    if text.attainable is not None:
+        score /= text.attainable
+    return np.minimum(score, np.float32(1), out=score)
+
+
+def nearest_word(features: Features, text: TextFeatures) -> NDArray[np.int64]:
+    """(V,) which of W words is nearest to each of (V, D) features by plain cosine, -1 where nothing is known.
+
+    Of "table" and "coffee table" the narrower word is nearer to a coffee table, though both fit.
+    """
+    nearest = np.full(len(features), -1, np.int64)
+    for start in range(0, len(features) if len(text.understood) else 0, _ROWS):
+        chunk = features[start : start + _ROWS]
+        nearest[start : start + _ROWS] = np.where(known(chunk), cosines(chunk, text.features).argmax(axis=1), -1)
+    return nearest
+
+
+def _some(text: TextFeatures, words: NDArray[np.bool_]) -> TextFeatures:
+    """Those of the words that a mask (W,) names."""
+    understood = tuple(word for word, chosen in zip(text.understood, words, strict=True) if chosen)
+    attainable = None if text.attainable is None else text.attainable[words]
+    return type(text)(text.features[words], understood, attainable)
+
+
+def _not_beaten(
+    features: Features,
+    cosine: NDArray[np.float32],
+    candidates: NDArray[np.bool_],
+    others: TextFeatures,
+    competes: NDArray[np.bool_],
+    temperature: float,
+) -> list[tuple[NDArray[np.int64], NDArray[np.float32]]]:
+    """For each of W words, whose cosines (V, W) are given, the rows of its candidates (V, W) at which none of the C
+    other words that compete with it, (W, C), scores higher, and its confidences there."""
+    asked = np.flatnonzero(candidates.any(axis=1))
+    found: list[list[tuple[NDArray[np.int64], NDArray[np.float32]]]] = [[] for _ in competes]
+    step = _ROWS if len(asked) < word_matching.MANY else _MANY_ROWS
+    for start in range(0, len(asked), step):
+        rows = asked[start : start + step]
+        against = similarity(features[rows], others)
+        confidence = word_matching.confidences(cosine[rows], against, candidates[rows], competes, temperature)
+        for w, own in enumerate(found):
+            best = np.flatnonzero(confidence[:, w])
+            own.append((rows[best], confidence[best, w]))
+    nothing = (np.zeros(0, np.int64), np.zeros(0, np.float32))
+    return [
+        (np.concatenate([rows for rows, _ in (nothing, *own)]), np.concatenate([part for _, part in (nothing, *own)]))
+        for own in found
+    ]
+
+
+def _beside(
+    features: Features, scores: NDArray[np.float32], others: TextFeatures, temperature: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """``matching.beside`` of other words at all voxels, whose cosines for a word are given."""
+    largest, odds = np.empty(len(scores), np.float32), np.empty(len(scores), np.float32)
+    step = _ROWS if len(scores) < word_matching.MANY else _MANY_ROWS
+    for start in range(0, len(scores), step):
+        chunk = slice(start, start + step)
+        against = similarity(features[chunk], others)
+        largest[chunk], odds[chunk] = word_matching.beside(scores[chunk], against, temperature)
+    return largest, odds
+
+
+def _probability(
+    features: Features, scores: NDArray[np.float32], contrast: TextFeatures, text_encoder: TextEncoder, way: str
+) -> NDArray[np.float32]:
+    """(V,) softmax or relevancy of a word whose cosines are given; 0 where nothing is known. An encoder that cannot
+    express the phrases that fit anything is asked for its contrast words in their place."""
+    others = contrast
+    if way == "relevancy":
+        canonical = text_encoder.encode_words(list(word_matching.CANONICAL))
+        expressed = np.asarray(canonical.features.any(axis=1))
+        others = _some(canonical, expressed) if expressed.any() else contrast
+    largest, odds = _beside(features, scores, others, text_encoder.temperature)
+    made = (
+        word_matching.softmax(odds) if way == "softmax" else word_matching.relevancy(largest, text_encoder.temperature)
+    )
+    return np.where(known(features), made, np.float32(0))
+
+
+def _only_known(word: str, text_encoder: TextEncoder) -> str:
+    """The end of a sentence about a word that is not understood: what may have been meant, and what is known."""
+    meant = nearest(word.lower(), text_encoder.contrast_words(), _MISSPELT)
+    return f"{meant}: this map knows only {text_encoder.knows}."
+
+
+def _note(
+    word: str,
+    understood: str,
+    text_encoder: TextEncoder,
+    scores: NDArray[np.float32],
+    threshold: float,
+    matched: bool,
+) -> str:
+    if not understood:
+        return f"'{word}' is not understood{_only_known(word, text_encoder)}"
+    if len(scores) == 0:
+        return "The map has no occupied voxels."
+    if not matched:
+        highest = float(scores.max())
+        why = f"the best score is {highest:.2f}" + (f", below {threshold:.2f}" if highest < threshold else "")
+        return f"Nothing in this map looks like '{understood}': {why}."
+    asked = [token for token in re.findall(r"\w+", word.lower()) if token not in ("a", "an", "the")]
+    if len(asked) > len(re.findall(r"\w+", understood)):
+        return f"Only '{understood}' of '{word}' was understood."
+    return ""
+
+
+def to_json(
+    map_path: Path,
+    results: list[QueryResult],
+    more: Callable[[Region], dict[str, Any]] | None = None,
+    metric: bool = True,
+) -> dict[str, Any]:
+    """The document that ``query --json`` prints; metres (if ``metric``), map frame, fractions 0…1. more: gives further
+    keys of a region."""
+    return {
+        "version": __version__,
+        "map": str(map_path),
+        "metric": metric,
+        "results": [
+            {
+                "word": result.word,
+                "matched": result.matched,
+                "understood": result.understood,
+                "note": result.note,
+                "regions": [
+                    {
+                        "label": region.label,
+                        "score": round(region.score, 4),
+                        "confidence": round(region.confidence, 4),
+                        "centroid": region.centroid.round(4).tolist(),
+                        "box_min": region.box_min.round(4).tolist(),
+                        "box_max": region.box_max.round(4).tolist(),
+                        "volume_m3": round(region.volume_m3, 6),
+                        "voxels": region.voxels,
+                        **(more(region) if more else {}),
+                    }
+                    for region in result.regions
+                ],
+            }
+            for result in results
+        ],
+    }
+
+
+def to_text(results: list[QueryResult], metric: bool = True) -> str:
+    """A table for people, in metres and litres, or in the map's units where these are not ``metric``."""
+    length, volume, per_unit3, digits = ("m", "l", 1000, 1) if metric else ("units", "units^3", 1, 5)
+    lines = []
+    for result in results:
+        count = len(result.regions)
+        title = f"{result.word}: {count} region{'s' if count != 1 else ''}" if count else f"{result.word}: no match"
+        lines.append(f"{title}. {result.note}".rstrip(". ") + ("." if result.note else ""))
+        if count:
+            columns = f"{f'centroid ({length})':23}  {f'size ({length})':19}  {f'volume ({volume})':>10}"
+            lines.append(f"   #  score  conf.  {columns}  voxels")
+        for number, region in enumerate(result.regions, start=1):
+            x, y, z = region.centroid
+            dx, dy, dz = region.box_max - region.box_min
+            lines.append(
+                f"  {number:2d}   {region.score:.2f}   {region.confidence:.2f}  "
+                f"{x:7.2f} {y:7.2f} {z:7.2f}  {dx:5.2f} x {dy:4.2f} x {dz:4.2f}  "
+                f"{per_unit3 * region.volume_m3:{len(f'volume ({volume})')}.{digits}f}  {region.voxels:6d}"
+            )
+    return "\n".join(lines)

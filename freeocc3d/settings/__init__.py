@@ -1,0 +1,1 @@
+"""Options of every stage, YAML in and out, and the registry of backends."""

@@ -1,0 +1,1 @@
+"""The map folder and the work folder of a run in progress."""

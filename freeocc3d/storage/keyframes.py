@@ -1,0 +1,165 @@
+"""Keyframes on disk: colour (JPEG), depth (16-bit PNG, millimetres), its standard deviation where it has one of its own
+(16-bit PNG, halves of them) and intrinsics, enough to build every later layer without the capture. They are written
+while the camera is tracked, and read one at a time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import overload
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import MapError
+from ..core.types import Frame, Intrinsics
+
+INDEX = "keyframes.json"
+_UNITS_PER_METRE, _SIGMA_UNITS_PER_METRE = 1000.0, 2000.0
+_SIGMA = "sigma"
+"""Key of the entries that have a third image."""
+_JPEG_QUALITY = 95
+
+
+class Keyframes(Sequence[Frame]):
+    """The keyframes in a folder, in order; ``self[row]`` decodes one. Raises MapError for a missing or broken file."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self._entries: list[dict[str, float]] = []
+
+    @classmethod
+    def load(cls, folder: Path) -> Keyframes:
+        """Those that a folder's index lists."""
+        keyframes = cls(folder)
+        try:
+            entries = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+            keyframes._entries = [{str(k): float(v) for k, v in entry.items()} for entry in entries]
+        except (OSError, ValueError, AttributeError, TypeError) as error:
+            raise MapError(f"Cannot read the keyframes' index {folder / INDEX}: {error}.") from error
+        return keyframes
+
+    def append(self, frame: Frame) -> None:
+        """Write a keyframe. Raises OSError."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        bgr = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
+        color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+        self._paths(frame.index)[0].write_bytes(color.tobytes())
+        self._write_depth(frame)
+        camera = frame.intrinsics
+        self._entries.append(
+            {"frame": frame.index, "timestamp": frame.timestamp, "width": camera.width, "height": camera.height,
+             "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+             **({} if frame.depth_sigma_m is None else {_SIGMA: 1.0})}
+        )  # fmt: skip
+
+    def write_scaled(self, folder: Path, factor: float) -> None:
+        """Write them to another folder with depth times ``factor``; colour is copied. Raises OSError, MapError."""
+        folder.mkdir(parents=True, exist_ok=True)
+        written = Keyframes(folder)
+        for entry, frame in zip(self._entries, self, strict=True):
+            color_path = self._paths(frame.index)[0]
+            (folder / color_path.name).write_bytes(color_path.read_bytes())
+            written._write_depth(frame.scaled(factor))
+            written._entries.append(entry)
+        written.save_index()
+
+    def only(self, frames: NDArray[np.integer]) -> Keyframes:
+        """Those of the given frames of the capture, in the same folder."""
+        chosen = Keyframes(self.folder)
+        wanted = set(frames.tolist())
+        chosen._entries = [entry for entry in self._entries if int(entry["frame"]) in wanted]
+        return chosen
+
+    def truncate(self, length: int) -> None:
+        """Forget all but the first ``length``; their files are overwritten when the frames come again."""
+        del self._entries[length:]
+
+    def drop_unlisted(self) -> None:
+        """Remove images that a run left which was interrupted after its last checkpoint."""
+        listed = {path for entry in self._entries for path in self._paths(int(entry["frame"]))}
+        for path in [*self.folder.glob("*.color.jpg"), *self.folder.glob("*.depth*.png")]:
+            if path not in listed:
+                path.unlink()
+
+    def save_index(self) -> None:
+        """Write the index, whole or not at all. Raises OSError."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        temporary = self.folder / (INDEX + ".tmp")
+        temporary.write_text(json.dumps(self._entries, indent=0), encoding="utf-8")
+        temporary.replace(self.folder / INDEX)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @overload
+    def __getitem__(self, row: int) -> Frame: ...
+    @overload
+    def __getitem__(self, row: slice) -> list[Frame]: ...
+    def __getitem__(self, row: int | slice) -> Frame | list[Frame]:
+        if isinstance(row, slice):
+            return [self._read(entry) for entry in self._entries[row]]
+        return self._read(self._entries[row])
+
+    def __iter__(self) -> Iterator[Frame]:
+        return map(self._read, list(self._entries))
+
+    def views(self) -> list[tuple[Path, Intrinsics]]:
+        """The colour image's file and the camera of each, without decoding anything."""
+        return [(self._paths(int(entry["frame"]))[0], _camera(entry)) for entry in self._entries]
+
+    def depth_m(self, row: int) -> NDArray[np.float32]:
+        """(H, W) depth of one, whose colour is not decoded; 0 = no measurement."""
+        return self._read_units(self._entries[row], 1) / np.float32(_UNITS_PER_METRE)
+
+    def _read(self, entry: dict[str, float]) -> Frame:
+        index = int(entry["frame"])
+        camera = _camera(entry)
+        color_path = self._paths(index)[0]
+        color = _decode(color_path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        depth_m = self._read_units(entry, 1) / np.float32(_UNITS_PER_METRE)
+        sigma_m = self._read_units(entry, 2) / np.float32(_SIGMA_UNITS_PER_METRE) if _SIGMA in entry else None
+        if color.shape != (*depth_m.shape, 3):
+            raise MapError(f"{color_path} does not have the size that {INDEX} states.")
+        return Frame(index, entry["timestamp"], cv2.cvtColor(color, cv2.COLOR_BGR2RGB), depth_m, camera, sigma_m)
+
+    def _read_units(self, entry: dict[str, float], image: int) -> NDArray[np.float32]:
+        camera, path = _camera(entry), self._paths(int(entry["frame"]))[image]
+        units = _decode(path, cv2.IMREAD_UNCHANGED)
+        if units.shape != (camera.height, camera.width):
+            raise MapError(f"{path} does not have the size that {INDEX} states.")
+        return units.astype(np.float32)
+
+    def _write_depth(self, frame: Frame) -> None:
+        _, depth_path, sigma_path = self._paths(frame.index)
+        depth_path.write_bytes(_encoded(frame.depth_m * _UNITS_PER_METRE))
+        if frame.depth_sigma_m is not None:
+            sigma = np.maximum(frame.depth_sigma_m * np.float32(_SIGMA_UNITS_PER_METRE), 1)  # 0 would weigh infinitely
+            sigma_path.write_bytes(_encoded(np.where(frame.depth_m > 0, sigma, 0)))
+
+    def _paths(self, index: int) -> tuple[Path, Path, Path]:
+        """Colour and depth image of a frame, and that of the depth's standard deviation."""
+        name = self.folder / f"{index:06d}"
+        return name.with_suffix(".color.jpg"), name.with_suffix(".depth.png"), name.with_suffix(".depth_sigma.png")
+
+
+def _encoded(values: NDArray[np.float32]) -> bytes:
+    units = np.clip(np.rint(values), 0, 65535).astype(np.uint16)
+    return bytes(cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
+
+
+def _camera(entry: dict[str, float]) -> Intrinsics:
+    return Intrinsics(int(entry["width"]), int(entry["height"]), entry["fx"], entry["fy"], entry["cx"], entry["cy"])
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise MapError(f"Cannot read the keyframe image {path}: {error.strerror}.") from error
+    image = cv2.imdecode(data, flags) if len(data) else None
+    if image is None:
+        raise MapError(f"The keyframe image {path} is damaged.")
+    return image

@@ -1,0 +1,232 @@
+"""The folder ``MAP.partial`` of a run in progress: what each stage left, and whether it may be taken up again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import MapError
+from ..core.types import Gaussians
+from ..gaussians.point_cloud import read_ply, write_ply
+from ..settings import config
+from ..settings.config import Config
+from . import store
+
+STAGES = {
+    "tracking": ("capture", "tracking"),
+    "gaussians": ("capture", "tracking", "gaussians", "fitting", "occupancy"),
+    "language": ("capture", "tracking", "gaussians", "fitting", "occupancy", "language"),
+}
+"""Stages whose results are saved, and the configuration sections that they depend on."""
+
+_TRACKING, _STAGE_FEATURES, _MARKS = "tracking.npz", "features.stage.npz", "stages.json"
+_ANSWERS, _OFFLINE = "vocabulary.stage.json", "offline"
+_STAGE_FILES = (_TRACKING, "tracking.tmp.npz", _STAGE_FEATURES, _ANSWERS, f"{_ANSWERS}.tmp", _MARKS, f"{_MARKS}.tmp")
+_OWN_FILES = {
+    *_STAGE_FILES, _OFFLINE, store.MANIFEST, store.CONFIG, store.REPORT,
+    store.TRAJECTORY, store.PATH_PICTURE, store.RENDER_PICTURE, store.GAUSSIANS, store.OCCUPANCY, store.FEATURES,
+    store.KEYFRAMES,
+}  # fmt: skip
+
+
+class WorkFolder:
+    """The folder ``MAP.partial`` of a run in progress: checkpoints, and the fingerprint of what they depend on."""
+
+    def __init__(self, folder: Path, resumed: bool):
+        self.folder = folder
+        self.resumed = resumed
+        self.seconds: dict[str, float] = {}
+        self.warnings: list[str] = []
+        self.broken: dict[int, str] = {}  # frame -> what is wrong with it
+        self._stage, self._since = "", 0.0
+        self._fingerprints: dict[str, str] = {}
+        self._valid: set[str] = set()
+
+    @classmethod
+    def open(cls, output: Path, overwrite: bool, resume: bool) -> WorkFolder:
+        """Raises MapError if a map or an interrupted run is in the way; changes nothing on disk."""
+        if not output.name:
+            raise MapError(f"'{output}' cannot be the name of a map folder.")
+        folder = output.with_name(output.name + ".partial")
+        if output.exists() and not overwrite:
+            raise MapError(f"{output} exists: choose another folder, or replace it with --overwrite.")
+        if output.exists() and not (output / store.MANIFEST).is_file():
+            raise MapError(f"{output} is not a map, so it is not overwritten: choose another folder.")
+        if folder.exists():
+            strange = folder.is_file() or {path.name for path in folder.iterdir()} - _OWN_FILES
+            if strange:
+                raise MapError(f"{folder} is in the way, and is not an interrupted run's: move it, or choose another.")
+            if (folder / _MARKS).is_file() and not (resume or overwrite):
+                raise MapError(
+                    f"{folder} holds the work of an interrupted run: go on with --resume, or start again with "
+                    "--overwrite."
+                )
+        return cls(folder, resume and (folder / _MARKS).is_file())
+
+    @classmethod
+    def made_of(cls, source: Path, output: Path, overwrite: bool) -> WorkFolder:
+        """For a map that is made of another one. Raises MapError as ``open`` does, and for the other's own place."""
+        if output.resolve() == source.resolve():
+            raise MapError(f"A map made of {source} cannot take that map's own place: choose another folder.")
+        return cls.open(output, overwrite, resume=False)
+
+    @contextlib.contextmanager
+    def writing(self, output: Path, identity: list[Any], settings: Config) -> Iterator[Path]:
+        """The folder, in which the configuration stands; what is written to it inside is the map ``output`` afterwards,
+        and gone where that fails. Raises MapError where nothing can be written."""
+        try:
+            self.begin(identity, settings)
+            (self.folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
+            yield self.folder
+            self.finish(output)
+        except BaseException as error:
+            self.discard()
+            if isinstance(error, OSError):
+                raise MapError(f"Cannot write {output}: {error.strerror}.") from error
+            raise
+
+    def begin(self, identity: list[Any], settings: Config) -> None:
+        """Make the folder, and decide which saved stages are still valid for this configuration and for what
+        ``identity`` says of the input. Raises MapError, and touches nothing, if a resumed run was another's."""
+        relevant = {**settings, "identity": {"of": identity}}
+        relevant["capture"] = {key: value for key, value in settings["capture"].items() if key != "max_broken"}
+        self._fingerprints = {
+            stage: config.fingerprint(relevant, (*sections, "identity")) for stage, sections in STAGES.items()
+        }
+        if self.resumed:
+            try:
+                saved = json.loads((self.folder / _MARKS).read_text(encoding="utf-8"))
+            except (OSError, ValueError) as error:
+                raise MapError(f"Cannot read {self.folder / _MARKS}: start again with --overwrite.") from error
+            self._valid = {stage for stage, value in self._fingerprints.items() if saved.get(stage) == value}
+            if "tracking" not in self._valid:
+                raise MapError(
+                    f"{self.folder} was begun with another capture, or other capture or tracking options: resume it "
+                    "with the same ones, or start again with --overwrite."
+                )
+            return
+        if self.folder.exists():
+            shutil.rmtree(self.folder)
+        try:
+            self.folder.mkdir(parents=True)
+        except OSError as error:
+            raise MapError(f"Cannot create {self.folder}: {error.strerror}.") from error
+
+    def save_tracking(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Keep layer 1's state, in place of the one before."""
+        temporary = self.folder / "tracking.tmp.npz"
+        seconds = {**self.seconds, self._stage: self.seconds.get(self._stage, 0.0) + time.perf_counter() - self._since}
+        log = {"broken": self.broken, "warnings": self.warnings, "seconds": seconds}
+        arrays: dict[str, Any] = {**state, "log": np.array(json.dumps(log))}
+        np.savez(temporary, **arrays)
+        temporary.replace(self.folder / _TRACKING)
+        self._mark("tracking")
+
+    def restore_tracking(self) -> dict[str, NDArray[Any]] | None:
+        """The state of the last checkpoint, if there is one and it is still valid."""
+        path = self.folder / _TRACKING
+        if "tracking" not in self._valid or not path.is_file():
+            return None
+        state = store.read_arrays(path, {})
+        log = json.loads(str(state.pop("log")))
+        self.broken = {int(index): text for index, text in log["broken"].items()}
+        self.warnings = log["warnings"]
+        self.seconds = {name: self.seconds.get(name, 0.0) + value for name, value in log["seconds"].items()}
+        return state
+
+    def forget_tracking(self) -> None:
+        """Drop layer 1's checkpoint: a run that is resumed from here on tracks anew."""
+        (self.folder / _TRACKING).unlink(missing_ok=True)
+
+    def gaussians(self, compute: Callable[[], Gaussians]) -> Gaussians:
+        """The saved result of layer 2, or ``compute()``, saved."""
+        path = self.folder / store.GAUSSIANS
+        if "gaussians" in self._valid and path.is_file():
+            return read_ply(path)
+        result = compute()
+        if len(result):
+            write_ply(result, path)
+            self._mark("gaussians")
+        return result
+
+    def features(self, compute: Callable[[], NDArray[np.float16]]) -> NDArray[np.float16]:
+        """The saved result of layer 3, or ``compute()``, saved."""
+        path = self.folder / _STAGE_FEATURES
+        if "language" in self._valid and path.is_file():
+            return np.asarray(store.read_arrays(path, {"features": ("f", 2)})["features"], np.float16)
+        features = compute()
+        np.savez(path, features=features)
+        self._mark("language")
+        return features
+
+    @property
+    def kept(self) -> bool:
+        """Whether there is a stage's result or a checkpoint to go on from."""
+        return (self.folder / _MARKS).is_file()
+
+    @property
+    def answers(self) -> Path:
+        """Where the answers about keyframes are kept, which say themselves to which questions."""
+        return self.folder / _ANSWERS
+
+    def begin_offline(self) -> Path:
+        """The folder of what a tracker does for the whole scan before its first frame; from now on the run can be taken
+        up again, and ``_OFFLINE`` says itself how far it is."""
+        (self.folder / _OFFLINE).mkdir(exist_ok=True)
+        if "tracking" not in self._valid:
+            self._mark("tracking")
+        return self.folder / _OFFLINE
+
+    def finish(self, output: Path) -> None:
+        """The work folder takes the map's name; a map that it replaces is gone only when the new one stands."""
+        for name in _STAGE_FILES:
+            (self.folder / name).unlink(missing_ok=True)
+        shutil.rmtree(self.folder / _OFFLINE, ignore_errors=True)
+        if not output.exists():
+            self.folder.rename(output)
+            return
+        aside = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent)) / output.name
+        output.rename(aside)
+        try:
+            self.folder.rename(output)
+        except OSError:
+            aside.rename(output)
+            raise
+        finally:
+            shutil.rmtree(aside.parent, ignore_errors=True)
+
+    def discard(self) -> None:
+        """Remove the folder of a run that cannot lead to a map."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def drop_if_empty(self) -> None:
+        """Leave nothing behind where nothing was done."""
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+
+    @contextlib.contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the time spent inside to the stage's."""
+        self._stage, self._since = stage, time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - self._since
+
+    def _mark(self, stage: str) -> None:
+        """Record that a stage's result is saved; later stages' results are out of date."""
+        order = list(STAGES)
+        self._valid = {name for name in self._valid if order.index(name) < order.index(stage)} | {stage}
+        marks = {name: self._fingerprints[name] for name in self._valid}
+        temporary = self.folder / f"{_MARKS}.tmp"
+        temporary.write_text(json.dumps(marks), encoding="utf-8")
+        temporary.replace(self.folder / _MARKS)

@@ -1,0 +1,97 @@
+"""What the trackers share that are given poses instead of estimating them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture.base import Capture
+from ..core.errors import TrackingError
+from ..core.progress import Progress
+from ..core.transforms import invert, nearest_rigid
+from ..core.types import Frame
+from ..depth.multi_view_stereo import Scan, StereoDepth
+from ..depth.sparse_points import triangulated
+from .base import Tracked, Tracker
+from .overlap import DepthView, mutual_overlap, sample_points
+from .records import Records
+
+_FARTHEST = 2000.0
+_SUREST_M = 5e-4  # a standard deviation of 0 would weigh infinitely
+_LEAST_COVERED = 0.05  # share of the pixels with a depth, or a frame shows nothing
+
+
+class GivenTracker(Tracker):
+    """Takes (N, 4, 4) poses of a capture's frames as they are; a frame whose pose is NaN is lost, and one that shares
+    too little with its keyframe becomes a keyframe. Where the capture has no depth, multi-view stereo measures it."""
+
+    def __init__(self, T_world_cam: NDArray[np.float64], keyframe_overlap: float, capture: Capture):
+        super().__init__()
+        self.T_world_cam = T_world_cam
+        self.keyframe_overlap = keyframe_overlap
+        self.offline = not capture.has_depth
+        self._capture = capture
+        self._keyframe: DepthView | None = None
+        self._depth: StereoDepth | None = None
+
+    def prepare(self, folder: Path, frames: range, progress: Progress) -> None:
+        scan = self.scan(folder, frames, progress)
+        if not self._capture.has_depth:
+            self._depth = StereoDepth(folder / "depth", self.stereo)
+            self._depth.compute(self._capture, scan, frames, progress, self.as_pinhole)
+
+    def scan(self, folder: Path, frames: range, progress: Progress) -> Scan:
+        """The poses with points that the frames see, for stereo."""
+        return triangulated(self._capture, self.T_world_cam, frames, progress)
+
+    def as_pinhole(self, frame: Frame) -> Frame:
+        """The frame as a pinhole camera would have taken it, should the tracker know the camera better."""
+        return frame
+
+    def completed(self, frame: Frame) -> Frame:
+        frame = self.as_pinhole(frame)
+        found = None if self._depth is None else self._depth.depth(frame.index)
+        if found is None:
+            return frame
+        return replace(frame, depth_m=found[0], depth_sigma_m=np.maximum(found[1], np.float32(_SUREST_M)))
+
+    def track(self, frame: Frame) -> Tracked:
+        given = self.T_world_cam[frame.index]
+        if not np.isfinite(given).all():
+            self.records.add_lost(frame.index)
+            return Tracked("lost", None, 0.0)
+        T_world_cam = nearest_rigid(given)  # files state poses to a few digits
+        if np.abs(T_world_cam[:3, 3]).max() > _FARTHEST:
+            raise TrackingError(
+                f"The pose of frame {frame.index} lies more than {_FARTHEST:g} m from the origin, where positions lose "
+                "their millimetres: subtract a common offset from the poses."
+            )
+        view = self._view(frame)
+        nothing_seen = np.count_nonzero(frame.depth_m) < _LEAST_COVERED * frame.depth_m.size
+        if nothing_seen and self._keyframe is None:
+            self.records.add_lost(frame.index)
+            return Tracked("lost", None, 0.0)
+        if self._keyframe is not None:
+            T_keyframe_cam = invert(self.records.T_world_keyframe[-1]) @ T_world_cam
+            shared = mutual_overlap(view, self._keyframe, T_keyframe_cam)
+            if nothing_seen or shared >= self.keyframe_overlap:
+                row = len(self.records.keyframe_index) - 1
+                self.records.add_tracked(frame.index, row, T_keyframe_cam, 1.0)
+                return Tracked("tracked", T_world_cam, 1.0)
+        self._keyframe = view
+        self.records.add_keyframe(frame.index, T_world_cam, 1.0)
+        return Tracked("keyframe", T_world_cam, 1.0)
+
+    def optimize(self) -> None:
+        """Given poses stay as they are."""
+
+    def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
+        self.records = Records.from_arrays(state)
+        self._keyframe = self._view(keyframes[-1]) if keyframes else None
+
+    def _view(self, frame: Frame) -> DepthView:
+        return DepthView(frame.depth_m, frame.intrinsics, sample_points(frame.depth_m, frame.intrinsics, step=16))

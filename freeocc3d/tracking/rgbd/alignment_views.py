@@ -1,0 +1,145 @@
+"""What dense alignment sees of a frame: at about 160 x 120 pixels, surface points, normals and intensities.
+
+The surface is a plane fitted to the depth around each pixel, in inverse depth, in which planes are linear in the pixel
+(and in which stereo and structured-light noise is nearly uniform): that takes most of the sensor's noise away before it
+reaches the alignment, and gives the normal.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ...core.types import Frame, Intrinsics
+
+WIDTH = 160
+"""Views are about this wide."""
+
+_LEVELS = 3
+_WINDOW = 6  # full-size pixels on each side of a pixel's centre in which its plane is fitted, at 640 pixels' width
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame as the alignment needs it.
+
+    intrinsics: of the (h, w) images.  points: (h, w, 3) float32, camera frame, metres; 0 where there is no surface.
+    normals: (h, w, 3) float32 unit.  gray: intensities 0…1, float32, at full, half and quarter size.
+    """
+
+    intrinsics: Intrinsics
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    gray: tuple[NDArray[np.float32], ...]
+
+    @property
+    def camera(self) -> NDArray[np.float64]:
+        """fx, fy, cx, cy."""
+        K = self.intrinsics
+        return np.array((K.fx, K.fy, K.cx, K.cy))
+
+    @property
+    def covered(self) -> float:
+        """Share of the pixels that have a surface."""
+        return float((self.points[..., 2] > 0).mean())
+
+
+def view_of(frame: Frame) -> View:
+    """Prepare a frame."""
+    camera = frame.intrinsics
+    step = max(1, round(camera.width / WIDTH))
+    w, h = camera.width // step, camera.height // step
+    small = Intrinsics(
+        w, h, camera.fx / step, camera.fy / step, (camera.cx + 0.5) / step - 0.5, (camera.cy + 0.5) / step - 0.5
+    )
+    window = max(2, round(_WINDOW * camera.width / 640))
+    points, normals = planes(frame.depth_m, step, window, camera.fx, camera.fy, camera.cx, camera.cy)
+    gray = cv2.cvtColor(frame.color[: h * step, : w * step], cv2.COLOR_RGB2GRAY)
+    gray = cv2.resize(gray, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+    pyramid = [cv2.GaussianBlur(gray, (3, 3), 0.6)]
+    for _ in range(_LEVELS - 1):
+        pyramid.append(cv2.pyrDown(pyramid[-1]))
+    return View(small, points, normals, tuple(pyramid))
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def planes(
+    depth_m: NDArray[np.float32], step: int, window: int, fx: float, fy: float, cx: float, cy: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Points and normals (h, w, 3) of planes 1/z = a + b (u - u0) + c (v - v0) fitted around every ``step``-th pixel's
+    centre (u0, v0) to the depths within ``window`` pixels that belong to one surface; 0 where there are too few."""
+    H, W = depth_m.shape
+    h, w = H // step, W // step
+    points = np.zeros((h, w, 3), np.float32)
+    normals = np.zeros((h, w, 3), np.float32)
+    stride = 2 if window >= 4 else 1
+    for i in range(h):
+        v0 = i * step + 0.5 * (step - 1)
+        for j in range(w):
+            u0 = j * step + 0.5 * (step - 1)
+            near = 0.0
+            best = 1e9
+            for v in range(i * step, min(i * step + step, H)):
+                for u in range(j * step, min(j * step + step, W)):
+                    d = (u - u0) ** 2 + (v - v0) ** 2
+                    if depth_m[v, u] > 0 and d < best:
+                        best = d
+                        near = 1.0 / depth_m[v, u]
+            if near == 0.0:
+                continue
+            a, b, c = near, 0.0, 0.0
+            good = False
+            for sweep in range(2):
+                allowed = 0.04 * near if sweep == 0 else 0.012 * near
+                n = suu = svv = suv = su = sv = 0.0
+                sw = swu = swv = 0.0
+                for v in range(max(0, int(v0) - window + 1), min(H, int(v0) + window + 1), stride):
+                    dv = v - v0
+                    for u in range(max(0, int(u0) - window + 1), min(W, int(u0) + window + 1), stride):
+                        z = depth_m[v, u]
+                        if z <= 0:
+                            continue
+                        du = u - u0
+                        inverse = 1.0 / z
+                        if abs(inverse - (a + b * du + c * dv)) > allowed:
+                            continue
+                        n += 1.0
+                        su += du
+                        sv += dv
+                        suu += du * du
+                        svv += dv * dv
+                        suv += du * dv
+                        sw += inverse
+                        swu += inverse * du
+                        swv += inverse * dv
+                if n < 8:
+                    good = False
+                    break
+                mu, mv, mw = su / n, sv / n, sw / n
+                uu, vv, uv = suu / n - mu * mu, svv / n - mv * mv, suv / n - mu * mv
+                wu, wv = swu / n - mw * mu, swv / n - mw * mv
+                det = uu * vv - uv * uv
+                if det < 0.02 * window**4 / 9:
+                    good = False
+                    break
+                b = (wu * vv - wv * uv) / det
+                c = (wv * uu - wu * uv) / det
+                a = mw - b * mu - c * mv
+                good = a > 0
+            if not good:
+                continue
+            z = 1.0 / a
+            x, y = (u0 - cx) / fx * z, (v0 - cy) / fy * z
+            nx, ny, nz = b * fx, c * fy, a + b * (cx - u0) + c * (cy - v0)
+            length = math.sqrt(nx * nx + ny * ny + nz * nz)
+            grazing = 1.0 / (length * math.sqrt(x * x + y * y + z * z))  # n . X = 1
+            if grazing < 0.12:
+                continue
+            points[i, j, 0], points[i, j, 1], points[i, j, 2] = x, y, z
+            normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = nx / length, ny / length, nz / length
+    return points, normals

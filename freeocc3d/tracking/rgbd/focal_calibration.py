@@ -1,0 +1,92 @@
+"""Whether colour and depth have the same focal length, asked of the scan itself.
+
+Some sensors are calibrated only roughly: the depth image lies on the colour image, but one is larger than the other.
+Depth alone gives the motion between two frames; features lifted by depth and moved by it land where they are matched
+only if the colour camera's focal length is right. Of a scan of focal lengths the one with the least reprojection error
+is taken, if it stands out; else nothing is changed.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...capture.base import Capture
+from ...core.transforms import apart
+from . import dense_alignment, orb_features
+from .keyframe_registration import KeyframeView, decoded_view, matched
+
+PAIRS = 36
+"""Pairs of frames that are looked at."""
+
+_GAPS = (24, 12, 6, 3)
+_RATIOS = np.exp(np.linspace(np.log(0.8), np.log(1.25), 46))
+_LEAST_CHANGE = 0.015  # of the focal length: less is within what a scan tells
+_LEAST_GAIN = 0.15  # of the error: a clear minimum takes away more
+_LEAST_PAIRS, _LEAST_MATCHES = 8, 500
+_FAR_PX = 3.0  # an error from which on a match counts as wrong
+
+
+def color_focal(capture: Capture, frames: range) -> float:
+    """Focal length of the colour camera over that of the depth camera; 1 where the scan does not clearly say otherwise.
+
+    frames: those of the capture that are used. No poses are read.
+    """
+    pairs = _pairs(capture, frames)
+    if len(pairs) < _LEAST_PAIRS or sum(len(rows) for _, _, _, rows in pairs) < _LEAST_MATCHES:
+        return 1.0
+    errors = np.array([_error(pairs, ratio) for ratio in _RATIOS])
+    unchanged, best = _error(pairs, 1.0), int(np.argmin(errors))
+    if best in (0, len(_RATIOS) - 1) or errors[best] > (1 - _LEAST_GAIN) * unchanged:
+        return 1.0
+    a, b, _ = np.polyfit(np.log(_RATIOS[best - 1 : best + 2]), errors[best - 1 : best + 2], 2)
+    ratio = float(np.exp(-b / (2 * a)))
+    return ratio if abs(np.log(ratio)) >= _LEAST_CHANGE else 1.0
+
+
+_Pair = tuple[KeyframeView, KeyframeView, NDArray[np.float64], NDArray[np.int64]]
+
+
+def _pairs(capture: Capture, frames: range) -> list[_Pair]:
+    """Pairs of frames (source, target), the source's pose in the target by depth alone, and their (M, 2) matches."""
+    starts = np.unique(np.linspace(0, max(len(frames) - 1, 0), PAIRS, dtype=int))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = pool.map(lambda start: _pair(capture, frames[start:]), starts.tolist())
+        return [pair for pair in found if pair is not None]
+
+
+def _pair(capture: Capture, frames: range) -> _Pair | None:
+    """The first frame with the farthest of a few further on that still shows most of the same."""
+    target = decoded_view(capture, frames[0])
+    for gap in _GAPS:
+        source = decoded_view(capture, frames[gap]) if target is not None and gap < len(frames) else None
+        if target is None or source is None:
+            continue
+        found = matched(source, target)
+        guess = orb_features.pose(found.points_s, found.rays_t, 1.0 / target.camera.fx, threshold_px=6.0)
+        if guess is None:
+            continue
+        aligned = dense_alignment.align(source.view, target.view, guess[0], photometric=0.0)
+        moved = max(apart(np.eye(4), aligned.T_target_source))
+        if aligned.determined and aligned.overlap > 0.6 and aligned.inliers > 0.75 and moved > 0.02:
+            return source, target, aligned.T_target_source, orb_features.match(source.features, target.features)
+    return None
+
+
+def _error(pairs: list[_Pair], ratio: float) -> float:
+    """Mean of a saturating reprojection error, 0…1, at a focal length of the colour camera."""
+    total, count = 0.0, 0
+    for source, target, T, rows in pairs:
+        camera = replace(source.camera, fx=source.camera.fx * ratio, fy=source.camera.fy * ratio)
+        points = orb_features.lift(source.features.rays(camera), source.view)[rows[:, 0]]
+        known = points[:, 2] > 0
+        moved = points[known] @ T[:3, :3].T + T[:3, 3]
+        off = camera.fx * (moved[:, :2] / moved[:, 2:] - target.features.rays(camera)[rows[known, 1]])
+        squared = (off**2).sum(axis=1) / _FAR_PX**2
+        total += float((squared / (1 + squared)).sum())
+        count += len(squared)
+    return total / max(count, 1)

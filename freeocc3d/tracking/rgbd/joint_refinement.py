@@ -1,0 +1,163 @@
+"""All keyframes at once: poses that agree best with dense and feature residuals of every overlapping pair.
+
+For a pair (s, t) of keyframes with T_ts = T_t^-1 T_s, both kinds of residuals give normal equations H, g of
+T_ts <- exp(xi) T_ts (``dense``, ``features``). Moving the keyframes by exp(xi_s), exp(xi_t) from the left moves T_ts by
+A (xi_s - xi_t), A = Ad(T_t^-1), so that the pair adds A^T H A to the blocks (s, s), (t, t), and its negative to (s, t).
+One Gauss-Newton step solves for all keyframes; correspondences are found anew at each.
+
+Source: Q.-Y. Zhou, J. Park, V. Koltun, Fast Global Registration, ECCV 2016, Sec. 3.3 (multi-way), with its pairs'
+objective replaced.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_matrix, diags
+from scipy.sparse.linalg import spsolve
+
+from ...core.transforms import invert, nearest_rigid
+from ..overlap import mutual_overlap
+from . import dense_alignment, orb_features
+from .keyframe_registration import KeyframeView, Matched, matched
+
+_STRIDE = 2  # source pixels that are skipped: neighbouring ones say nearly the same
+_LEAST_SHARE, _LEAST_CORRELATION = 0.5, 0.5
+_STILL, _FAR_M = 5e-5, 0.02  # a step that moves nothing any more, and one after which other pairs may overlap
+_PRIOR = 1.0  # information that holds a keyframe which no pair holds
+
+
+@dataclass
+class _Pair:
+    source: int
+    target: int
+    matched: Matched
+    brightness: NDArray[np.float64] = field(default_factory=lambda: np.array((1.0, 0.0)))
+    scales: NDArray[np.float64] = field(default_factory=lambda: np.array((3.0, 5.0)))
+    photometric: float = dense_alignment.PHOTOMETRIC
+
+
+def refine(
+    keyframes: Sequence[KeyframeView],
+    poses: Sequence[NDArray[np.float64]],
+    neighbours: int = 10,
+    least_overlap: float = 0.35,
+    rounds: int = 2,
+    iterations: int = 5,
+) -> list[NDArray[np.float64]]:
+    """T_world_keyframe of K keyframes, refined; the first keeps its pose.
+
+    neighbours: earlier keyframes that each is paired with, those that share most of its view.  rounds: how often pairs
+    are chosen at most; anew only if keyframes moved far since.
+    """
+    T = [np.array(pose) for pose in poses]
+    if len(T) < 2:
+        return T
+    made: dict[tuple[int, int], _Pair] = {}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for _ in range(rounds):
+            before = np.stack(T)
+            chosen = overlapping_pairs(keyframes, T, neighbours, least_overlap)
+            new = [pair for pair in chosen if pair not in made]
+            matches = pool.map(lambda pair: matched(keyframes[pair[0]], keyframes[pair[1]]), new)
+            made.update({pair: _Pair(*pair, found) for pair, found in zip(new, matches, strict=True)})
+            pairs = [made[pair] for pair in chosen]
+            for _ in range(iterations):
+                terms = list(pool.map(lambda pair: _terms(pair, keyframes, T), pairs))
+                step = _solve([pair for pair, term in zip(pairs, terms, strict=True) if term is not None],
+                              [term for term in terms if term is not None], len(T))  # fmt: skip
+                for k, xi in enumerate(step):
+                    dense_alignment.move(T[k], xi)
+                if np.abs(step).max() < _STILL:
+                    break
+            if np.abs(np.stack(T) - before)[:, :3, 3].max() < _FAR_M:
+                break
+    return [nearest_rigid(pose) for pose in T]
+
+
+def overlapping_pairs(
+    keyframes: Sequence[KeyframeView], T: Sequence[NDArray[np.float64]], neighbours: int, least: float
+) -> list[tuple[int, int]]:
+    """(source, target) of the keyframes that share most of their views; each is paired with the one before it."""
+    pairs = set()
+    centers = np.stack([_seen(keyframe, pose) for keyframe, pose in zip(keyframes, T, strict=True)])
+    for n in range(1, len(T)):
+        # The middles of what two cameras see are near where their views overlap: measure only these.
+        near = np.argsort(np.linalg.norm(centers[:n] - centers[n], axis=1), kind="stable")[: 4 * neighbours]
+        T_n_world = invert(T[n])
+        shared = [(mutual_overlap(keyframes[m].overlap, keyframes[n].overlap, T_n_world @ T[m]), int(m)) for m in near]
+        pairs |= {(n, m) for share, m in sorted(shared, reverse=True)[:neighbours] if share >= least}
+        pairs.add((n, n - 1))
+    return sorted(pairs)
+
+
+def _seen(keyframe: KeyframeView, T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) world position of the middle of what a keyframe sees."""
+    points = keyframe.overlap.points
+    middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+    return np.asarray(T[:3, :3] @ middle + T[:3, 3])
+
+
+def _terms(
+    pair: _Pair, keyframes: Sequence[KeyframeView], T: Sequence[NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """A pair's (6, 6), (6,) normal equations of its keyframes' difference in the world frame; None if it disagrees."""
+    source, target = keyframes[pair.source], keyframes[pair.target]
+    a, b = source.view, target.view
+    T_target_world = invert(T[pair.target])
+    T_ts = T_target_world @ T[pair.source]
+    H8, g8, stats = np.zeros((8, 8)), np.zeros(8), np.zeros(dense_alignment.STATS)
+    dense_alignment.linearise(
+        a.points, a.normals, a.gray[0], b.points, b.normals, b.gray[0], b.camera, T_ts, _STRIDE, pair.brightness,
+        pair.scales, pair.photometric, H8, g8, stats,
+    )  # fmt: skip
+    few = stats[1] * _STRIDE**2 < 0.05 * a.points[..., 0].size
+    correlation = dense_alignment.correlation(stats)
+    if few or dense_alignment.inliers(stats) < _LEAST_SHARE or correlation < _LEAST_CORRELATION:
+        return None
+    # Intensities that agree less well (colour that lies beside its depth, reflections) say less of the pose.
+    if not np.isnan(correlation):  # flat ones say nothing, at any weight
+        agreement = (correlation - _LEAST_CORRELATION) / (1 - _LEAST_CORRELATION)
+        pair.photometric = dense_alignment.PHOTOMETRIC * agreement**4
+    pair.brightness += np.linalg.solve(H8[6:, 6:] + 1e-9 * np.eye(2), -g8[6:])
+    H, g, _ = dense_alignment.constrained(*dense_alignment.marginal(H8, g8))
+    orb_features.reprojection(pair.matched.points_s, pair.matched.rays_t, T_ts, target.camera.fx, H, g)
+    A = _adjoint(T_target_world)
+    return A.T @ H @ A, A.T @ g
+
+
+def _solve(
+    pairs: Sequence[_Pair], terms: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], count: int
+) -> NDArray[np.float64]:
+    """(K, 6) steps of all keyframes; the first stays."""
+    if not pairs:
+        return np.zeros((count, 6))
+    blocks = np.stack([H for H, _ in terms])
+    source, target = (np.array([getattr(pair, end) for pair in pairs]) for end in ("source", "target"))
+    row = np.concatenate((source, target, source, target))
+    column = np.concatenate((source, target, target, source))
+    values = np.concatenate((blocks, blocks, -blocks, -blocks))
+    inside = np.arange(6)
+    rows = np.broadcast_to(6 * row[:, None, None] + inside[:, None], values.shape)
+    columns = np.broadcast_to(6 * column[:, None, None] + inside[None, :], values.shape)
+    M = csc_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=(6 * count, 6 * count))
+    g = np.zeros((count, 6))
+    np.add.at(g, source, np.stack([term for _, term in terms]))
+    np.add.at(g, target, -np.stack([term for _, term in terms]))
+    hold = _PRIOR + 1e-4 * M.diagonal()
+    hold[:6] = 1e15
+    return np.asarray(spsolve(M + diags(hold), -g.ravel())).reshape(count, 6)
+
+
+def _adjoint(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6, 6) with T exp(xi) T^-1 = exp(Ad(T) xi), rotation before translation."""
+    R, t = T[:3, :3], T[:3, 3]
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = R
+    A[3:, :3] = np.cross(t, R, axisb=0, axisc=0)
+    return A

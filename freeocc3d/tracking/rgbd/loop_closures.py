@@ -1,0 +1,115 @@
+"""Loop closures: keyframes that show the same place, found by their features and verified by their geometry.
+
+A closure has to pass four tests, for one wrong closure can bend a whole map: enough features agree on one pose; dense
+alignment from there finds the surfaces on each other and the intensities alike; it stays where the features were; and a
+neighbour of one of the two, moved along, falls into place on the other as well.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.transforms import apart, invert
+from ..pose_graph import Edge
+from . import dense_alignment
+from .keyframe_registration import KeyframeView, register_by_features
+from .orb_features import Features, match
+from .place_recognition import Vocabulary, similarity
+
+CANDIDATES = 4
+"""Keyframes that each is compared with: the most similar ones."""
+
+_LEAST_SIMILAR = 0.15
+_BETWEEN = 3  # keyframes on a path between two that are compared
+_FEATURES, _SAMPLE = 20, 300
+_LEAST_OVERLAP, _LEAST_INLIERS, _LEAST_CORRELATION = 0.35, 0.75, 0.7
+_NEAR_M, _NEAR_DEG = 0.10, 4.0
+
+
+def find(
+    keyframes: Sequence[KeyframeView], submap: Sequence[int], T_world_keyframe: Sequence[NDArray[np.float64]]
+) -> list[Edge]:
+    """Verified closures among K keyframes.
+
+    submap: (K,) of which piece of the path each is.  T_world_keyframe: their poses, of which only those of the same
+    submap are compared.
+    """
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        candidates = _candidates(keyframes, submap, pool)
+        found = pool.map(lambda pair: verify(keyframes, submap, T_world_keyframe, *pair), candidates)
+        return [edge for edge in found if edge is not None]
+
+
+def _candidates(
+    keyframes: Sequence[KeyframeView], submap: Sequence[int], pool: ThreadPoolExecutor
+) -> list[tuple[int, int]]:
+    """(later, earlier) rows that look alike and are not neighbours on the path anyway."""
+    described = [keyframe.features.descriptors for keyframe in keyframes]
+    if sum(map(len, described)) < _FEATURES * 2:
+        return []
+    vocabulary = Vocabulary(described)
+    alike = similarity(np.stack(list(pool.map(vocabulary.histogram, described))))
+    pairs, rows = set(), np.arange(len(keyframes))
+    for n in range(len(keyframes)):
+        near = (np.abs(rows - n) <= _BETWEEN) & (np.asarray(submap) == submap[n])
+        scores = np.where(near, -1, alike[n])
+        best = np.argsort(-scores, kind="stable")[:CANDIDATES]
+        pairs |= {(max(n, int(m)), min(n, int(m))) for m in best if scores[m] >= _LEAST_SIMILAR}
+    return sorted(pairs)
+
+
+def in_common(a: Features, b: Features) -> int:
+    """How many features of two frames are each other's nearest, and near, of a sample."""
+    few = [Features(f.pixels[:_SAMPLE], f.descriptors[:_SAMPLE]) for f in (a, b)]
+    return len(match(*few))
+
+
+def verify(
+    keyframes: Sequence[KeyframeView],
+    submap: Sequence[int],
+    T_world_keyframe: Sequence[NDArray[np.float64]],
+    source: int,
+    target: int,
+) -> Edge | None:
+    """The closure of two keyframes, or None if a test fails."""
+    found = register_by_features(keyframes[source], keyframes[target])
+    if found is None or found.agreeing < _FEATURES:
+        return None
+    closed = found.aligned
+    if not _falls_into_place(closed) or not _near(found.by_features, closed.T_target_source):
+        return None
+
+    def agrees(a: int, b: int) -> bool:
+        """Whether keyframes a and b fall into place where the closure and the path say."""
+        T_source_a = invert(T_world_keyframe[source]) @ T_world_keyframe[a]
+        guess = invert(T_world_keyframe[b]) @ T_world_keyframe[target] @ closed.T_target_source @ T_source_a
+        aligned = dense_alignment.align(keyframes[a].view, keyframes[b].view, guess)
+        return _falls_into_place(aligned) and _near(guess, aligned.T_target_source)
+
+    def beside(row: int) -> list[int]:
+        """Its neighbours on the path."""
+        return [n for n in (row - 1, row + 1) if 0 <= n < len(keyframes) and submap[n] == submap[row]]
+
+    pairs = [*((n, target) for n in beside(source)), *((source, n) for n in beside(target))]
+    if not any(agrees(a, b) for a, b in pairs if a != b and {a, b} != {source, target}):
+        return None
+    return Edge(source, target, closed.T_target_source, closed.information, uncertain=True)
+
+
+def _falls_into_place(aligned: dense_alignment.Alignment) -> bool:
+    return (
+        aligned.determined
+        and aligned.overlap >= _LEAST_OVERLAP
+        and aligned.inliers >= _LEAST_INLIERS
+        and aligned.correlation >= _LEAST_CORRELATION
+    )
+
+
+def _near(T_a: NDArray[np.float64], T_b: NDArray[np.float64]) -> bool:
+    metres, degrees = apart(T_a, T_b)
+    return metres <= _NEAR_M and degrees <= _NEAR_DEG

@@ -1,0 +1,144 @@
+"""ORB features of a frame, lifted to 3D by its depth, matched between frames, and the pose that they give.
+
+Sources: E. Rublee et al., ORB: an Efficient Alternative to SIFT or SURF, ICCV 2011; M. Fischler, R. Bolles, Random
+Sample Consensus, CACM 1981; both as OpenCV has them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ...core.types import Frame, Intrinsics
+from .alignment_views import View
+
+COUNT = 800
+_MIN_INLIERS = 12
+_FARTHEST_PX, _AGREES_PX = 12.0, 4.0
+
+
+@dataclass(frozen=True)
+class Features:
+    """pixels: (N, 2) float32 of the colour image.  descriptors: (N, 32) uint8."""
+
+    pixels: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+    def rays(self, camera: Intrinsics) -> NDArray[np.float32]:
+        """(N, 2) x/z and y/z of the pixels for a colour camera."""
+        center = np.array((camera.cx, camera.cy), np.float32)
+        return np.asarray((self.pixels - center) / np.array((camera.fx, camera.fy), np.float32), np.float32)
+
+
+def detect(frame: Frame, count: int = COUNT) -> Features:
+    """The strongest corners of a frame, spread over it."""
+    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+    orb = cv2.ORB_create(nfeatures=count, scaleFactor=1.2, nlevels=8, fastThreshold=10)
+    points, descriptors = orb.detectAndCompute(gray, None)
+    if descriptors is None:
+        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+    return Features(np.array([p.pt for p in points], np.float32), descriptors)
+
+
+def lift(rays: NDArray[np.float32], view: View) -> NDArray[np.float32]:
+    """(N, 3) camera-frame points where the (N, 2) rays meet the planes of the view's pixels, 0 where there is none."""
+    K = view.intrinsics
+    u = np.rint(rays[:, 0] * K.fx + K.cx).astype(int)
+    v = np.rint(rays[:, 1] * K.fy + K.cy).astype(int)
+    inside = (u >= 0) & (v >= 0) & (u < K.width) & (v < K.height)
+    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
+    q, n = view.points[v, u], view.normals[v, u]
+    directions = np.concatenate((rays, np.ones((len(rays), 1), np.float32)), axis=1)
+    along = (n * directions).sum(axis=1)
+    known = inside & (q[:, 2] > 0) & (np.abs(along) > 1e-6)
+    z = np.where(known, (n * q).sum(axis=1) / np.where(known, along, 1.0), 0.0)
+    z = np.where(np.abs(z - q[:, 2]) < 0.05 * q[:, 2], z, 0.0)  # at a grazing surface the plane does not tell
+    return (directions * z[:, None]).astype(np.float32)
+
+
+def match(a: Features, b: Features) -> NDArray[np.int64]:
+    """(M, 2) rows of a and b whose descriptors are each other's nearest, and near."""
+    if not len(a.pixels) or not len(b.pixels):
+        return np.zeros((0, 2), np.int64)
+    found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(a.descriptors, b.descriptors)
+    return np.array([(m.queryIdx, m.trainIdx) for m in found if m.distance < 64], np.int64).reshape(-1, 2)
+
+
+def pose(
+    points_s: NDArray[np.float32],
+    rays_t: NDArray[np.float32],
+    pixel: float,
+    threshold_px: float = 3.0,
+    iterations: int = 300,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+    """T_target_source (4, 4) from (M, 3) source points seen along (M, 2) target rays, and the rows that agree with it;
+    None if too few do. pixel: size of a pixel on the rays, 1 / f.  iterations: draws of RANSAC at most."""
+    if len(points_s) < _MIN_INLIERS:
+        return None
+    cv2.setRNGSeed(1)
+    good, rotation, translation, inliers = cv2.solvePnPRansac(
+        points_s.astype(np.float64), rays_t.astype(np.float64), np.eye(3), None, iterationsCount=iterations,
+        reprojectionError=threshold_px * pixel, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
+    )  # fmt: skip
+    if not good or inliers is None or len(inliers) < _MIN_INLIERS:
+        return None
+    rows = inliers[:, 0]
+    rotation, translation = cv2.solvePnPRefineLM(
+        points_s[rows].astype(np.float64), rays_t[rows].astype(np.float64), np.eye(3), None, rotation, translation
+    )
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(rotation)[0]
+    T[:3, 3] = translation[:, 0]
+    return T, rows.astype(np.int64)
+
+
+@njit(nogil=True, cache=True)
+def reprojection(
+    points_s: NDArray[np.float32],
+    rays_t: NDArray[np.float32],
+    T: NDArray[np.float64],
+    focal: float,
+    H: NDArray[np.float64],
+    g: NDArray[np.float64],
+) -> tuple[int, int]:
+    """Add the reprojection errors of M matches, in pixels, to normal equations (6, 6), (6,) of T <- exp(xi) T.
+
+    points_s: (M, 3), z = 0 where there is no depth.  rays_t: (M, 2).  focal: pixels per unit of a ray.
+    Returns how many matches have a depth, and how many of these agree.
+    """
+    known = agree = 0
+    J = np.zeros((2, 6))
+    for m in range(len(points_s)):
+        if points_s[m, 2] == 0.0:
+            continue
+        known += 1
+        x = T[0, 0] * points_s[m, 0] + T[0, 1] * points_s[m, 1] + T[0, 2] * points_s[m, 2] + T[0, 3]
+        y = T[1, 0] * points_s[m, 0] + T[1, 1] * points_s[m, 1] + T[1, 2] * points_s[m, 2] + T[1, 3]
+        z = T[2, 0] * points_s[m, 0] + T[2, 1] * points_s[m, 1] + T[2, 2] * points_s[m, 2] + T[2, 3]
+        if z < 0.1:
+            continue
+        eu = focal * (x / z - rays_t[m, 0])
+        ev = focal * (y / z - rays_t[m, 1])
+        off = math.sqrt(eu * eu + ev * ev)
+        if off > _FARTHEST_PX:
+            continue
+        if off < _AGREES_PX:
+            agree += 1
+        weight = 1.0 / (1.0 + (off / 3.0) ** 2) ** 2
+        f = focal / z
+        du0, du2 = f, -f * x / z
+        dv1, dv2 = f, -f * y / z
+        J[0, 0], J[0, 1], J[0, 2] = y * du2, z * du0 - x * du2, -y * du0
+        J[0, 3], J[0, 4], J[0, 5] = du0, 0.0, du2
+        J[1, 0], J[1, 1], J[1, 2] = y * dv2 - z * dv1, -x * dv2, x * dv1
+        J[1, 3], J[1, 4], J[1, 5] = 0.0, dv1, dv2
+        for a in range(6):
+            g[a] += weight * (J[0, a] * eu + J[1, a] * ev)
+            for b in range(6):
+                H[a, b] += weight * (J[0, a] * J[0, b] + J[1, a] * J[1, b])
+    return known, agree

@@ -1,0 +1,130 @@
+"""COLMAP's models, read or just made, as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path, PurePath
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from ...capture.base import Capture
+from ...capture.undistortion import Lens
+from ...core.errors import TrackingError
+from ...core.types import Intrinsics
+from .reconstruction import Reconstruction
+
+_READABLE = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV"
+
+
+def read_model(folder: Path, capture: Capture) -> Reconstruction:
+    """The COLMAP model of a folder (cameras, images and points3D, .bin or .txt) as that of the capture's frames, which
+    are known by their names, or by these without their endings. Its scale is unknown. Raises TrackingError."""
+    if not any((folder / f"cameras{ending}").is_file() for ending in (".bin", ".txt")):
+        raise TrackingError(
+            f"{folder} holds no COLMAP model (tracking.colmap.model): expected cameras, images, points3D."
+        )
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+    except (RuntimeError, ValueError, IndexError, MemoryError) as error:
+        said = " ".join(str(error).split())[:160].rstrip(".")
+        raise TrackingError(f"The COLMAP model in {folder} cannot be read: {said}.") from error
+    names = [capture.name(index) for index in range(len(capture))]
+    whole = {PurePath(name).name: index for index, name in enumerate(names) if name}
+    stems = {PurePath(name).stem: index for index, name in enumerate(names) if name}
+
+    def frame_of(name: str) -> int | None:
+        own = PurePath(name)
+        return whole.get(own.name, stems.get(own.stem))
+
+    found = reconstruction_of(model, len(capture), frame_of)
+    if not found.has_pose.any():
+        first = next((image.name for image in model.images.values()), "no image")
+        raise TrackingError(
+            f"No image of the model in {folder} belongs to a frame of {capture.path}: its first is {first}, the "
+            f"capture's {names[0] or 'has no name'}."
+        )
+    if not len(found.points):
+        raise TrackingError(f"The model in {folder} holds no points of the capture's frames.")
+    size = capture[int(np.flatnonzero(found.has_pose)[0])].color.shape[1::-1]
+    camera = found.lens.camera
+    if (camera.width, camera.height) != size:
+        raise TrackingError(
+            f"The model in {folder} is of images of {camera.width} x {camera.height} pixels, those of {capture.path} "
+            f"have {size[0]} x {size[1]}: give the images that it was made of."
+        )
+    return found
+
+
+def reconstruction_of(
+    model: pycolmap.Reconstruction, frames: int, frame_of: Callable[[str], int | None]
+) -> Reconstruction:
+    """A model as that of a capture of N ``frames``; ``frame_of`` tells which one an image shows by its name.
+
+    Raises TrackingError for several cameras or one that OpenCV's model does not express.
+    """
+    T_world_cam = np.full((frames, 4, 4), np.nan)
+    seen_frame, seen_id, cameras = [], [], set()
+    for image in model.images.values():
+        frame = frame_of(image.name) if image.has_pose else None
+        if frame is None:
+            continue
+        T_world_cam[frame] = np.eye(4)
+        T_world_cam[frame, :3] = image.cam_from_world().inverse().matrix()
+        ids = [point.point3D_id for point in image.get_observation_points2D()]  # pycolmap has no array of them
+        seen_id.append(np.array(ids, np.uint64))
+        seen_frame.append(np.full(len(ids), frame, np.int32))
+        cameras.add(image.camera_id)
+    lenses = {lens_of(model.cameras[camera]) for camera in cameras} or {_NO_LENS}
+    if len(lenses) > 1:
+        raise TrackingError(
+            f"The model has {len(lenses)} cameras, but a capture has one: make it with one shared camera "
+            "(COLMAP: --ImageReader.single_camera 1)."
+        )
+    observed = np.concatenate(seen_id) if seen_id else np.zeros(0, np.uint64)
+    unique, seen_point = np.unique(observed, return_inverse=True)
+    points = np.array([model.points3D[int(i)].xyz for i in unique], np.float32).reshape(-1, 3)
+    return Reconstruction(
+        T_world_cam,
+        next(iter(lenses)),
+        points,
+        np.concatenate(seen_frame) if seen_frame else np.zeros(0, np.int32),
+        seen_point.astype(np.int32),
+        metric=False,
+        apart=np.zeros(frames, bool),
+        chosen=np.ones(frames, bool),
+    )
+
+
+def lens_of(camera: pycolmap.Camera) -> Lens:
+    """COLMAP's camera in OpenCV's model. Raises TrackingError if that does not express it."""
+    extra = dict(zip(_names(camera), camera.params.tolist(), strict=True))
+    if camera.model_name == "FULL_OPENCV" and not any(extra[name] for name in ("k3", "k4", "k5", "k6")):
+        model = "OPENCV"
+    else:
+        model = camera.model_name
+    if model not in _READABLE:
+        raise TrackingError(
+            f"The model's camera is {camera.model_name}, which is not understood: make it with {_READABLE}, or "
+            "undistort its images (COLMAP: image_undistorter)."
+        )
+    radial = extra.get("k1", extra.get("k", 0.0))
+    intrinsics = Intrinsics(
+        camera.width, camera.height, camera.focal_length_x if "fx" in extra else camera.focal_length,
+        camera.focal_length_y if "fy" in extra else camera.focal_length,
+        camera.principal_point_x - 0.5, camera.principal_point_y - 0.5,
+    )  # fmt: skip
+    return Lens(intrinsics, (radial, *(extra.get(name, 0.0) for name in ("k2", "p1", "p2"))))
+
+
+def _names(camera: pycolmap.Camera) -> list[str]:
+    return [name.strip() for name in camera.params_info.split(",")]
+
+
+_NO_LENS = Lens(Intrinsics(1, 1, 1.0, 1.0, 0.0, 0.0))
+
+
+def registered(model: pycolmap.Reconstruction) -> NDArray[np.int64]:
+    """Ids of the images that have a pose, ascending."""
+    return np.array(sorted(model.reg_image_ids()), np.int64)

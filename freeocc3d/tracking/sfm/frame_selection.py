@@ -1,0 +1,77 @@
+"""Which frames of a long scan are reconstructed: sharp ones, with the same way of image motion between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...capture import read_ahead
+from ...capture.base import Capture
+from ...core.errors import FrameError
+from ...core.progress import Progress
+
+_WIDTH = 320  # motion and sharpness are measured in images of this width
+_CORNERS, _LEAST_FOLLOWED = 150, 20
+_LOST = 0.25  # of the width: counted where nothing could be followed
+_ASTRAY_PX = 1.0  # from where a corner was, when it is followed there and back
+_CREEP = 1e-4  # of the width, so that a camera that rests still gets on
+
+
+def choose(capture: Capture, frames: Sequence[int], budget: int, progress: Progress) -> list[int]:
+    """At most ``budget`` of the frames, ascending; all of them if they are no more. Frames that cannot be decoded are
+    left out of a choice."""
+    if len(frames) <= budget:
+        return list(frames)
+    progress.stage("selection", len(frames))
+    indices, sharp, moved = [], [], []
+    before: NDArray[np.uint8] | None = None
+    for done, (index, frame) in enumerate(read_ahead(capture, frames), 1):
+        if not isinstance(frame, FrameError):
+            image = _small(frame.color)
+            indices.append(index)
+            sharp.append(sharpness(image))
+            moved.append(0.0 if before is None else motion(before, image))
+            before = image
+        progress.advance(done)
+    return [indices[row] for row in spread(np.array(sharp), np.array(moved), budget)]
+
+
+def spread(sharp: NDArray[np.float64], moved: NDArray[np.float64], budget: int) -> list[int]:
+    """Rows of (N,) frames: the way of (N,) steps, each from the frame before, is cut into ``budget`` equal parts, and
+    of each the sharpest frame is taken."""
+    way = np.cumsum(np.maximum(moved, _CREEP))
+    part = np.minimum((way - way[0]) / max(way[-1] - way[0], 1e-12) * budget, budget - 1).astype(np.int64)
+    order = np.lexsort((-sharp, part))
+    _, first = np.unique(part[order], return_index=True)
+    return sorted(order[first].tolist())
+
+
+def sharpness(gray: NDArray[np.uint8]) -> float:
+    """Variance of the Laplacian: higher where edges are crisp."""
+    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
+
+
+def motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
+    """Median way of corners from one (H, W) grey image to the next, over the width."""
+    corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 8)
+    if corners is None or len(corners) < _LEAST_FOLLOWED:
+        return _LOST
+    followed, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, followed, None)
+    astray = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
+    found = (found.ravel() == 1) & (returned.ravel() == 1) & (astray < _ASTRAY_PX)
+    if found.sum() < max(_LEAST_FOLLOWED, 0.3 * len(corners)):
+        return _LOST
+    way = np.linalg.norm((followed - corners).reshape(-1, 2)[found], axis=1)
+    return min(float(np.median(way)) / before.shape[1], _LOST)
+
+
+def _small(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+    if gray.shape[1] <= _WIDTH:
+        return gray
+    height = max(round(gray.shape[0] * _WIDTH / gray.shape[1]), 1)
+    return cv2.resize(gray, (_WIDTH, height), interpolation=cv2.INTER_AREA)

@@ -1,0 +1,214 @@
+"""Structure from motion of a capture: which frames, their features, what they share, and poses and points from that.
+
+Each stage leaves its result in a folder, and is not done again. The stages: frames are chosen (``selection``), features
+found (``local_features``), pairs of images proposed (``candidates``), matched and verified (``matching``), mapped and
+adjusted (``mapping``).
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from ...capture.base import Capture
+from ...core.errors import FrameError
+from ...core.progress import Progress
+from ...core.types import Intrinsics
+from . import diagnosis, frame_selection, mapping, pair_selection
+from .colmap_reconstruction import reconstruction_of
+from .database import SfmDatabase, image_name
+from .feature_matching import match
+from .local_features import Detector, LocalFeatures, detector
+from .reconstruction import Reconstruction
+
+_DATABASE, _CHOSEN, _RESULT = "database.db", "chosen.json", "reconstruction.npz"
+
+_ALL_PAIRS = 60
+"""Images in no order of which all pairs are compared; of more, those that look alike."""
+
+_FOLLOW, _ALIKE, _ALIKE_UNORDERED = 5, 8, 24
+_CHUNK = 64
+_CACHED = 128
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a capture is reconstructed; ``colmap.Options`` says what each means."""
+
+    frames: int = 300
+    order: str = "auto"
+    features: str = "sift"
+    mapping: str = "incremental"
+    intrinsics: str = "refine"
+
+
+def reconstruct(
+    capture: Capture, frames: Sequence[int], folder: Path, recipe: Recipe, progress: Progress
+) -> Reconstruction:
+    """Poses and points of the capture's frames, in a unit in which the median depth is ``NOMINAL_DEPTH``.
+
+    folder: takes what lets an interrupted call go on. Raises TrackingError for a scan that gives none, ModelError.
+    """
+    if (folder / _RESULT).is_file():
+        return Reconstruction.load(folder / _RESULT)
+    what = str(capture.path)
+    diagnosis.check_count(len(frames), what)
+    chosen = _chosen(capture, frames, folder / _CHOSEN, recipe.frames, progress)
+    detect = detector(recipe.features)
+    mapping.silence()
+    with SfmDatabase(folder / _DATABASE) as database:
+        warnings = _extract(capture, chosen, database, detect, recipe, progress)
+        found = database.frames()
+        diagnosis.check_count(len(found), what)
+        diagnosis.check_features([len(database.pixels(frame)) for frame in found], what)
+        _compare(database, found, recipe.order, detect.ratio, progress)
+        diagnosis.check_motion(database, what)
+        models = _mapped(folder, len(found), recipe, progress)
+        largest = models[0].num_reg_images() if models else 0
+        if largest < diagnosis.LEAST_IMAGES:
+            raise diagnosis.no_model(database, largest, what)
+    progress.stage("adjustment")
+    model = mapping.adjusted(models[0], recipe.intrinsics == "fixed", distorts=not capture.intrinsics_known)
+    frame_of = {image_name(index): index for index in found}
+    result = reconstruction_of(model, len(capture), frame_of.get).normalised()
+    apart, pieces = _apart(models, result.has_pose)
+    if pieces:
+        warnings.append(
+            f"{what} fell into {pieces + 1} models that nothing ties together: the largest, of {largest} images, is "
+            "mapped. Film the way between them, or reconstruct them one by one (capture.start, capture.stop)."
+        )
+    result = replace(
+        result,
+        apart=apart,
+        chosen=np.isin(np.arange(len(capture)), chosen),
+        warnings=tuple(warnings),
+    )
+    result.save(folder / _RESULT)
+    return result
+
+
+def _apart(models: Sequence[pycolmap.Reconstruction], has_pose: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int]:
+    """(N,) frames that are in other models than the first, and how many such models there are: what another model has
+    of its own must be more than a few frames."""
+    apart, pieces = np.zeros(len(has_pose), bool), 0
+    for model in models[1:]:
+        own = np.array(model.reg_image_ids(), np.int64) - 1
+        own = own[~has_pose[own] & ~apart[own]]
+        if len(own) >= diagnosis.LEAST_IMAGES:
+            apart[own] = True
+            pieces += 1
+    return apart, pieces
+
+
+def _chosen(capture: Capture, frames: Sequence[int], path: Path, budget: int, progress: Progress) -> list[int]:
+    """The frames that are reconstructed."""
+    if path.is_file():
+        return list(json.loads(path.read_text(encoding="utf-8")))
+    found = frame_selection.choose(capture, frames, budget, progress)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(found), encoding="utf-8")
+    temporary.replace(path)
+    return found
+
+
+def _extract(
+    capture: Capture,
+    chosen: Sequence[int],
+    database: SfmDatabase,
+    detect: Detector,
+    recipe: Recipe,
+    progress: Progress,
+) -> list[str]:
+    """Features of the chosen frames into the database; a frame that cannot be decoded, or of another size than the
+    first, is left out. Returns warnings."""
+    progress.stage("features", len(chosen))
+    there = set(database.frames())
+    waiting = [index for index in chosen if index not in there]
+    others = 0
+
+    def seen(index: int) -> tuple[Intrinsics, LocalFeatures] | None:
+        try:
+            frame = capture[index]
+        except FrameError:
+            return None
+        return frame.intrinsics, detect(frame.color)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for start in range(0, len(waiting), _CHUNK):
+            part = waiting[start : start + _CHUNK]
+            done = len(chosen) - len(waiting) + start
+            for index, found in zip(part, pool.map(seen, part), strict=True):
+                if found is not None:
+                    camera, features = found
+                    database.set_camera(_model(capture, recipe), camera, capture.intrinsics_known)
+                    if (camera.width, camera.height) == database.size():
+                        database.add(index, features)
+                    else:
+                        others += 1
+                done += 1
+                progress.advance(done)
+    return [f"{others} images of {capture.path} have another size than the first and are left out."] if others else []
+
+
+def _model(capture: Capture, recipe: Recipe) -> str:
+    """COLMAP's name of the camera that images are matched and mapped with."""
+    if recipe.intrinsics == "fixed":
+        return "PINHOLE"
+    return "SIMPLE_PINHOLE" if capture.intrinsics_known else "SIMPLE_RADIAL"
+
+
+def _compare(database: SfmDatabase, frames: Sequence[int], order: str, ratio: float, progress: Progress) -> None:
+    """Match the pairs of images that may show the same, and verify what matches by its geometry."""
+    descriptors = functools.lru_cache(_CACHED)(database.descriptors)
+    proposed = [(frames[i], frames[j]) for i, j in _pairs(descriptors, frames, order).tolist()]
+    verified = database.verified()
+    waiting = [pair for pair in proposed if pair not in verified]
+    progress.stage("matching", len(proposed))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for start in range(0, len(waiting), _CHUNK):
+            part = waiting[start : start + _CHUNK]
+            described = [(descriptors(i), descriptors(j)) for i, j in part]
+            database.add_matches(part, list(pool.map(lambda pair: match(pair[0], pair[1], ratio), described)))
+            progress.advance(len(proposed) - len(waiting) + start + len(part))
+
+
+def _pairs(descriptors: Callable[[int], NDArray[np.float32]], frames: Sequence[int], order: str) -> NDArray[np.int64]:
+    """(P, 2) rows of ``frames`` to be compared."""
+    rng = np.random.default_rng(0)
+    sampled = []
+    for frame in frames:
+        found = descriptors(frame)
+        sampled.append(found[rng.permutation(len(found))[: pair_selection.OF_IMAGE]])
+    alike = pair_selection.similarity(sampled)
+    if order == "video" or (order == "auto" and pair_selection.in_order(alike)):
+        return pair_selection.pairs(alike, _FOLLOW, _ALIKE)
+    return pair_selection.pairs(alike, 0, len(frames) - 1 if len(frames) <= _ALL_PAIRS else _ALIKE_UNORDERED)
+
+
+def _mapped(folder: Path, images: int, recipe: Recipe, progress: Progress) -> list[pycolmap.Reconstruction]:
+    """Models, the largest first. Images that a model lacks are tried again when all of it is there."""
+    fixed = recipe.intrinsics == "fixed"
+    progress.stage("mapping", images)
+    placed = itertools.count(1)
+
+    def advance() -> None:
+        progress.advance(min(next(placed), images))
+
+    if recipe.mapping == "global":
+        models = mapping.global_(folder / _DATABASE, folder, fixed)
+    else:
+        models = mapping.incremental(folder / _DATABASE, folder, fixed, advance)
+    somewhere = {image_id for model in models for image_id in model.reg_image_ids()}
+    if models and len(somewhere) < images:
+        models[0] = mapping.continued(folder / _DATABASE, folder, fixed, models[0])
+    return models

@@ -1,1 +1,0 @@
-"""Multi-view stereo: dense depth of posed frames from their colour."""

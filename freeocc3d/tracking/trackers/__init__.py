@@ -1,0 +1,1 @@
+"""Trackers, one file each; ../base.py is their contract."""

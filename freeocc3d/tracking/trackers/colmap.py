@@ -1,0 +1,112 @@
+"""Estimates poses from colour alone: structure from motion over the whole scan, or an existing COLMAP model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...capture.base import Capture
+from ...core.errors import ConfigError
+from ...core.progress import Progress
+from ...core.types import Frame, Trajectory
+from ...depth.multi_view_stereo import Scan
+from ...settings.registry import require_positive
+from ..base import Tracked
+from ..given_poses import GivenTracker
+from ..sfm.colmap_reconstruction import read_model
+from ..sfm.reconstruction import Reconstruction
+from ..sfm.structure_from_motion import Recipe, reconstruct
+
+REQUIRES: tuple[str, ...] = ("pycolmap",)
+
+_CHOICES = {
+    "order": ("auto", "video", "photos"),
+    "mapping": ("incremental", "global"),
+    "intrinsics": ("refine", "fixed"),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which frames, how they are matched and mapped, the camera, and an existing model."""
+
+    frames: int = 300
+    """Frames that are reconstructed at most: of more, the sharpest ones with the same way of image motion between."""
+    order: str = "auto"
+    """"video": each frame shows much of the one before; "photos": images in no order; "auto": as the images say."""
+    features: str = "sift"
+    """"sift", or the path of an ONNX network that finds keypoints and descriptors (SuperPoint, DISK, ALIKED)."""
+    mapping: str = "incremental"
+    """"incremental" adds image by image; "global" places all at once: faster, but needs each seen in many others."""
+    intrinsics: str = "refine"
+    """"refine": those of the capture are a start; "fixed": they are kept as they are."""
+    model: str | None = None
+    """Folder of a COLMAP model (cameras, images, points3D) of the capture's images that is taken instead."""
+    keyframe_overlap: float = 0.85
+    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "frames", "keyframe_overlap")
+        for name, known in _CHOICES.items():
+            if getattr(self, name) not in known:
+                raise ConfigError(f"'{name}' must be {' or '.join(known)}, got '{getattr(self, name)}'.")
+
+
+def load(options: Options, capture: Capture) -> ColmapTracker:
+    """The tracker; the capture's depth and poses are not read. Raises ConfigError."""
+    if options.intrinsics == "fixed" and not capture.intrinsics_known and options.model is None:
+        raise ConfigError(
+            f"tracking.colmap.intrinsics=fixed needs the camera of {capture.path}: give capture.intrinsics, or refine."
+        )
+    return ColmapTracker(options, capture)
+
+
+class ColmapTracker(GivenTracker):
+    """Poses stand when ``prepare`` is done; frames that were not chosen are "unused", those of smaller models "apart".
+    Frames are given as a pinhole camera would have taken them."""
+
+    world: ClassVar[str] = "OpenCV camera axes of the model's world, in units of half the median depth of its points"
+    estimates_camera = True
+
+    def __init__(self, options: Options, capture: Capture):
+        super().__init__(np.full((len(capture), 4, 4), np.nan), options.keyframe_overlap, capture)
+        self.options = options
+        self.offline, self.metric = True, capture.options.scale is not None
+        self.reconstruction: Reconstruction | None = None
+
+    def scan(self, folder: Path, frames: range, progress: Progress) -> Scan:
+        found = self._reconstructed(folder, frames, progress)
+        self.reconstruction, self.T_world_cam, self.warnings = found, found.T_world_cam, found.warnings
+        return found
+
+    def _reconstructed(self, folder: Path, frames: range, progress: Progress) -> Reconstruction:
+        options, scale = self.options, self._capture.options.scale
+        if options.model is not None:
+            found = read_model(Path(options.model).expanduser(), self._capture).normalised()
+        else:
+            recipe = Recipe(options.frames, options.order, options.features, options.mapping, options.intrinsics)
+            found = reconstruct(self._capture, frames, folder, recipe, progress)
+        return found if scale is None else found.scaled(scale)
+
+    def as_pinhole(self, frame: Frame) -> Frame:
+        """Undistorted."""
+        assert self.reconstruction is not None, "prepare comes first"
+        rectified = self.reconstruction.rectified
+        return replace(frame, color=rectified.color(frame.color), intrinsics=rectified.intrinsics)
+
+    def track(self, frame: Frame) -> Tracked:
+        assert self.reconstruction is not None, "prepare comes first"
+        if not self.reconstruction.chosen[frame.index]:
+            return Tracked("unused", None, 0.0)
+        return super().track(frame)
+
+    def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
+        found = super().trajectory(timestamps)
+        if self.reconstruction is None or not self.reconstruction.apart.any():
+            return found
+        status = np.where(self.reconstruction.apart & (found.status == "lost"), "apart", found.status)
+        return replace(found, status=status)

@@ -1,0 +1,44 @@
+"""Takes the capture's own poses; a frame that shares too little with its keyframe becomes a keyframe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from ...capture.base import Capture
+from ...core.errors import TrackingError
+from ...settings.registry import require_positive
+from ..given_poses import GivenTracker
+
+REQUIRES: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Options:
+    """Keyframes."""
+
+    keyframe_overlap: float = 0.85
+    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "keyframe_overlap")
+
+
+def load(options: Options, capture: Capture) -> KnownTracker:
+    """The tracker that reads ``capture.pose``. Raises TrackingError if the capture has no poses at all."""
+    stated = [capture.pose(index) for index in range(len(capture))]
+    if all(pose is None for pose in stated):
+        raise TrackingError(f"{capture.path} brings no poses: use tracking.backend=rgbd, which estimates them.")
+    none = np.full((4, 4), np.nan)
+    given = np.stack([none if pose is None else pose for pose in stated])
+    tracker = KnownTracker(given, options.keyframe_overlap, capture)
+    tracker.metric = capture.metric_poses
+    return tracker
+
+
+class KnownTracker(GivenTracker):
+    """The world frame is that of the capture's poses; a frame without a pose is lost."""
+
+    world: ClassVar[str] = "world frame of the capture's poses, metres"

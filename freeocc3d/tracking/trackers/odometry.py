@@ -1,0 +1,249 @@
+"""Open3D's hybrid odometry against keyframes and a pose graph over them, with which "rgbd" is compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...capture.base import Capture
+from ...core.errors import ConfigError
+from ...core.transforms import invert, nearest_rigid
+from ...core.types import Frame, Intrinsics
+from ...settings.registry import require_positive
+from .. import pose_graph
+from ..base import Tracked, Tracker
+from ..overlap import DepthView, mutual_overlap, sample_points
+from ..pose_graph import Edge
+from ..records import Records
+
+REQUIRES: tuple[str, ...] = ("open3d",)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Odometry and keyframes."""
+
+    device: str = "cpu"
+    """Where the odometry runs: "cpu", or "cuda:0" and so on with an Open3D that has CUDA."""
+    width: int = 320
+    """Images are tracked at this width (a smaller one is kept)."""
+    iterations: tuple[int, int, int] = (10, 6, 4)
+    """Gauss–Newton iterations per pyramid level, coarse to fine."""
+    depth_difference: float = 0.07
+    """Pixels whose depths differ by more than this many metres are no correspondence."""
+    keyframe_overlap: float = 0.85
+    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
+    min_fitness: float = 0.3
+    """Share of pixels that must find a correspondence."""
+    max_residual: float = 0.03
+    """Largest root mean square of the odometry's residual (metres and grey levels, 0…1, mixed)."""
+    min_information: float = 1e-3
+    """Smallest eigenvalue of the information matrix, per correspondence, that still counts as constrained."""
+    overlap_edges: int = 6
+    """Earlier keyframes that a new one is registered to, beyond the last: those that share most of its view."""
+    min_edge_overlap: float = 0.4
+    """Share of the view that such a keyframe must have in common."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "width", "depth_difference", "keyframe_overlap", "min_fitness", "max_residual")
+        if min(self.iterations) < 0 or max(self.iterations) == 0:
+            raise ConfigError(f"'iterations' must not be negative, nor all zero, got {self.iterations}.")
+
+
+@dataclass(frozen=True)
+class _View(DepthView):
+    """A frame as the odometry needs it, at tracking size."""
+
+    rgbd: object
+
+
+@dataclass(frozen=True)
+class _Match:
+    T_target_source: NDArray[np.float64]
+    information: NDArray[np.float64]
+    fitness: float
+    ok: bool
+
+
+def load(options: Options, capture: Capture) -> OdometryTracker:
+    """The tracker; ``capture`` is not read. Raises ConfigError for a device that is not there."""
+    return OdometryTracker(options)
+
+
+class OdometryTracker(Tracker):
+    """Registers each frame to the present keyframe, starting from constant velocity; a frame that shares too little
+    with it becomes the next keyframe, and is registered to earlier keyframes that look at the same place.
+
+    Odometry: J. Park, Q.-Y. Zhou, V. Koltun, Colored Point Cloud Registration Revisited, ICCV 2017, in Open3D's tensor
+    implementation (hybrid photometric and geometric residual, multi-scale).
+    """
+
+    needs_depth: ClassVar[bool] = True
+
+    def __init__(self, options: Options):
+        super().__init__()
+        self.options = options
+        self.device = _device(options.device)
+        self._keyframes: list[_View] = []
+        self._T_keyframe_last: NDArray[np.float64] | None = None  # last tracked frame, in the present keyframe
+        self._velocity = np.eye(4)  # T_previous_last
+        self._frames_lost = 0
+
+    def track(self, frame: Frame) -> Tracked:
+        view = self._view(frame)
+        if not self._keyframes:
+            return self._start(frame.index, view)
+        match = self._register_to_keyframe(view)
+        if match is None:
+            self._frames_lost += 1
+            self.records.add_lost(frame.index)
+            return Tracked("lost", None, 0.0)
+        self._update_velocity(match.T_target_source)
+        T_world_cam = self.records.T_world_keyframe[-1] @ match.T_target_source
+        confidence = self._confidence(match)
+        if self._is_keyframe(view, match):
+            self._add_keyframe(frame.index, view, match, confidence)
+            return Tracked("keyframe", T_world_cam, confidence)
+        self.records.add_tracked(frame.index, len(self._keyframes) - 1, match.T_target_source, confidence)
+        return Tracked("tracked", T_world_cam, confidence)
+
+    def optimize(self) -> None:
+        self.records.T_world_keyframe = pose_graph.optimize(self.records.T_world_keyframe, self.edges)
+
+    def _start(self, index: int, view: _View) -> Tracked:
+        if np.count_nonzero(view.depth_m) < 0.05 * view.depth_m.size:
+            self.records.add_lost(index)
+            return Tracked("lost", None, 0.0)
+        self.records.add_keyframe(index, np.eye(4), 1.0)
+        self._keyframes.append(view)
+        self._T_keyframe_last = np.eye(4)
+        return Tracked("keyframe", np.eye(4), 1.0)
+
+    def _register_to_keyframe(self, view: _View) -> _Match | None:
+        """The match with the present keyframe from the first starting guess that passes the failure test."""
+        assert self._T_keyframe_last is not None
+        guesses = [self._T_keyframe_last @ self._velocity, self._T_keyframe_last]
+        for guess in guesses:
+            match = self._register(view, self._keyframes[-1], guess)
+            if match.ok:
+                return match
+        return None
+
+    def _register(self, source: _View, target: _View, T_target_source: NDArray[np.float64]) -> _Match:
+        """Odometry of ``source`` against ``target`` and its failure test."""
+        import open3d as o3d
+
+        odometry = o3d.t.pipelines.odometry
+        failed = _Match(T_target_source, np.eye(6), 0.0, ok=False)
+        valid = np.count_nonzero(source.depth_m) / source.depth_m.size
+        if valid < 0.05:
+            return failed
+        K = o3d.core.Tensor(source.intrinsics.matrix)
+        try:
+            result = odometry.rgbd_odometry_multi_scale(
+                source.rgbd, target.rgbd, K, o3d.core.Tensor(T_target_source), 1.0, 1000.0,
+                [odometry.OdometryConvergenceCriteria(n) for n in self.options.iterations],
+                odometry.Method.Hybrid,
+                odometry.OdometryLossParams(self.options.depth_difference, 0.05, 0.1),
+            )  # fmt: skip
+        except RuntimeError:  # a singular system: nothing to align
+            return failed
+        T = result.transformation.cpu().numpy()
+        fitness, residual = result.fitness / valid, result.inlier_rmse
+        if not np.isfinite(T).all() or fitness < self.options.min_fitness or residual > self.options.max_residual:
+            return failed
+        information = odometry.compute_odometry_information_matrix(
+            source.rgbd.depth, target.rgbd.depth, K, result.transformation,  # type: ignore[attr-defined]
+            self.options.depth_difference, 1.0, 1000.0,
+        ).cpu().numpy()  # fmt: skip
+        weakest = np.linalg.eigvalsh(information)[0] / max(information[5, 5], 1.0)
+        return _Match(nearest_rigid(T), information, fitness, ok=bool(weakest >= self.options.min_information))
+
+    def _update_velocity(self, T_keyframe_cam: NDArray[np.float64]) -> None:
+        assert self._T_keyframe_last is not None
+        moved = invert(self._T_keyframe_last) @ T_keyframe_cam
+        self._velocity = moved if self._frames_lost == 0 else np.eye(4)
+        self._T_keyframe_last = T_keyframe_cam
+        self._frames_lost = 0
+
+    def _is_keyframe(self, view: _View, match: _Match) -> bool:
+        return mutual_overlap(view, self._keyframes[-1], match.T_target_source) < self.options.keyframe_overlap
+
+    def _confidence(self, match: _Match) -> float:
+        return float(np.clip(match.fitness, 0.0, 1.0))
+
+    def _add_keyframe(self, index: int, view: _View, match: _Match, confidence: float) -> None:
+        row = len(self._keyframes)
+        self.records.add_keyframe(index, self.records.T_world_keyframe[-1] @ match.T_target_source, confidence)
+        self.edges.append(Edge(row, row - 1, match.T_target_source, match.information, uncertain=False))
+        self._keyframes.append(view)
+        self._T_keyframe_last = np.eye(4)
+        self._add_overlap_edges(row)
+
+    def _add_overlap_edges(self, row: int) -> None:
+        """Register keyframe ``row`` to the earlier ones that share most of its view by the present poses."""
+        view, T_cam_world = self._keyframes[row], invert(self.records.T_world_keyframe[row])
+        shared = [
+            mutual_overlap(other, view, T_cam_world @ self.records.T_world_keyframe[k])
+            for k, other in enumerate(self._keyframes[: row - 1])
+        ]
+        best = np.argsort(shared)[::-1][: self.options.overlap_edges]
+        for k in (int(k) for k in best if shared[k] >= self.options.min_edge_overlap):
+            guess = invert(self.records.T_world_keyframe[k]) @ self.records.T_world_keyframe[row]
+            match = self._register(view, self._keyframes[k], guess)
+            if match.ok:
+                self.edges.append(Edge(row, k, match.T_target_source, match.information, uncertain=True))
+
+    def _view(self, frame: Frame) -> _View:
+        import open3d as o3d
+
+        camera, color, depth = frame.intrinsics, frame.color, frame.depth_m
+        step = max(1, round(camera.width / self.options.width))
+        if step > 1:
+            # Depth is picked, never averaged across an edge; colour is averaged around the same pixels, by a window of
+            # odd size, so that both stay registered and the principal point moves with them exactly.
+            first = step // 2
+            color = cv2.blur(color, (step | 1, step | 1))[first::step, first::step]
+            depth = depth[first::step, first::step]
+            camera = Intrinsics(
+                depth.shape[1], depth.shape[0], camera.fx / step, camera.fy / step,
+                (camera.cx - first) / step, (camera.cy - first) / step,
+            )  # fmt: skip
+        depth = np.ascontiguousarray(depth)
+        rgbd = o3d.t.geometry.RGBDImage(
+            o3d.t.geometry.Image(np.ascontiguousarray(color)), o3d.t.geometry.Image(depth[..., None])
+        ).to(self.device)
+        return _View(depth, camera, sample_points(depth, camera), rgbd)
+
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        last = self._T_keyframe_last if self._T_keyframe_last is not None else np.eye(4)
+        return {
+            **super().state(),
+            "last": np.stack((last, self._velocity)),
+            "frames_lost": np.array(self._frames_lost),
+        }
+
+    def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
+        self.records = Records.from_arrays(state)
+        self._keyframes = [self._view(frame) for frame in keyframes]
+        self._T_keyframe_last, self._velocity = np.asarray(state["last"], np.float64)
+        self._frames_lost = int(state["frames_lost"])
+        self.edges = pose_graph.edges_from_arrays(state)
+
+
+def _device(name: str) -> object:
+    """The Open3D device of a name such as "cpu" or "cuda:0". Raises ConfigError if there is none."""
+    import open3d as o3d
+
+    kind, _, number = name.lower().partition(":")
+    number = number or "0"
+    if kind not in ("cpu", "cuda") or not number.isdigit():
+        raise ConfigError(f"Unknown device '{name}': use cpu or cuda:0.")
+    if kind == "cuda" and int(number) >= o3d.core.cuda.device_count():
+        raise ConfigError(f"There is no device '{name}': Open3D sees {o3d.core.cuda.device_count()} CUDA devices here.")
+    return o3d.core.Device(kind.upper(), int(number))

@@ -1,0 +1,253 @@
+"""Estimates poses from colour and depth: dense tracking, relocalisation, loop closures, a joint refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...capture.base import Capture
+from ...core.transforms import apart, invert
+from ...core.types import Frame
+from ...settings.registry import require_positive
+from .. import pose_graph
+from ..base import Tracked, Tracker
+from ..overlap import DepthView, mutual_overlap
+from ..pose_graph import Edge
+from ..records import Records
+from ..rgbd import dense_alignment, joint_refinement, loop_closures
+from ..rgbd.alignment_views import View, view_of
+from ..rgbd.keyframe_registration import KeyframeView, Registered, keyframe_view, register_by_features, surface_of
+
+REQUIRES: tuple[str, ...] = ("open3d",)
+
+_LEAST_COVERED = 0.05  # share of the pixels that show a surface, or there is nothing to track
+_LEAST_OVERLAP, _LEAST_INLIERS, _LEAST_CORRELATION = 0.3, 0.6, 0.5  # or the frame is lost
+_CONFIRMED_OVERLAP, _CONFIRMED_M, _CONFIRMED_DEG = 0.15, 0.15, 8.0  # features and surfaces say the same
+_RECOGNISED_OVERLAP = 0.5
+_SURE_INLIERS, _SURE_CORRELATION = 0.75, 0.96  # or features are asked
+_LIKELY_CORRELATION = 0.8
+_JUMP_M, _JUMP_DEG = 0.10, 6.0  # from where the camera was going; or features are asked
+_FEATURES = 20
+_DRAWS = 1000  # of RANSAC for a lost frame, which is worth more of them
+_RECENT = 4  # keyframes that a lost frame is compared with, besides those that look alike
+
+
+@dataclass(frozen=True)
+class Options:
+    """Tracking, loop closure and refinement."""
+
+    keyframe_overlap: float = 0.8
+    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
+    close_loops: bool = True
+    """Recognise places that were seen before, and make the path agree with them."""
+    refine: bool = True
+    """Align all overlapping keyframes jointly at the end."""
+    neighbours: int = 16
+    """Earlier keyframes that each is aligned with in the refinement."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "keyframe_overlap", "neighbours")
+
+
+def load(options: Options, capture: Capture) -> RgbdTracker:
+    """The tracker; ``capture`` is not read."""
+    return RgbdTracker(options)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A frame as the tracker needs it; its features are detected when they are asked for."""
+
+    frame: Frame
+    view: View
+    surface: DepthView
+    _full: list[KeyframeView] = field(default_factory=list)
+
+    @property
+    def full(self) -> KeyframeView:
+        if not self._full:
+            self._full.append(keyframe_view(self.frame, self.view))
+        return self._full[0]
+
+
+class RgbdTracker(Tracker):
+    """Aligns each frame densely to a keyframe, starting from constant velocity; when the result is in doubt, from the
+    pose that matched features give. A frame that shares too little with its keyframe becomes the next one. A frame that
+    cannot be placed is looked for in the keyframes so far; if none shows what it shows, it begins a submap.
+
+    ``optimize`` closes loops, ties submaps together where they show the same place, and aligns all keyframes jointly.
+    The largest piece that hangs together is what is mapped.
+    """
+
+    needs_depth: ClassVar[bool] = True
+
+    def __init__(self, options: Options):
+        super().__init__()
+        self.options = options
+        self.keyframes: list[KeyframeView] = []
+        self._current = -1  # row of the keyframe that frames are aligned to
+        self._T_keyframe_last = np.eye(4)  # last tracked frame, in that keyframe
+        self._velocity = np.eye(4)  # T_previous_last
+        self._frames_lost = 0
+        self._last: _Seen | None = None  # not kept over an interruption: keyframes are enough to go on
+
+    def track(self, frame: Frame) -> Tracked:
+        view = view_of(frame)
+        if view.covered < _LEAST_COVERED:
+            return self._lose(frame.index)
+        seen = _Seen(frame, view, surface_of(view))
+        if not self.keyframes:
+            return self._begin_submap(seen)
+        aligned = self._follow(seen)
+        if aligned is None:
+            return self._relocalise(seen) or self._begin_submap(seen)
+        T = aligned.T_target_source
+        self._velocity = invert(self._T_keyframe_last) @ T if self._frames_lost == 0 else np.eye(4)
+        return self._place(seen, aligned, "tracked")
+
+    def optimize(self) -> None:
+        T = self.records.T_world_keyframe
+        self.edges = [edge for edge in self.edges if not edge.uncertain]
+        if self.options.close_loops and len(T) > 2:
+            found = loop_closures.find(self.keyframes, self.records.submap, T)
+            self.edges = pose_graph.agreeing(T, self.records.submap, [*self.edges, *found])
+        pieces = pose_graph.pieces(self.records.submap, self.edges)
+        for rows in pieces:
+            placed = pose_graph.optimize_piece(T, self.edges, rows)
+            if self.options.refine:
+                placed = joint_refinement.refine([self.keyframes[k] for k in rows], placed, self.options.neighbours)
+            for k, pose in zip(rows, placed, strict=True):
+                T[k] = pose
+        self.records.pieces = pieces
+
+    def _follow(self, seen: _Seen) -> dense_alignment.Alignment | None:
+        """The alignment to the current keyframe; None if there is none that can be trusted."""
+        target = self.keyframes[self._current]
+        guess = self._T_keyframe_last @ self._velocity
+        aligned = dense_alignment.align(seen.view, target.view, guess)
+        metres, degrees = apart(guess, aligned.T_target_source)
+        if _sure(aligned) and metres <= _JUMP_M and degrees <= _JUMP_DEG and self._frames_lost == 0:
+            return aligned
+        found = register_by_features(seen.full, target)
+        if found is not None and _confirmed(found) and _score(found.aligned) >= _score(aligned):
+            return found.aligned
+        steady = metres <= _JUMP_M and degrees <= _JUMP_DEG and self._frames_lost == 0
+        alike = not aligned.correlation < _LIKELY_CORRELATION  # where nothing varies, nothing disagrees
+        good = alike and aligned.overlap >= _LEAST_OVERLAP and aligned.inliers >= _SURE_INLIERS
+        return aligned if good and (steady or aligned.correlation >= _SURE_CORRELATION) else None
+
+    def _relocalise(self, seen: _Seen) -> Tracked | None:
+        """Place a frame that the current keyframe does not show, by the last frame or by the other keyframes."""
+        self._velocity = np.eye(4)
+        if self._last is not None:
+            found = register_by_features(seen.full, self._last.full, _DRAWS)
+            if found is not None and _recognised(found):
+                T = self._T_keyframe_last @ found.aligned.T_target_source
+                return self._place(seen, replace(found.aligned, T_target_source=T), "relocalised")
+        best: tuple[dense_alignment.Alignment, int] | None = None
+        for row in self._alike(seen):
+            found = register_by_features(seen.full, self.keyframes[row], _DRAWS)
+            if found is None or not _recognised(found):
+                continue
+            if best is None or _score(found.aligned) > _score(best[0]):
+                best = found.aligned, row
+        if best is None:
+            return None
+        self._current = best[1]
+        return self._place(seen, best[0], "relocalised")
+
+    def _alike(self, seen: _Seen) -> list[int]:
+        """Keyframes that a lost frame may show: the last ones, and those with most features in common."""
+        described = seen.full.features
+        last = len(self.keyframes) - 1
+        recent = [row for row in range(last, max(-1, last - _RECENT), -1) if row != self._current]
+        if not len(described.pixels):
+            return recent
+        older = [row for row in range(last + 1) if row not in recent and row != self._current]
+        step = max(1, len(older) // 40)
+        scored = [(loop_closures.in_common(described, self.keyframes[row].features), row) for row in older[::step]]
+        return recent + [row for _, row in sorted(scored, reverse=True)[: loop_closures.CANDIDATES]]
+
+    def _place(self, seen: _Seen, aligned: dense_alignment.Alignment, status: str) -> Tracked:
+        """Hang the frame on the current keyframe, or make it the next one."""
+        self._frames_lost = 0
+        self._last = seen
+        self._T_keyframe_last = aligned.T_target_source
+        T_world_cam = self.records.T_world_keyframe[self._current] @ aligned.T_target_source
+        confidence = _confidence(aligned)
+        index, target = seen.frame.index, self.keyframes[self._current]
+        shared = mutual_overlap(seen.surface, target.overlap, aligned.T_target_source)
+        if shared >= self.options.keyframe_overlap:
+            self.records.add_tracked(index, self._current, aligned.T_target_source, confidence, status)
+            return Tracked(status, T_world_cam, confidence)
+        row = len(self.keyframes)
+        self.edges.append(Edge(row, self._current, aligned.T_target_source, aligned.information, uncertain=False))
+        self._add_keyframe(seen, T_world_cam, confidence, self.records.submap[self._current])
+        return Tracked("keyframe", T_world_cam, confidence)
+
+    def _begin_submap(self, seen: _Seen) -> Tracked:
+        self._velocity, self._frames_lost, self._last = np.eye(4), 0, None
+        self._add_keyframe(seen, np.eye(4), 1.0, max(self.records.submap, default=-1) + 1)
+        return Tracked("keyframe", np.eye(4), 1.0)
+
+    def _add_keyframe(self, seen: _Seen, T_world_cam: NDArray[np.float64], confidence: float, submap: int) -> None:
+        self.records.add_keyframe(seen.frame.index, T_world_cam, confidence, submap)
+        self.keyframes.append(seen.full)
+        self._current = len(self.keyframes) - 1
+        self._T_keyframe_last = np.eye(4)
+
+    def _lose(self, index: int) -> Tracked:
+        self._frames_lost += 1
+        self.records.add_lost(index)
+        return Tracked("lost", None, 0.0)
+
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        return {
+            **super().state(),
+            "last": np.stack((self._T_keyframe_last, self._velocity)),
+            "counters": np.array((self._current, self._frames_lost)),
+        }
+
+    def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
+        self.records = Records.from_arrays(state)
+        self.keyframes = [keyframe_view(frame) for frame in keyframes]
+        self._T_keyframe_last, self._velocity = np.asarray(state["last"], np.float64)
+        self._current, self._frames_lost = state["counters"].tolist()
+        self.edges = pose_graph.edges_from_arrays(state)
+
+
+def _confirmed(found: Registered) -> bool:
+    """Whether enough features agree, dense alignment stays where they say, and what is seen there agrees."""
+    aligned = found.aligned
+    metres, degrees = apart(found.by_features, aligned.T_target_source)
+    alike = not aligned.correlation < _LEAST_CORRELATION  # where nothing varies, nothing disagrees
+    seen = aligned.overlap >= _CONFIRMED_OVERLAP and aligned.inliers >= _LEAST_INLIERS
+    return found.agreeing >= _FEATURES and alike and seen and metres <= _CONFIRMED_M and degrees <= _CONFIRMED_DEG
+
+
+def _recognised(found: Registered) -> bool:
+    """Whether a frame of which nothing was known is where it was found: by features and surfaces, or, where these saw
+    the way from afar only, by surfaces that share much and look the same."""
+    seen_again = _sure(found.aligned) and found.aligned.overlap >= _RECOGNISED_OVERLAP
+    return seen_again or (_confirmed(found) and _likely(found.aligned))
+
+
+def _sure(aligned: dense_alignment.Alignment) -> bool:
+    return _likely(aligned) and aligned.overlap >= _LEAST_OVERLAP and aligned.correlation >= _SURE_CORRELATION
+
+
+def _likely(aligned: dense_alignment.Alignment) -> bool:
+    return aligned.determined and aligned.inliers >= _SURE_INLIERS and aligned.correlation >= _LIKELY_CORRELATION
+
+
+def _score(aligned: dense_alignment.Alignment) -> float:
+    return aligned.inliers * max(np.nan_to_num(aligned.correlation), 0.1)
+
+
+def _confidence(aligned: dense_alignment.Alignment) -> float:
+    alike = 0.5 if np.isnan(aligned.correlation) else max(aligned.correlation, 0.0)
+    return float(np.clip(aligned.inliers * alike * (1.0 if aligned.determined else 0.5), 0.0, 1.0))

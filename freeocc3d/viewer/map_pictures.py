@@ -1,0 +1,186 @@
+"""Pictures of a map, from above and from a corner, drawn off-screen with PyVista."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.atomic_files import write_whole
+from ..core.errors import ExportError
+from ..core.transforms import transform
+from ..occupancy.surface_faces import exposed_faces
+from ..query.oriented_boxes import OrientedBox, oriented_boxes
+from ..query.regions import Region
+from ..query.word_query import QueryResult
+from ..storage.store import Map
+from .palette import HIGHLIGHTS, class_colors, height_colors, highlighted
+from .scene_rendering import BACKGROUND, CUT, VIEWS, Scene, cut_height, lengthwise, render, shaded
+
+SIZE = 1600, 900
+_BAR = 56  # pixels above and below the views
+_TEXT = (40, 40, 40)
+_LEGEND_ROWS = 2
+_LONGEST_NAME = 48  # characters of a word in the legend
+_MARGIN, _SWATCH, _GAP, _MORE = 16, 22, 20, 130  # pixels: left edge, box before a name, after it, room for "and N more"
+
+
+def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: bool = False) -> None:
+    """Draw the map coloured by "rgb", "class" or "height", with the camera's way, as PNG.
+
+    Raises ExportError (empty map, unwritable target, unknown colouring), DependencyError (no off-screen rendering).
+    """
+    _refuse_empty(scan_map)
+    occupancy = scan_map.occupancy
+    legend: list[tuple[str, tuple[int, int, int]]] = []
+    if by == "rgb":
+        colors = occupancy.colors
+    elif by == "class":
+        palette, labels = class_colors(scan_map.vocabulary), scan_map.labels()
+        colors = palette[labels]
+        present = np.bincount(labels, minlength=len(palette))
+        common = [int(k) for k in np.argsort(-present, kind="stable") if present[k]]
+        names = ["nothing known", *scan_map.vocabulary]
+        legend = [(names[k], tuple(palette[k].tolist())) for k in common]
+    elif by == "height":
+        colors = height_colors(occupancy, scan_map.up)
+    else:
+        raise ExportError(f"A map can be coloured by rgb, class or height, not by '{by}'.")
+    _write(_drawn(scan_map, colors, [], _title(scan_map), legend), Path(path), overwrite)
+
+
+def query_picture(scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False) -> None:
+    """Draw the map pale with what each word matched in a strong colour, boxed; PNG. Raises as ``map_picture``."""
+    _write(query_png(scan_map, results), Path(path), overwrite)
+
+
+def query_png(scan_map: Map, results: Sequence[QueryResult]) -> bytes:
+    """What ``query_picture`` writes."""
+    _refuse_empty(scan_map)
+    colors = highlighted(scan_map.occupancy.colors, [result.regions for result in results])
+    legend = []
+    boxes: list[tuple[Region, tuple[int, int, int]]] = []
+    for number, result in enumerate(results):
+        color = tuple(HIGHLIGHTS[number % len(HIGHLIGHTS)].tolist())
+        legend.append((_found(result), color))
+        boxes += [(region, color) for region in result.regions]
+    return _drawn(scan_map, colors, boxes, _title(scan_map), legend)
+
+
+def _found(result: QueryResult) -> str:
+    """What the legend says of a word: how many regions, and the score of the best."""
+    word = result.word if len(result.word) <= _LONGEST_NAME else result.word[: _LONGEST_NAME - 3] + "..."
+    if not result.regions:
+        return f"{word}: no match"
+    count, best = len(result.regions), f"{result.regions[0].score:.2f}"
+    return f"{word}: {count} regions, best {best}" if count > 1 else f"{word}: 1 region, {best}"
+
+
+def _refuse_empty(scan_map: Map) -> None:
+    if len(scan_map.occupancy.colors) == 0:
+        raise ExportError(f"The map {scan_map.path} has no occupied voxel to draw.")
+
+
+def _write(png: bytes, path: Path, overwrite: bool) -> None:
+    if path.suffix.lower() != ".png":
+        raise ExportError(f"Pictures are written as PNG: name it {path.with_suffix('.png')} in place of {path}.")
+    write_whole(path, lambda target: _write_bytes(target, png), overwrite)
+
+
+def _drawn(
+    scan_map: Map,
+    colors: NDArray[np.uint8],
+    regions: list[tuple[Region, tuple[int, int, int]]],
+    title: str,
+    legend: list[tuple[str, tuple[int, int, int]]],
+) -> bytes:
+    """The picture as PNG."""
+    scene = _scene(scan_map, colors, regions)
+    width, height = SIZE[0] // 2, SIZE[1] - 2 * _BAR
+    views = np.hstack([render(scene, view, (width, height)) for view in VIEWS])
+    picture = _framed(views, title, legend)
+    return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+
+
+def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region, tuple[int, int, int]]]) -> Scene:
+    """The exposed faces of the voxels below the cut and of the regions that lie mostly above it, turned so that z is up
+    and the walls lie along x and y."""
+    occupancy = scan_map.occupancy
+    centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
+    R = lengthwise(scan_map.T_gravity_map[:3, :3], centers)
+    height = centers @ R[2]
+    kept = height <= cut_height(height, occupancy.voxel_size)
+    for region, _ in regions:  # a lamp that was asked for is drawn; a wall that was asked for does not hide the room
+        if 2 * np.count_nonzero(kept[region.rows]) < len(region.rows):
+            kept[region.rows] = True
+    vertices, quads, rows = exposed_faces(occupancy, kept)
+    turned = vertices.astype(np.float64) @ R.T
+    trajectory = scan_map.trajectory
+    way = trajectory.T_world_cam[trajectory.has_pose][:, :3, 3] @ R.T
+    upright = oriented_boxes(occupancy, [region for region, _ in regions], scan_map.T_gravity_map)
+    boxes = tuple((_corners(box) @ R.T, color) for box, (_, color) in zip(upright, regions, strict=True))
+    return Scene(turned, quads, shaded(turned, colors[rows]), way, boxes)
+
+
+def _corners(box: OrientedBox) -> NDArray[np.float64]:
+    """(8, 3) corners, map frame."""
+    return transform(box.T_map_box, (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * box.extent)
+
+
+def _framed(views: NDArray[np.uint8], title: str, legend: list[tuple[str, tuple[int, int, int]]]) -> NDArray[np.uint8]:
+    """The views with the title above and the legend below."""
+    picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
+    picture[_BAR : _BAR + views.shape[0], : views.shape[1]] = views
+    _put(picture, title, (16, 36), 0.62)
+    widths = [_SWATCH + cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.52, 1)[0][0] for text, _ in legend]
+    places = _placed(widths)
+    baselines = (SIZE[1] - 20,) if not places or places[-1][0] == 0 else (SIZE[1] - 36, SIZE[1] - 12)
+    for (text, color), (row, x) in zip(legend, places, strict=False):
+        y = baselines[row]
+        cv2.rectangle(picture, (x, y - 14), (x + 16, y + 2), color, -1, cv2.LINE_AA)
+        _put(picture, text, (x + _SWATCH, y), 0.52)
+    if left_out := len(legend) - len(places):
+        _put(picture, f"and {left_out} more", (SIZE[0] - _MORE, baselines[-1]), 0.52)
+    return picture
+
+
+def _placed(widths: list[int]) -> list[tuple[int, int]]:
+    """(row, x) of the legend's entries, as many as its rows hold; the last row keeps room to count those left out."""
+    places: list[tuple[int, int]] = []
+    row, x = 0, _MARGIN
+    for width in widths:
+        while row < _LEGEND_ROWS and x + width > SIZE[0] - (_MORE if row == _LEGEND_ROWS - 1 else _MARGIN):
+            row, x = row + 1, _MARGIN
+        if row == _LEGEND_ROWS:
+            break
+        places.append((row, x))
+        x += width + _GAP
+    return places
+
+
+def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: float) -> None:
+    printable = text.encode("ascii", "replace").decode()
+    cv2.putText(picture, printable, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _TEXT, 1, cv2.LINE_AA)
+
+
+def _size(scan_map: Map) -> str:
+    """The edges of the voxels, with their unit."""
+    factor, unit = (100, "cm") if scan_map.metric else (1, "units")
+    largest, smallest = factor * scan_map.occupancy.voxel_size, factor * scan_map.occupancy.finest
+    return f"{largest:.3g} {unit}" if largest == smallest else f"{largest:.3g} to {smallest:.3g} {unit}"
+
+
+def _title(scan_map: Map) -> str:
+    counts = scan_map.manifest["counts"]
+    name = Path(str(scan_map.manifest["capture"]["path"])).name
+    return (
+        f"{name}: {counts['voxels']['occupied']:,} occupied voxels of {_size(scan_map)}, "
+        f"{counts['frames_with_pose']} of {counts['frames']} frames; above {CUT:.0%} of the height is cut away"
+    )

@@ -1,0 +1,66 @@
+"""Colours for classes, heights and what a query found."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.types import Occupancy
+from ..query.regions import Region
+
+HIGHLIGHTS = np.array(
+    [(255, 64, 32), (20, 120, 255), (30, 190, 70), (240, 60, 200), (255, 170, 0), (0, 190, 200)], np.uint8
+)
+"""Strong colours of the words of a query, in turn."""
+
+_KNOWN = {
+    "wall": (200, 205, 210), "floor": (150, 125, 100), "ceiling": (225, 225, 215), "window": (150, 200, 235),
+    "door": (165, 110, 65), "black": (25, 25, 25), "grey": (128, 128, 128), "white": (245, 245, 245),
+    "red": (215, 35, 40), "orange": (245, 135, 30), "yellow": (245, 215, 45), "green": (45, 160, 70),
+    "turquoise": (45, 185, 185), "blue": (40, 90, 215), "purple": (120, 50, 165), "pink": (245, 130, 180),
+    "brown": (115, 70, 35), "beige": (220, 195, 155),
+}  # fmt: skip
+
+
+def class_colors(names: list[str]) -> NDArray[np.uint8]:
+    """(C + 1, 3) RGB: row 0 is for "nothing known", row k for names[k - 1]. A name has the same colour always."""
+    rows = [(90, 90, 90), *(_KNOWN.get(name) or _hashed(name) for name in names)]
+    return np.array(rows, np.uint8)
+
+
+def highlighted(colors: NDArray[np.uint8], words: list[list[Region]]) -> NDArray[np.uint8]:
+    """(V, 3) voxel colours with everything pale and grey but the regions, which take their word's strong colour."""
+    grey = colors.astype(np.float32).mean(axis=1, keepdims=True)
+    pale = 0.25 * colors + 0.35 * grey + 0.4 * 215.0
+    out = np.clip(pale, 0, 255).astype(np.uint8)
+    for number, regions in enumerate(words):
+        for region in regions:
+            out[region.rows] = HIGHLIGHTS[number % len(HIGHLIGHTS)]
+    return out
+
+
+def height_colors(occupancy: Occupancy, up: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(V, 3) colour of each occupied voxel by its height along ``up``, lowest dark blue, highest yellow."""
+    height = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges()) @ up
+    return ramp((height - height.min()) / max(float(np.ptp(height)), 1e-9))
+
+
+def ramp(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """(N, 3) viridis colours of (N,) values in 0…1."""
+    import cv2  # here, for a query's PLY has no use for it and starts sooner without
+
+    level = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(level[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8)
+
+
+def _hashed(name: str) -> tuple[int, int, int]:
+    """A saturated colour whose hue, and a little of its lightness, the name decides."""
+    digest = hashlib.sha256(name.encode()).digest()
+    hue = digest[0] / 256 * 6
+    value = 170 + digest[1] % 70
+    ramp = hue % 1
+    low, rise, fall = 0.3, 0.3 + 0.7 * ramp, 1.0 - 0.7 * ramp
+    rgb = [(1, rise, low), (fall, 1, low), (low, 1, rise), (low, fall, 1), (rise, low, 1), (1, low, fall)][int(hue)]
+    return tuple(int(value * part) for part in rgb)  # type: ignore[return-value]

@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import data_folder, depth_image, write_image, write_replica, write_scannet, write_seven_scenes
+
+from freeocc3d.capture import Options, check_depth_scale, open_capture, used_frames
+from freeocc3d.core.errors import CaptureError, ConfigError
+from freeocc3d.settings import registry
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [(write_seven_scenes, "seven_scenes"), (write_replica, "replica"), (write_scannet, "scannet")],
+)
+def test_a_layout_is_recognised(tmp_path: Path, write, name: str) -> None:
+    write(tmp_path, 2)
+    capture = open_capture(str(tmp_path))
+    assert capture.format == name
+    assert registry.backends("capture.readers")[name].summary
+    assert len(open_capture(tmp_path, Options(format=name))) == 2
+
+
+def test_no_folder_and_no_directory(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match=r"There is no folder .*nowhere"):
+        open_capture(tmp_path / "nowhere")
+    (tmp_path / "scan.zip").write_bytes(b"")
+    with pytest.raises(CaptureError, match=r"scan\.zip is no video that can be read"):
+        open_capture(tmp_path / "scan.zip")
+
+
+def test_an_unrecognised_folder_says_what_was_looked_for(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(CaptureError, match="not a capture of a known format") as caught:
+        open_capture(tmp_path)
+    for sought in ("results/frameN.jpg", "frame-N.color.png", "color/N.jpg", "(scannet)"):
+        assert sought in str(caught.value)
+
+
+def test_the_folder_above_a_capture_points_to_it(tmp_path: Path) -> None:
+    write_seven_scenes(tmp_path / "seq-01", 1)
+    with pytest.raises(CaptureError, match=r"but .*seq-01 is: give that folder"):
+        open_capture(tmp_path)
+
+
+def test_a_folder_of_two_formats_has_to_be_named(tmp_path: Path) -> None:
+    write_replica(tmp_path, 1)
+    write_scannet(tmp_path, 1)
+    with pytest.raises(CaptureError, match=r"like replica and like scannet: name one with capture\.format"):
+        open_capture(tmp_path)
+    assert open_capture(tmp_path, Options(format="scannet")).format == "scannet"
+
+
+def test_an_unknown_format_names_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="did you mean 'replica'"):
+        open_capture(tmp_path, Options(format="replicca"))
+
+
+def test_a_format_that_does_not_fit_says_what_is_missing(tmp_path: Path) -> None:
+    write_seven_scenes(tmp_path, 1)
+    with pytest.raises(CaptureError, match="results holds no colour images"):
+        open_capture(tmp_path, Options(format="replica"))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        Options(max_depth=0.0),
+        Options(depth_scale=0.0),
+        Options(max_broken=1.5),
+        Options(stride=0),
+        Options(start=-1),
+    ],
+)
+def test_options_out_of_range(tmp_path: Path, options: Options) -> None:
+    write_seven_scenes(tmp_path, 1)
+    with pytest.raises(ConfigError, match=r"capture\."):
+        open_capture(tmp_path, options)
+
+
+def test_a_builtin_path_goes_to_the_synthetic_reader_with_its_own_options(monkeypatch: pytest.MonkeyPatch) -> None:
+    option = registry.Option("frames", "int", 100, "")
+    fake = types.SimpleNamespace(Reader=lambda *arguments: arguments)
+    monkeypatch.setattr(registry, "load", lambda folder, name: fake if name == "synthetic" else None)
+    monkeypatch.setattr(
+        registry, "backends", lambda folder: {"synthetic": registry.Backend(folder, "synthetic", "", (), (option,))}
+    )
+    monkeypatch.setattr(registry, "build_options", lambda module, values: values)
+    options = Options(stride=2)
+    opened = open_capture("builtin:room", options, {"synthetic": {"frames": 7}, "other": {}})
+    assert opened == (Path("builtin:room"), options, {"frames": 7})
+
+
+def test_used_frames_follow_the_options(tmp_path: Path) -> None:
+    write_seven_scenes(tmp_path, 10)
+    assert list(used_frames(open_capture(tmp_path))) == list(range(10))
+    assert list(used_frames(open_capture(tmp_path, Options(start=1, stop=8, stride=3)))) == [1, 4, 7]
+    with pytest.raises(CaptureError, match="No frame of"):
+        used_frames(open_capture(tmp_path, Options(start=10)))
+
+
+def test_depth_in_its_own_units_raises_no_warning(tmp_path: Path) -> None:
+    assert check_depth_scale(open_capture(write_seven_scenes(tmp_path, 3))) is None
+
+
+@pytest.mark.parametrize(("true_scale", "said_scale"), [(1000, 1), (1000, 100000), (5000, 1000), (6553.5, 1000)])
+def test_depth_in_other_units_names_the_likely_ones(tmp_path: Path, true_scale: float, said_scale: float) -> None:
+    write_seven_scenes(tmp_path, 3)
+    for i in range(3):
+        write_image(tmp_path / f"frame-{i:06d}.depth.png", depth_image(i, true_scale))
+    warning = check_depth_scale(open_capture(tmp_path, Options(depth_scale=said_scale)))
+    assert warning is not None
+    assert f"capture.depth_scale is probably {true_scale} and not {said_scale}" in warning
+
+
+def test_depth_all_beyond_the_range_is_warned_of(tmp_path: Path) -> None:
+    warning = check_depth_scale(open_capture(write_seven_scenes(tmp_path, 3), Options(max_depth=1.0)))
+    assert warning is not None
+    assert "check capture.depth_scale and capture.max_depth" in warning
+
+
+def test_depth_without_any_measurement_is_not_about_units(tmp_path: Path) -> None:
+    write_seven_scenes(tmp_path, 1)
+    write_image(tmp_path / "frame-000000.depth.png", np.zeros((24, 32), np.uint16))
+    capture = open_capture(tmp_path)
+    assert not capture[0].depth_m.any()
+    assert check_depth_scale(capture) is None
+
+
+@pytest.mark.parametrize("name", ["7scenes-kitchen", "house/living", "house/bedroom"])
+def test_real_captures_are_in_the_units_that_they_state(name: str) -> None:
+    assert check_depth_scale(open_capture(data_folder() / name)) is None
+
+
+def test_opening_a_capture_imports_nothing_heavy() -> None:
+    code = "import sys, freeocc3d.capture; print({'open3d', 'torch', 'scipy', 'numba'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"

@@ -1,0 +1,206 @@
+"""Depth of a scan without depth: the built-in room at its true poses."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_depth_network import _write as write_network
+
+from freeocc3d.capture import open_capture
+from freeocc3d.capture.base import Capture, Options
+from freeocc3d.core.errors import ConfigError, FrameError, MapError, TrackingError
+from freeocc3d.core.progress import Progress
+from freeocc3d.core.transforms import invert, project, transform
+from freeocc3d.core.types import Frame
+from freeocc3d.depth import multi_view_stereo
+from freeocc3d.depth.sparse_points import triangulated
+from freeocc3d.tracking.trackers import known
+
+FRAMES = range(24)
+
+
+class Colour(Capture):
+    """The room in 24 frames of 320 x 240 pixels, part of a walk, without depth."""
+
+    format, layout, has_depth = "colour", "", False
+
+    def __init__(self) -> None:
+        self.room = open_capture("builtin:room", Options(), {"synthetic": {"frames": 96, "width": 320, "height": 240}})
+        super().__init__(self.room.path, Options())
+        self.timestamps = self.room.timestamps
+        self.decoded = 0
+        self.broken: set[int] = set()
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return False
+
+    def __getitem__(self, index: int) -> Frame:
+        if index in self.broken:
+            raise FrameError(f"frame {index}")
+        self.decoded += 1
+        frame = self.room[index]
+        return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+
+    def pose(self, index: int):
+        return self.room.pose(index)
+
+
+def _tracker(capture: Capture, folder: Path, frames=FRAMES, change: Callable = lambda T: T, **options):
+    tracker = known.load(known.Options(), capture)
+    tracker.T_world_cam = change(tracker.T_world_cam)
+    tracker.stereo = multi_view_stereo.Options(size=160, **options)
+    assert tracker.offline
+    tracker.prepare(folder, frames, Progress())
+    return tracker
+
+
+@pytest.fixture(scope="module")
+def computed(tmp_path_factory):
+    capture, folder = Colour(), tmp_path_factory.mktemp("stereo")
+    return capture, folder, _tracker(capture, folder)
+
+
+def _against_truth(capture, tracker):
+    """Relative errors where there is a depth, the share of pixels that have one, errors in standard deviations."""
+    errors, sure, true = [], [], 0
+    for index in FRAMES:
+        truth = capture.room[index].depth_m
+        found = tracker._depth.depth(index)
+        true += np.count_nonzero(truth)
+        if found is not None:
+            both = (truth > 0) & (found[0] > 0)
+            errors.append(np.abs(found[0] - truth)[both] / truth[both])
+            sure.append(np.abs(found[0] - truth)[both] / found[1][both])
+    return np.concatenate(errors), sum(map(len, errors)) / true, np.concatenate(sure)
+
+
+def test_the_room_is_measured(computed) -> None:
+    capture, _, tracker = computed
+    errors, share, in_sigmas = _against_truth(capture, tracker)
+    assert np.median(errors) < 0.01
+    assert share > 0.4
+    assert 0.1 < np.median(in_sigmas) < 1.5
+    frame = tracker.completed(capture[10])
+    assert frame.depth_m.shape == frame.color.shape[:2]
+    assert frame.depth_m.dtype == np.float32
+    assert frame.depth_sigma_m.dtype == np.float32
+    assert (frame.depth_sigma_m[frame.depth_m > 0] > 0).all()
+    assert tracker.track(frame).status == "keyframe"
+
+
+def test_what_was_computed_is_taken_up_again(computed) -> None:
+    capture, folder, tracker = computed
+    before = tracker._depth.depth(10)
+    times = {path: path.stat().st_mtime_ns for path in (folder / "depth").iterdir()}
+    removed = {folder / "depth" / name for name in ("surface.npz", "000010.depth.npz")}
+    for path in removed:
+        path.unlink()
+    again = _tracker(capture, folder)
+    np.testing.assert_array_equal(again._depth.depth(10)[0], before[0])
+    made_again = removed | {folder / "depth" / "layout.npz"}
+    assert {p for p in times if p.stat().st_mtime_ns != times[p]} == made_again
+    assert not list((folder / "depth").glob("*tmp*"))
+
+
+def test_a_damaged_surface_is_told(computed, tmp_path: Path) -> None:
+    capture, folder, _ = computed
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "depth" / "000010.depth.npz").unlink()
+    path = tmp_path / "depth" / "surface.npz"
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    np.savez(path, **{**arrays, "triangles": arrays["triangles"] + len(arrays["vertices"])})
+    with pytest.raises(MapError, match=r"surface.npz is damaged"):
+        _tracker(capture, tmp_path)
+    np.savez(path, **{**arrays, "sigma_m": arrays["sigma_m"][:-1]})
+    with pytest.raises(MapError, match=r"surface.npz is damaged: its arrays"):
+        _tracker(capture, tmp_path)
+    path.write_bytes(b"")
+    with pytest.raises(MapError, match=r"surface.npz is damaged"):
+        _tracker(capture, tmp_path)
+
+
+def test_a_damaged_layout_is_told(computed, tmp_path: Path) -> None:
+    capture, folder, _ = computed
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "depth" / "000010.depth.npz").unlink()
+    path = tmp_path / "depth" / "layout.npz"
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    assert len(arrays["offsets"]) > 0
+    for name, damaged in (("support", arrays["support"][:-1]), ("offsets", arrays["offsets"][:-1])):
+        np.savez(path, **{**arrays, name: damaged})
+        with pytest.raises(MapError, match=r"layout.npz is damaged: it has"):
+            _tracker(capture, tmp_path)
+    np.savez(path, **{name: array for name, array in arrays.items() if name != "outermost"})
+    with pytest.raises(MapError, match=r"layout.npz is damaged"):
+        _tracker(capture, tmp_path)
+    path.unlink()
+    with pytest.raises(MapError, match=r"layout.npz is missing"):
+        _tracker(capture, tmp_path)
+
+
+def test_images_that_show_nothing_are_told(tmp_path: Path) -> None:
+    class Blank(Colour):
+        def __getitem__(self, index: int) -> Frame:
+            frame = super().__getitem__(index)
+            return replace(frame, color=np.full_like(frame.color, 128))
+
+    capture, tracker = Colour(), known.load(known.Options(), Colour())
+    scan = triangulated(capture, tracker.T_world_cam, range(6), Progress())
+    depth = multi_view_stereo.StereoDepth(tmp_path, multi_view_stereo.Options(size=64))
+    with pytest.raises(TrackingError, match="bare surfaces"):
+        depth.compute(Blank(), scan, range(6), Progress())
+
+
+def test_points_are_where_surfaces_are(computed) -> None:
+    capture, _, tracker = computed
+    scan = triangulated(capture, tracker.T_world_cam, FRAMES, Progress())
+    assert len(scan.points) > 500
+    frame = capture.room[10]
+    seen = scan.points[scan.seen_point[scan.seen_frame == 10]]
+    cam = transform(invert(capture.pose(10)), seen)
+    K = frame.intrinsics
+    pixels, _ = project(cam.astype(np.float64), K)
+    u, v = np.rint(pixels).astype(int).T
+    inside = (u >= 0) & (v >= 0) & (u < K.width) & (v < K.height)
+    depth = frame.depth_m[v[inside], u[inside]]
+    off = np.abs(cam[inside, 2] - depth)[depth > 0] / depth[depth > 0]
+    assert np.median(off) < 0.05
+
+
+def test_broken_frames_are_done_without(tmp_path: Path) -> None:
+    capture = Colour()
+    capture.broken = {5}
+    tracker = _tracker(capture, tmp_path, range(10))
+    assert tracker._depth.depth(5) is None
+    assert tracker._depth.depth(4) is not None
+
+
+def test_a_network_fills_what_stereo_leaves_empty(tmp_path: Path) -> None:
+    network = write_network(tmp_path / "n.onnx")
+    capture = Colour()
+    plain = _tracker(capture, tmp_path / "a", range(8))
+    fused = _tracker(capture, tmp_path / "b", range(8), network=str(network))
+    counts = [[np.count_nonzero(t._depth.depth(i)[0]) for i in range(2, 6)] for t in (plain, fused)]
+    assert (np.array(counts[1]) >= counts[0]).all()
+
+
+def test_a_camera_that_only_turns_measures_nothing(tmp_path: Path) -> None:
+    def turned(T):
+        T = T.copy()
+        T[:, :3, 3] = 0.0
+        return T
+
+    with pytest.raises(TrackingError, match="sideways"):
+        _tracker(Colour(), tmp_path, range(8), turned)
+
+
+@pytest.mark.parametrize("given", [{"size": 10}, {"neighbours": 0}, {"agreeing": 0}])
+def test_options_out_of_range(given) -> None:
+    with pytest.raises(ConfigError):
+        multi_view_stereo.Options(**given)

@@ -1,0 +1,133 @@
+"""Finer voxels in a box: the paper's cups, which are one lump at 8 cm and two cups at 5 mm."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_main import refused, run
+
+from freeocc3d.capture.builtin_room import CUP_HEIGHT, CUPS
+from freeocc3d.core.errors import MapError
+from freeocc3d.core.progress import Progress
+from freeocc3d.core.types import FREE
+from freeocc3d.editing import box_refinement
+from freeocc3d.language.encoders import colour
+from freeocc3d.occupancy.connected_components import connected
+from freeocc3d.pipeline import run as pipeline
+from freeocc3d.storage.store import Map
+
+RED, YELLOW = (np.array(CUPS[name]) + (0, 0, 0.5 * CUP_HEIGHT) for name in ("red", "yellow"))
+"""Middles of the two cups, which stand on a table of 75 cm."""
+MIDDLE, REACH = 0.5 * (RED + YELLOW), np.array((0.2, 0.2, 0.1))
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Map:
+    settings = {
+        "capture": {"stride": 4, "synthetic": {"width": 320, "height": 240}},
+        "tracking": {"backend": "known"},
+        "fitting": {"passes": 0},
+    }
+    return pipeline.reconstruct("builtin:room", tmp_path_factory.mktemp("refine") / "room", settings)
+
+
+@pytest.fixture(scope="module")
+def cups(room: Map) -> Map:
+    box = box_refinement.Box(MIDDLE - REACH, MIDDLE + REACH)
+    return box_refinement.refine(room, box, 0.005, room.path.parent / "cups")
+
+
+def near(found: Map, point: np.ndarray, radius: float) -> np.ndarray:
+    voxels = found.occupancy.occupied_voxels()
+    return voxels[np.linalg.norm(found.occupancy.centers(voxels) - point, axis=1) < radius]
+
+
+def test_cups_that_are_one_lump_at_8_cm_are_two_regions_at_5_mm(room: Map, cups: Map) -> None:
+    lump = near(room, MIDDLE, 0.2)
+    assert len(np.unique(connected(lump))) == 1
+    for word, middle in (("red cup", RED), ("yellow cup", YELLOW)):
+        best = cups.query(word).regions[0]
+        assert np.linalg.norm(best.centroid[:2] - middle[:2]) < 0.015
+        assert best.box_min[2] > 0.74
+        size = best.box_max - best.box_min
+        assert (size > 0.05).all()
+        assert (size < 0.13).all()
+        large = [region for region in cups.query(word).regions if region.voxels > 50]
+        assert len(large) == 1
+
+
+def test_between_and_above_the_cups_it_is_free(cups: Map) -> None:
+    centers = cups.occupancy.centers(cups.occupancy.voxels(FREE))
+    for point in (MIDDLE, MIDDLE + (0, 0, 0.08)):
+        assert np.linalg.norm(centers - point, axis=1).min() < 0.005
+
+
+def test_surfaces_are_where_they_are_to_a_voxel(cups: Map) -> None:
+    """The table's top, away from the cups."""
+    voxels = cups.occupancy.occupied_voxels()
+    centers = cups.occupancy.centers(voxels)
+    away = (np.abs(centers[:, 1] - MIDDLE[1]) > 0.12) & (centers[:, 2] > 0.72)
+    assert away.sum() > 500
+    assert abs(np.median(centers[away, 2]) - 0.75) < 0.005
+    assert centers[away, 2].max() < 0.765
+
+
+def test_what_is_refined_is_a_map_that_can_be_refined_again(cups: Map) -> None:
+    again = box_refinement.refine(cups, box_refinement.Box(RED - 0.06, RED + 0.06), 0.004, cups.path.parent / "red")
+    assert again.manifest["voxel_size_m"] == 0.004
+    assert again.query("red cup").regions[0].volume_m3 > 1e-5
+    assert again.manifest["refined"]["map"].endswith("cups")
+    assert len(again.keyframes) <= len(cups.keyframes)
+    assert len(again.gaussians) == again.manifest["counts"]["gaussians"]
+
+
+def test_boxes_that_cannot_be_refined(room: Map, tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="lower and an upper corner"):
+        box_refinement.Box(np.ones(3), np.zeros(3))
+    with pytest.raises(MapError, match="No keyframe"):
+        box_refinement.refine(room, box_refinement.Box(np.full(3, 50.0), np.full(3, 50.5)), 0.01, tmp_path / "map")
+    with pytest.raises(MapError, match="more than can be kept"):
+        box_refinement.refine(room, box_refinement.Box(np.full(3, -50.0), np.full(3, 50.0)), 0.01, tmp_path / "map")
+    with pytest.raises(MapError, match="cannot be had"):
+        box_refinement.refine(room, box_refinement.Box(np.zeros(3), np.ones(3)), 0.2, tmp_path / "map")
+    with pytest.raises(MapError, match="own place"):
+        box_refinement.refine(room, box_refinement.Box(MIDDLE - REACH, MIDDLE + REACH), 0.01, room.path, overwrite=True)
+    in_the_air = MIDDLE + (0, 0, 0.5)
+    with pytest.raises(MapError, match=r"No keyframe|No voxel"):
+        box_refinement.refine(room, box_refinement.Box(in_the_air - 0.05, in_the_air + 0.05), 0.01, tmp_path / "map")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("needed", [False, True])
+def test_a_map_that_has_moved_to_another_machine(room: Map, needed: bool, tmp_path: Path, monkeypatch) -> None:
+    """Colours are found in the keyframes; where an encoder needs the capture, features are the map's own."""
+    monkeypatch.setattr(colour, "NEEDS_CAPTURE", needed)
+    told = []
+    progress = Progress()
+    progress.warn = told.append  # type: ignore[method-assign]
+    moved = Map(room.path, {**room.manifest, "capture": {**room.manifest["capture"], "path": "/gone"}})
+    found = box_refinement.refine(
+        moved, box_refinement.Box(MIDDLE - REACH, MIDDLE + REACH), 0.01, tmp_path / "map", progress=progress
+    )
+    assert len(told) == needed
+    assert not told or "cannot be used again" in told[0]
+    assert found.occupancy.features.shape == (len(found.occupancy.colors), room.occupancy.features.shape[1])
+
+
+def test_from_the_command_line(room: Map, tmp_path: Path) -> None:
+    low, high = (MIDDLE - REACH).tolist(), (MIDDLE + REACH).tolist()
+    done = run("refine", room.path, "--box", *low, *high, "--voxel", 0.01, "-o", tmp_path / "map")
+    assert "edge 0.01 m" in done.stdout
+    assert f"a box of {room.path}" in done.stdout
+    assert "exists" in refused("refine", room.path, "--box", *low, *high, "--voxel", 0.01, "-o", tmp_path / "map")
+    word = "red cup"
+    coarse = json.loads(run("query", room.path, word, "--json").stdout)["results"][0]["regions"][0]
+    fine = json.loads(run("query", room.path, word, "--refine", 0.02, "--json").stdout)["results"][0]["regions"][0]
+    assert np.linalg.norm(np.subtract(fine["centroid"], coarse["centroid"])) < 1.0
+    assert fine["voxels"] > coarse["voxels"]
+    picture = tmp_path / "cups.png"
+    run("query", room.path, word, "--refine", 0.02, "--picture", picture, "--ply", tmp_path / "cups.ply")
+    assert picture.stat().st_size > 10_000
+    assert "one word" in run("query", room.path, word, "sofa", "--refine", 0.02, code=2).stderr
+    assert "-o keeps" in run("query", room.path, word, "-o", tmp_path / "other", code=2).stderr

@@ -1,0 +1,240 @@
+"""The scale of maps: the built-in room, which is in metres, made half as large and said to be in no unit."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from test_main import refused, run
+
+from freeocc3d.capture import open_capture
+from freeocc3d.core.errors import FreeOccError, MapError
+from freeocc3d.core.transforms import is_rigid, transform
+from freeocc3d.editing import scaling
+from freeocc3d.pipeline import run as pipeline
+from freeocc3d.storage import store
+from freeocc3d.storage.store import Map, load_map
+from freeocc3d.tracking.trackers import file, known
+from freeocc3d.viewer import map_pictures
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Map:
+    settings = {
+        "capture": {"stride": 8, "synthetic": {"width": 320, "height": 240}},
+        "tracking": {"backend": "known"},
+        "fitting": {"passes": 0},
+    }
+    return pipeline.reconstruct("builtin:room", tmp_path_factory.mktemp("scale") / "room", settings)
+
+
+@pytest.fixture(scope="module")
+def half(room: Map) -> Map:
+    """Half as large, in no unit."""
+    made = scaling.scaled(room, 0.5, "given", room.path.parent / "half")
+    manifest = yaml.safe_load((made.path / store.MANIFEST).read_text())
+    manifest["scale"] = {"metric": False, "by": "none", "factor": 1.0}
+    report = {**made.report, "warnings": [scaling.UNKNOWN, "another"]}
+    (made.path / store.REPORT).write_text(json.dumps(report))
+    manifest["files"][store.REPORT] = (made.path / store.REPORT).stat().st_size
+    (made.path / store.MANIFEST).write_text(yaml.safe_dump(manifest))
+    return load_map(made.path)
+
+
+def test_everything_that_is_a_length_is_scaled(room: Map, half: Map) -> None:
+    np.testing.assert_allclose(
+        half.trajectory.T_world_cam[::8, :3, 3], 0.5 * room.trajectory.T_world_cam[::8, :3, 3], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        half.trajectory.T_world_cam[::8, :3, :3], room.trajectory.T_world_cam[::8, :3, :3], atol=1e-6
+    )
+    for name in ("means", "scales", "anchor_cam"):
+        np.testing.assert_allclose(
+            getattr(half.gaussians, name), 0.5 * getattr(room.gaussians, name), rtol=1e-5, atol=1e-7
+        )
+    for name in ("quats_wxyz", "opacities", "colors", "anchor_keyframe"):
+        np.testing.assert_array_equal(getattr(half.gaussians, name), getattr(room.gaussians, name))
+    own, before = half.occupancy, room.occupancy
+    np.testing.assert_array_equal(own.voxels(1), before.voxels(1))
+    np.testing.assert_allclose(own.centers(own.voxels(1)), 0.5 * before.centers(before.voxels(1)))
+    np.testing.assert_allclose(half.keyframes.depth_m(2), 0.5 * room.keyframes.depth_m(2), atol=6e-4)
+    np.testing.assert_array_equal(half.keyframes[2].color, room.keyframes[2].color)
+    assert is_rigid(half.T_gravity_map)
+    cameras = half.trajectory.T_world_keyframe[:, :3, 3]
+    np.testing.assert_allclose(
+        transform(half.T_gravity_map, cameras), 0.5 * transform(room.T_gravity_map, 2 * cameras), atol=1e-6
+    )
+    assert half.report["rendering"]["depth_l1_m"] == pytest.approx(0.5 * room.report["rendering"]["depth_l1_m"])
+    assert (half.path / store.PATH_PICTURE).read_bytes() != (room.path / store.PATH_PICTURE).read_bytes()
+    assert (half.path / store.RENDER_PICTURE).is_file()
+
+
+def test_words_are_found_at_half_the_place(room: Map, half: Map) -> None:
+    big, small = (scan_map.query("red cup").regions[0] for scan_map in (room, half))
+    np.testing.assert_allclose(small.centroid, 0.5 * big.centroid, atol=1e-3)
+    assert small.volume_m3 == pytest.approx(big.volume_m3 / 8)
+
+
+def test_scaling_back_gives_the_map_that_it_was(room: Map, half: Map, tmp_path: Path) -> None:
+    back = scaling.scaled(half, 2.0, "length", tmp_path / "back")
+    assert back.metric
+    assert back.manifest["scale"] == {"metric": True, "by": "length", "factor": 2.0}
+    assert back.manifest["voxel_size_m"] == pytest.approx(room.manifest["voxel_size_m"])
+    np.testing.assert_allclose(back.gaussians.means, room.gaussians.means, rtol=1e-5)
+    assert back.report["warnings"] == ["another"], "that the scale is unknown is said no more"
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_a_length_between_two_pixels_or_words(room: Map, half: Map) -> None:
+    frame = room.keyframes[3]
+    pixels = [(60, 120), (260, 130)]
+    depth_m = open_capture("builtin:room", None, {"synthetic": {"width": 320, "height": 240}}).exact_depth(frame.index)  # type: ignore[attr-defined]
+    camera = frame.intrinsics
+    points = [
+        ((x - camera.cx) / camera.fx * depth_m[y, x], (y - camera.cy) / camera.fy * depth_m[y, x], depth_m[y, x])
+        for x, y in pixels
+    ]
+    true = float(np.linalg.norm(np.subtract(*points)))
+    ends = [f"{frame.index}:{x},{y}" for x, y in pixels]
+    assert scaling.by_length(half, ends, true) == pytest.approx(2.0, rel=0.02)
+    places = [half.query(word).regions[0].centroid for word in ("red cup", "green plant")]
+    apart = 2 * float(np.linalg.norm(places[0] - places[1]))
+    assert scaling.by_length(half, ["red cup", "green plant"], apart) == pytest.approx(2.0)
+
+
+def test_points_that_are_none_are_told(half: Map) -> None:
+    keyframe = int(half.trajectory.keyframes[1])
+    with pytest.raises(MapError, match=r"Frame 1 is no keyframe of .*; the nearest are 0, "):
+        scaling.by_length(half, ["1:5,5", "red cup"], 1.0)
+    with pytest.raises(MapError, match=r"Pixel 999,5 is outside of keyframe .*320 x 240"):
+        scaling.by_length(half, [f"{keyframe}:999,5", "red cup"], 1.0)
+    with pytest.raises(MapError, match=r"'xylophone' matches nothing"):
+        scaling.by_length(half, ["xylophone", "red cup"], 1.0)
+    with pytest.raises(MapError, match="are one point of the map"):
+        scaling.by_length(half, ["red cup", "red cup"], 1.0)
+    with pytest.raises(MapError, match="A length is a positive number of metres"):
+        scaling.by_length(half, ["red cup", "blue chair"], -1.0)
+
+
+def test_a_pixel_without_depth_takes_the_nearest_that_has_one(half: Map) -> None:
+    depth_m = half.keyframes.depth_m(0).copy()
+    depth_m[100:120, 100:120] = 0
+    frame = int(half.trajectory.keyframes[0])
+
+    class Holed:
+        def __getattr__(self, name):
+            return getattr(half, name)
+
+    class Frames:
+        folder = half.keyframes.folder
+
+        def depth_m(self, row):
+            return depth_m
+
+        def views(self):
+            return half.keyframes.views()
+
+    holed = Holed()
+    holed.keyframes = Frames()  # type: ignore[attr-defined]
+    assert scaling.by_length(holed, [f"{frame}:102,102", "red cup"], 1.0) > 0  # type: ignore[arg-type]
+    with pytest.raises(MapError, match=rf"Keyframe {frame} has no depth within 6 pixels of 110,110"):
+        scaling.by_length(holed, [f"{frame}:110,110", "red cup"], 1.0)  # type: ignore[arg-type]
+
+
+def test_the_cameras_height_above_the_floor(half: Map, tmp_path: Path) -> None:
+    """The camera goes at 1.5 m, up and down by 3 cm."""
+    assert scaling.by_camera_height(half, 1.5) == pytest.approx(2.0, rel=0.03)
+    floorless = load_map(half.path)
+    above = (floorless.gaussians.means @ half.up.astype(np.float32)) > 0.3
+    floorless.__dict__["gaussians"] = floorless.gaussians[np.flatnonzero(above)]
+    with pytest.raises(MapError, match="shows no floor below the cameras: give a known length"):
+        scaling.by_camera_height(floorless, 1.5)
+
+
+def test_metric_poses_of_the_capture_or_of_a_file(room: Map, half: Map, tmp_path: Path) -> None:
+    assert scaling.by_poses(half, "builtin:room") == pytest.approx(2.0, rel=1e-4)
+    assert scaling.by_poses(half, str(room.path / store.TRAJECTORY)) == pytest.approx(2.0, rel=1e-4)
+    rng = np.random.default_rng(0)
+    T = room.trajectory.T_world_cam.copy()
+    T[:, :3, 3] = rng.normal(size=(len(T), 3))
+    store.write_tum(tmp_path / "other.txt", dataclasses.replace(room.trajectory, T_world_cam=T))
+    with pytest.raises(FreeOccError, match=r"The poses of .*other\.txt are not this map's"):
+        scaling.by_poses(half, str(tmp_path / "other.txt"))
+
+
+@pytest.mark.parametrize("factor", [0.0, -2.0, float("nan"), 1e-3, 1e3])
+def test_factors_that_no_map_can_have_are_refused(half: Map, tmp_path: Path, factor: float) -> None:
+    with pytest.raises(MapError, match=r"positive number|check the length"):
+        scaling.scaled(half, factor, "given", tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_commands_say_what_the_unit_is(room: Map, half: Map, tmp_path: Path) -> None:
+    assert "scale      unknown: lengths are not metres" in run("info", half.path).stdout
+    facts = json.loads(run("info", half.path, "--json").stdout)
+    assert facts["metric"] is False
+    assert json.loads(run("info", room.path, "--json").stdout)["scale"]["by"] == "sensor"
+    assert "edge 0.04 units\n" in run("info", half.path).stdout
+    assert "edge 0.08 m\n" in run("info", room.path).stdout
+    unknown, known = (run("query", scan_map.path, "red cup").stdout for scan_map in (half, room))
+    assert "Lengths are not metres" in unknown
+    assert "Lengths are not metres" not in known
+    assert "(m)" not in unknown
+    assert "(l)" not in unknown
+    (header, row), (header_m, row_l) = (text.splitlines()[1:3] for text in (unknown, known))
+    for name in ("centroid (units)", "size (units)", "volume (units^3)"):
+        assert name in header
+    assert header_m.split("conf.")[1].split() == ["centroid", "(m)", "size", "(m)", "volume", "(l)", "voxels"]
+    # A row's columns end, and a volume stands, where the header says; half as large is an eighth of the volume.
+    assert (len(row), len(row_l)) == (len(header), len(header_m))
+    assert float(row.split()[-2]) == pytest.approx(float(row_l.split()[-2]) / 8000, rel=0.02)
+    assert "voxels of 0.04 units," in map_pictures._title(half)
+    assert "voxels of 8 cm," in map_pictures._title(room)
+    assert json.loads(run("query", half.path, "red cup", "--json").stdout)["metric"] is False
+    exported = run("export", half.path, "--format", "octomap", "-o", tmp_path / "half.bt")
+    assert "lengths are not metres" in exported.stderr
+    described = json.loads((tmp_path / "half.bt.json").read_text())
+    assert (described["metric"], described["unit"]) == (False, "unknown")
+    shown = run("scale", half.path, "-o", tmp_path / "metres", "--camera-height", "1.5").stdout
+    assert "scale      metres, by the cameras' height, 2" in shown
+    assert "exists" in refused("scale", half.path, "-o", tmp_path / "metres", "--factor", "2")
+    assert "own place" in refused("scale", half.path, "-o", half.path, "--factor", "2", "--overwrite")
+    wrong = run("scale", half.path, "-o", tmp_path / "two", "--factor", "2", "--camera-height", "1.5", code=2)
+    assert "give one of --factor" in wrong.stderr
+
+
+def test_given_trackers_know_whether_their_poses_are_metric(tmp_path: Path, room: Map) -> None:
+    from test_posed_images import write_colmap, write_nerfstudio
+
+    from freeocc3d.capture import Options
+
+    def metric(folder: Path, **options) -> bool:
+        return known.load(known.Options(), open_capture(folder, Options(**options))).metric
+
+    assert metric(write_nerfstudio(tmp_path / "depth", 3))
+    assert metric(tmp_path / "depth", depth=False)
+    assert not metric(write_nerfstudio(tmp_path / "colour", 3, depth=False))
+    assert metric(tmp_path / "colour", scale=2.0)
+    assert not metric(write_colmap(tmp_path / "model", 3))
+    poses = tmp_path / "depth" / "transforms.json"
+    capture = open_capture(tmp_path / "depth", Options(depth=False))
+    tracker = file.load(file.Options(path=str(poses), scale=None), capture)
+    assert not tracker.metric
+    assert file.load(file.Options(path=str(poses), scale=1.0), capture).metric
+    scaled = file.load(
+        file.Options(path=str(poses), scale=None), open_capture(tmp_path / "depth", Options(depth=False, scale=3.0))
+    )
+    assert scaled.metric
+    np.testing.assert_allclose(scaled.T_world_cam[:, :3, 3], 3 * tracker.T_world_cam[:, :3, 3])
+
+
+def test_a_map_of_unknown_scale_is_scored_at_the_true_one(half: Map, tmp_path: Path) -> None:
+    truth = tmp_path / "truth.npz"
+    run("ground-truth", "builtin:room", "-o", truth)
+    scored = json.loads(run("evaluate", half.path, "--ground-truth", truth, "--json").stdout)
+    assert scored["align"] == "sim3"
+    assert scored["alignment"]["scale"] == pytest.approx(2.0)
+    as_it_is = json.loads(run("evaluate", half.path, "--ground-truth", truth, "--align", "se3", "--json").stdout)
+    assert scored["iou"] > 0.5 > 10 * as_it_is["iou"]

@@ -1,0 +1,241 @@
+"""Whole evaluations: pooled scenes, class lists, real captures, and what does not fit."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import data_folder
+from test_main import refused, run
+
+import freeocc3d
+from freeocc3d.core.errors import FreeOccError
+from freeocc3d.evaluation.confusion import Prediction
+from freeocc3d.evaluation.ground_truth import GroundTruth, load_ground_truth, save_ground_truth
+from freeocc3d.evaluation.scored_classes import identity
+from freeocc3d.evaluation.scoring import Asked, Evaluation, Scene, evaluate
+from freeocc3d.evaluation.trajectory_alignment import Alignment
+
+CLASSES = Path(__file__).parents[2] / "configs" / "classes" / "house_to_embodiedocc.yaml"
+
+
+def scene(
+    labels: list[int], claimed: list[int] | None, classes: tuple[str, ...], name: str = "a", frames: object = None
+) -> Scene:
+    """A scene of a row of voxels; claims are classes, 99 = occupied by no known class."""
+    true = np.array(labels, np.uint8).reshape(-1, 1, 1)
+    mask = None if frames is None else np.array(frames, bool).reshape(true.shape)
+    own = np.array(claimed if claimed is not None else labels).reshape(true.shape)
+    predicted = Prediction(
+        (own > 0) & (own < 255), None if claimed is None else np.where(own == 99, 0, own).astype("u1")
+    )
+    return Scene(
+        name, GroundTruth(true, np.zeros(3), 0.1, ("free", *classes), mask), predicted, Alignment.identity(), None,
+        None, None, np.array((0.0, 0.0, 1.0)), (),
+    )  # fmt: skip
+
+
+def test_scenes_are_pooled_by_voxels_and_absent_classes_count_zero_in_a_list() -> None:
+    classes = ("wall", "sofa", "lamp")
+    one = scene([1, 1, 1, 0, 255], [1, 1, 99, 0, 1], classes)
+    two = scene([2, 2, 0, 0], [2, 0, 1, 0], classes, "b")
+    pooled = Evaluation((one, two), classes, "none")
+    # wall: 2 hits of 3 true, 1 invented; sofa: 1 hit of 2 true.
+    assert pooled.miou() == pytest.approx((2 / 4 + 1 / 2) / 2)
+    assert pooled.classes_in_miou == ("wall", "sofa")
+    assert pooled.absent == ("lamp",)
+    assert pooled.miou(classes) == pytest.approx((2 / 4 + 1 / 2) / 3)
+    assert Evaluation((one, two), classes, "none", listed=True).miou() == pytest.approx((2 / 4 + 1 / 2) / 3)
+    assert pooled.scores.iou == pytest.approx(4 / 6)
+    document = pooled.to_json()
+    assert document["per_class"] == {"wall": pytest.approx(0.5), "sofa": pytest.approx(0.5)}
+    assert [own["iou"] for own in document["scenes"]] == [1.0, pytest.approx(1 / 3)]
+    reordered = Evaluation((two, one), classes, "none").to_json()
+    for name in ("iou", "miou", "precision", "recall", "per_class", "confusion", "by_mask"):
+        assert reordered[name] == document[name]
+
+
+def test_both_masks_stand_side_by_side() -> None:
+    masked = scene([1, 1, 0, 0, 255], [1, 0, 1, 0, 1], ("wall",), frames=[1, 0, 0, 1, 1])
+    document = Evaluation((masked,), ("wall",), "none").to_json()
+    assert document["mask"] == "label"
+    assert document["by_mask"]["label"]["iou"] == document["iou"] == pytest.approx(1 / 3)
+    assert document["by_mask"]["frames"] == {"iou": 1.0, "miou": 1.0, "precision": 1.0, "recall": 1.0, "voxels": 2}
+
+
+def test_lists_of_classes_over_which_miou_is_given() -> None:
+    classes = tuple(f"class {k}" for k in range(1, 13))
+    labels = [k for k in range(1, 13) for _ in range(13 - k)]
+    wrong = [0 if k == 11 else k for k in labels]
+    scored = Evaluation((scene(labels, wrong, classes),), classes, "none")
+    assert scored.miou_over["top_10"] == classes[:10]
+    assert scored.miou(scored.miou_over["top_10"]) == 1.0
+    assert scored.miou() == pytest.approx(11 / 12)
+    assert scored.miou_over["top_20"] is None
+    assert scored.miou_over["shared_8"] is None
+    assert "top_20, top_30, top_40 (the truth holds 12 classes)" in scored.to_text()
+
+
+def test_a_claim_without_classes_has_no_miou_which_is_not_zero() -> None:
+    scored = Evaluation((scene([1, 0], None, ("wall",)),), ("wall",), "none")
+    document = scored.to_json()
+    assert document["miou"] is None
+    assert document["per_class"] == {}
+    assert document["classes_in_miou"] == []
+    assert document["iou"] == 1.0
+    assert "mIoU           –" in scored.to_text()
+
+
+@pytest.fixture(scope="module")
+def bedroom(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of a part of a real capture, with its classes."""
+    path = tmp_path_factory.mktemp("evaluate") / "bedroom"
+    settings = {"capture": {"stop": 60, "stride": 2}, "language": {"encoder": "labels"}}
+    freeocc3d.reconstruct(data_folder() / "house" / "bedroom", path, settings)
+    return path
+
+
+def test_the_command_scores_a_map_against_its_captures_truth(bedroom: Path, tmp_path: Path) -> None:
+    document = json.loads(run("evaluate", bedroom, "--json").stdout)
+    assert 0.1 < document["iou"] < 0.9  # a quarter of the walk
+    assert document["precision"] > 0.75
+    assert document["ate_rmse_m"] < 0.02
+    assert (document["frames"], document["frames_with_pose"]) == (261, 30)
+    assert document["trajectory"]["frames_matched"] == 30
+    assert set(document["by_mask"]) == {"label"}
+    assert document["align"] == "se3"
+    assert document["alignment"]["scale"] == 1.0
+    assert document["miou"] == pytest.approx(np.mean([document["per_class"][c] for c in document["classes_in_miou"]]))
+    page = tmp_path / "report.html"
+    run("evaluate", bedroom, "--html", page)
+    written = page.read_text()
+    assert f"{100 * document['iou']:.1f} %" in written
+    assert written.count("data:image/png;base64,") == 3
+    assert f"{page} exists" in refused("evaluate", bedroom, "--html", page)
+    assert page.read_text() == written
+    truth = data_folder() / "house" / "bedroom" / "ground_truth.npz"
+    mapped = run("evaluate", bedroom, "--ground-truth", truth, "--classes", CLASSES).stdout
+    assert "11 classes: ceiling, floor, wall" in mapped
+    assert "shared_8" in mapped
+    assert "cannot name" not in mapped
+
+
+def test_the_truth_as_prediction_scores_100_everywhere() -> None:
+    for name in ("house/bedroom", "house/living", "7scenes-kitchen"):
+        truth = data_folder() / name / "ground_truth.npz"
+        document = json.loads(
+            run("evaluate", "--grid", truth, "--ground-truth", truth, "--align", "none", "--json").stdout
+        )
+        for figure in ("iou", "precision", "recall", "miou"):
+            assert document[figure] == 1.0, name
+        assert set(document["per_class"].values()) == {1.0}
+        assert all(own is None or own["miou"] == 1.0 for key, own in document["miou_over"].items() if key != "listed")
+
+
+def test_a_shifted_and_a_swapped_truth_score_what_numpy_counts(tmp_path: Path) -> None:
+    truth = load_ground_truth(data_folder() / "house" / "bedroom" / "ground_truth.npz")
+    known = truth.labels != 255
+
+    def scored(labels: Any, origin: Any = truth.origin) -> dict[str, Any]:
+        save_ground_truth(GroundTruth(labels, origin, 0.08, truth.classes), tmp_path / "claim.npz", True)
+        save_ground_truth(truth, tmp_path / "truth.npz", True)
+        return evaluate(Asked(grid=tmp_path / "claim.npz", ground_truths=[tmp_path / "truth.npz"])).to_json()
+
+    occupied = known & (truth.labels > 0)
+    for axis in range(3):
+        shift = np.zeros(3)
+        shift[axis] = 0.08
+        moved = np.roll(np.where(known, truth.labels, 0), 1, axis)
+        moved[tuple(slice(0, 1) if a == axis else slice(None) for a in range(3))] = 0
+        expected = ((moved > 0) & occupied).sum() / (((moved > 0) | occupied) & known).sum()
+        walls = (moved == 21) & known
+        of_wall = (walls & (truth.labels == 21)).sum() / (walls | (truth.labels == 21)).sum()
+        document = scored(truth.labels, truth.origin + shift)
+        assert document["iou"] == pytest.approx(expected, abs=1e-12)
+        assert document["per_class"]["wall"] == pytest.approx(of_wall, abs=1e-12)
+    flipped = truth.labels[::-1]
+    claimed = (flipped > 0) & (flipped < 255)
+    expected = (claimed & occupied).sum() / ((claimed | occupied) & known).sum()
+    assert scored(np.ascontiguousarray(flipped))["iou"] == pytest.approx(expected, abs=1e-12)
+
+
+def test_maps_are_pooled_and_a_split_must_be_whole(bedroom: Path, tmp_path: Path) -> None:
+    one = evaluate(Asked(maps=[bedroom]))
+    two = evaluate(Asked(maps=[bedroom, bedroom]))
+    np.testing.assert_array_equal(two.scores.matrix, 2 * one.scores.matrix)
+    assert two.to_json()["frames_with_pose"] == 60
+    assert two.ate_rmse_m == pytest.approx(one.ate_rmse_m)
+    (tmp_path / "split.txt").write_text("bedroom\n")
+    assert evaluate(Asked(maps=[bedroom], split=tmp_path / "split.txt")).scores.iou == one.scores.iou
+    (tmp_path / "split.txt").write_text("bedroom\nscene0011_00\n")
+    with pytest.raises(FreeOccError, match="scene0011_00"):
+        evaluate(Asked(maps=[bedroom], split=tmp_path / "split.txt"))
+
+
+def test_truth_and_maps_that_do_not_fit_are_told_in_a_sentence(bedroom: Path, tmp_path: Path) -> None:
+    house = data_folder() / "house"
+    truth = house / "bedroom" / "ground_truth.npz"
+    assert "given 2 times for 1" in refused(
+        "evaluate", bedroom, "--poses", house / "living", "--poses", house / "living"
+    )
+    (tmp_path / "two.txt").write_text("0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    assert "at least 3" in refused("evaluate", bedroom, "--poses", tmp_path / "two.txt")
+    line = "".join(f"{2 * i} {i} 0 0 0 0 0 1\n" for i in range(20))
+    (tmp_path / "line.txt").write_text(line)
+    assert "on one line" in refused("evaluate", bedroom, "--poses", tmp_path / "line.txt")
+    (tmp_path / "late.txt").write_text(line.replace("\n", "\n9", 1))
+    assert "se3, sim3, none" in refused("evaluate", bedroom, "--align", "affine")
+    assert "no such file" in refused("evaluate", bedroom, "--ground-truth", tmp_path / "absent.npz")
+    assert "are given for 1 scenes" in refused("evaluate", bedroom, "--ground-truth", truth, "--ground-truth", truth)
+    (tmp_path / "few.yaml").write_text("[wall, floor]\n")
+    assert "'bed'" in refused("evaluate", bedroom, "--classes", tmp_path / "few.yaml")
+    assert "--poses" in refused("evaluate", "--frames", tmp_path, "--ground-truth", truth)
+    assert "did you mean 'threshold'" in refused("evaluate", bedroom, "--set", "occupancy.treshold=0.3")
+    moved = tmp_path / "moved"
+    shutil.copytree(bedroom, moved)
+    manifest = (moved / "map.yaml").read_text()
+    (moved / "map.yaml").write_text(manifest.replace("house/bedroom", "house/gone"))
+    assert "is not there: name the true poses" in refused("evaluate", moved, "--ground-truth", truth)
+    assert "name it with --ground-truth" in refused("evaluate", moved)
+    assert run("evaluate", bedroom, "--grid", truth, code=2).stderr
+    assert run("evaluate", code=2).stderr
+    (tmp_path / "zero.txt").write_text("".join(f"{i} {i} {i * i} 0 0 0 0 0\n" for i in range(20)))
+    assert "is no trajectory" in refused("evaluate", bedroom, "--poses", tmp_path / "zero.txt")
+    assert "There is no" in refused("evaluate", "--gaussians", tmp_path / "absent.ply", "--ground-truth", truth)
+    assert "there is no folder" in refused("evaluate", bedroom, "--html", tmp_path / "absent" / "page.html")
+    arrays = dict(np.load(truth))
+    np.savez(tmp_path / "fine.npz", **{**arrays, "voxel_size": np.float64(1e-9)})
+    assert "from 0.001 to 10" in refused("evaluate", bedroom, "--ground-truth", tmp_path / "fine.npz")
+
+
+def test_a_map_that_misses_the_truth_altogether_says_so(bedroom: Path, tmp_path: Path) -> None:
+    arrays = dict(np.load(data_folder() / "house" / "bedroom" / "ground_truth.npz"))
+    np.savez(tmp_path / "away.npz", **{**arrays, "origin": arrays["origin"] + 1000})
+    result = evaluate(Asked(maps=[bedroom], ground_truths=[tmp_path / "away.npz"]))
+    assert result.scores.iou == 0
+    assert any("no voxel inside the truth" in note for note in result.notes)
+    assert not any("no voxel inside the truth" in note for note in evaluate(Asked(maps=[bedroom])).notes)
+
+
+def test_the_threshold_can_be_swept_without_mapping_again(bedroom: Path) -> None:
+    strict = evaluate(Asked(maps=[bedroom], overrides=["occupancy.threshold=0.9"]))
+    usual = evaluate(Asked(maps=[bedroom]))
+    assert strict.scores.recall < usual.scores.recall
+    assert strict.scores.precision > usual.scores.precision
+
+
+def test_the_ground_truth_command_writes_what_evaluate_reads(tmp_path: Path) -> None:
+    bedroom = data_folder() / "house" / "bedroom"
+    out = tmp_path / "gt.npz"
+    done = run("ground-truth", bedroom, "-o", out, "--set", "capture.stop=20", "--set", "max_range=6")
+    assert "wall" in done.stdout
+    assert load_ground_truth(out).classes[1:3] == ("air conditioner", "bed")
+    assert "exists" in refused("ground-truth", bedroom, "-o", out)
+    assert "did you mean 'max_range'" in refused(
+        "ground-truth", bedroom, "-o", tmp_path / "b.npz", "--set", "maxrange=6"
+    )
+    assert run("ground-truth", bedroom, "-o", tmp_path / "b.npz", "--protocol", "other", code=2).stderr
+    classes = identity(load_ground_truth(out).classes)
+    assert len(classes.classes) == 39

@@ -1,0 +1,66 @@
+"""GeoJSON of what words find."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scenes import occupancy_of
+from test_export_frames import map_of
+
+from freeocc3d.core.errors import ConfigError, ExportError
+from freeocc3d.export import export_map, geojson
+from freeocc3d.query.regions import Region
+
+
+def asked(scan_map):
+    """The map with one region of all its voxels for "cup", and none for anything else."""
+    center = scan_map.occupancy.centers(scan_map.occupancy.occupied_voxels())
+    region = Region(0.8, 0.9, center.mean(axis=0), center.min(axis=0), center.max(axis=0), 8e-3, np.arange(len(center)))
+
+    def query_words(words, top_k):
+        assert top_k >= len(center)  # every region, however many there are
+        found = {"cup": SimpleNamespace(word="cup", regions=[region], note="")}
+        return [found.get(word, SimpleNamespace(word=word, regions=[], note=f"no {word}")) for word in words]
+
+    scan_map.query_words = query_words
+    return scan_map
+
+
+def test_an_outline_on_the_floor_with_its_height_and_scores(tmp_path) -> None:
+    bar = [(i, 10, 20 + k) for i in range(4) for k in range(2)]  # 0.4 m to the right, 0.2 m deep, 0.1 m high
+    scan_map = asked(map_of(occupancy_of(bar)))
+    export_map(scan_map, "geojson", tmp_path / "map.geojson")
+    told = json.loads((tmp_path / "map.geojson").read_text())
+    (feature,) = told["features"]
+    ring = np.array(feature["geometry"]["coordinates"][0])
+    assert ring[0].tolist() == ring[-1].tolist()
+    assert sorted(map(tuple, ring[:-1].tolist())) == [(2.0, -0.4), (2.0, 0.0), (2.2, -0.4), (2.2, 0.0)]
+    x, y = ring.T
+    assert 0.5 * np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) == pytest.approx(0.08)  # counter-clockwise
+    properties = feature["properties"]
+    assert properties["word"] == "cup"
+    assert properties["area_m2"] == pytest.approx(0.08)
+    assert (properties["height_min_m"], properties["height_max_m"]) == (0.42, 0.52)
+    np.testing.assert_allclose(properties["centroid"], (2.1, -0.2, 0.47), atol=1e-6)
+    assert told["frame"] == "gravity"
+
+
+def test_words_are_those_asked_for(tmp_path) -> None:
+    scan_map = asked(map_of(occupancy_of([(0, 0, 1)])))
+    assert export_map(scan_map, "geojson", tmp_path / "map.geojson", {"words": ["cup", "table"]}) == ["no table"]
+    assert len(json.loads((tmp_path / "map.geojson").read_text())["features"]) == 1
+    assert export_map(scan_map, "geojson", tmp_path / "map.geojson", {"words": ["table"]}, True) == ["no table"]
+    assert json.loads((tmp_path / "map.geojson").read_text())["features"] == []
+    scan_map.vocabulary = []
+    with pytest.raises(ExportError, match="name words"):
+        export_map(scan_map, "geojson", tmp_path / "b.geojson")
+    with pytest.raises(ConfigError, match="up is no axis"):
+        export_map(scan_map, "geojson", tmp_path / "b.geojson", {"frame": "map"})
+
+
+def test_an_outline_has_corners_only() -> None:
+    square = np.array([(x, y) for x in range(5) for y in range(3)], float)
+    ring, area = geojson.outline(square)
+    assert area == 8
+    assert len(ring) == 5

@@ -1,0 +1,97 @@
+"""Denoising: the kernel against plain NumPy, noise that averages out, and points that are no surface."""
+
+import numpy as np
+import pytest
+from scenes import CAMERA, lifted, posed, wall_frame, with_sigma
+
+from freeocc3d.core.transforms import quats_to_rotations
+from freeocc3d.core.types import Frame, PosedFrame
+from freeocc3d.gaussians import anchors, denoising
+
+
+def views(count: int, seed: int = 0) -> tuple[list[Frame], np.ndarray]:
+    """Depth images of nothing in particular, with holes, from random poses."""
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    quats = rng.normal(size=(count, 4)) * (0, 0.1, 0.1, 0.1) + (1, 0, 0, 0)
+    poses[:, :3, :3] = quats_to_rotations(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    poses[:, :3, 3] = rng.uniform(-0.2, 0.2, (count, 3))
+    shape = CAMERA.height, CAMERA.width
+    frames = []
+    for n in range(count):
+        depth = rng.uniform(1.8, 2.2, shape).astype(np.float32)
+        depth[rng.uniform(size=shape) < 0.2] = 0
+        frames.append(Frame(n, float(n), np.zeros((*shape, 3), np.uint8), depth, CAMERA))
+    return frames, poses
+
+
+@pytest.mark.parametrize("own_sigma", [False, True])
+def test_the_kernel_agrees_with_plain_numpy(own_sigma: bool) -> None:
+    frames, poses = views(8)
+    frames = [with_sigma(frame) for frame in frames] if own_sigma else frames
+    points = np.random.default_rng(1).uniform((-1, -1, 1.5), (1, 1, 2.5), (4000, 3))
+    directions = np.random.default_rng(2).normal((0, 0, 0.3), 1, points.shape)  # some were measured from behind
+    looks = posed(frames, poses)
+    found = denoising.denoised(points, directions, looks, 0.15)
+    parts = [denoising.look_reference(points, directions, look, 0.15) for look in looks]
+    offset, weight, through = (sum(part[i].astype(float) for part in parts) for i in range(3))
+    shown = sum((part[1] > 0).astype(int) for part in parts)
+    assert 800 < np.count_nonzero(weight) < 3500
+    np.testing.assert_allclose(found.weights, weight, rtol=1e-5)
+    expected = points + offset / np.where(weight > 0, weight, 1)[:, None]
+    np.testing.assert_allclose(found.points, expected, atol=1e-6)
+    np.testing.assert_array_equal(found.kept, through <= np.maximum(shown, 1))
+    best = np.argmax([part[1] for part in parts], axis=0)
+    np.testing.assert_array_equal(found.keyframe, np.where(weight > 0, best, -1))
+
+
+def test_a_noisy_wall_ends_one_layer_thick() -> None:
+    frames = [wall_frame(2.02, n, seed=n) for n in range(12)]
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    thickness, count = {}, {}
+    for denoise in (False, True):
+        g = lifted(frames, poses, 0.01, denoise=denoise)
+        thickness[denoise], count[denoise] = np.std(g.means[:, 2]), len(g)
+    assert thickness[True] < 0.4 * thickness[False]
+    assert count[True] < 0.7 * count[False]
+
+
+def test_what_most_images_see_through_is_left_out_and_what_none_shows_stays() -> None:
+    frames = [wall_frame(2.0, n) for n in range(3)]
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    floating, on_the_wall, behind_the_camera, behind_the_wall = (0, 0, 1.0), (0, 0, 2.005), (0, 0, -1.0), (0, 0, 2.5)
+    points = np.array([floating, on_the_wall, behind_the_camera, behind_the_wall])
+    found = denoising.denoised(points, points, posed(frames, poses), 0.05)
+    np.testing.assert_array_equal(found.kept, [False, True, True, True])
+    np.testing.assert_array_equal(found.weights > 0, [False, True, False, False])
+    np.testing.assert_allclose(found.points[1], (0, 0, 2.0), atol=1e-6)
+    np.testing.assert_array_equal(found.points[2:], points[2:])
+
+
+def test_the_two_sides_of_a_board_stay_apart() -> None:
+    front, behind = np.eye(4), np.diag((-1.0, 1.0, -1.0, 1.0))
+    behind[2, 3] = 4.04  # looks back at a board of 4 cm, whose other side is 2 m away
+    looks = posed([wall_frame(2.0, 0), wall_frame(2.0, 1)], np.stack((front, behind)))
+    points = np.array([(0.1, 0.1, 2.003), (0.1, 0.1, 2.037)])
+    found = denoising.denoised(points, np.array([(0, 0, 1.0), (0, 0, -1.0)]), looks, 0.05)
+    np.testing.assert_allclose(found.points[:, 2], (2.0, 2.04), atol=1e-6)
+
+
+def test_a_frame_between_keyframes_is_anchored_to_the_one_it_hangs_on() -> None:
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, 0, 3] = 0.3
+    cells = anchors.AnchoredCells(anchors.Options(), 0.04, T[:1])
+    looks = [PosedFrame(wall_frame(2.0, n), T[n], 0) for n in range(2)]
+    for look in looks:
+        cells.add(look)
+    g = cells.gaussians(looks)
+    assert (g.anchor_keyframe == 0).all()
+    assert g.means[:, 0].max() > 1.4  # what only the second shows
+    np.testing.assert_allclose(g.anchor_cam, g.means, atol=1e-6)
+
+
+def test_nothing_to_look_at_changes_nothing() -> None:
+    points = np.array([(0.0, 0.0, 2.0)])
+    found = denoising.denoised(points, points, iter(()), 0.05)
+    np.testing.assert_array_equal(found.points, points)
+    assert found.keyframe[0] == -1

@@ -1,0 +1,167 @@
+"""Fitting: what it improves, what it may not touch, and that nothing makes it run away."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scenes import CAMERA, lifted, random_gaussians, wall_frame
+
+from freeocc3d.core.errors import ConfigError
+from freeocc3d.core.transforms import quats_to_rotations
+from freeocc3d.core.types import Frame
+from freeocc3d.gaussians import anchors, fitting, rendered_views
+from freeocc3d.gaussians.rasterizers import cpu
+
+RASTERIZER = cpu.load()
+
+
+def walls(count: int = 3) -> tuple[list[Frame], np.ndarray]:
+    """A wall, textured as pixels are, from cameras a little apart."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 2, 3] = -0.1 * np.arange(count)
+    return [wall_frame(2.0 + 0.1 * n, n) for n in range(count)], poses
+
+
+def seen(frames, poses) -> list[rendered_views.View]:
+    return [rendered_views.view_of(frame, T, 160, torch.device("cpu")) for frame, T in zip(frames, poses, strict=True)]
+
+
+def fitted(g, views, passes: int = 15, **options):
+    return fitting.fitted(g, views, RASTERIZER, fitting.Options(**options), passes)
+
+
+def test_fitting_renders_closer_to_the_images_with_means_where_they_were() -> None:
+    frames, poses = walls()
+    g, views = lifted(frames, poses), seen(frames, poses)
+    after = fitted(g, views)
+    before_db, after_db = (rendered_views.fidelity(x, views, RASTERIZER) for x in (g, after))
+    assert after_db.psnr > before_db.psnr + 1
+    assert after_db.depth_l1_m <= before_db.depth_l1_m + 1e-3
+    kept = {tuple(mean) for mean in g.means.tolist()}
+    assert len(after) > 0.95 * len(g)
+    assert all(tuple(mean) in kept for mean in after.means.tolist())
+
+
+def test_an_anchored_gaussian_keeps_its_axis_extent_and_mean_precision() -> None:
+    frames, poses = walls()
+    g = lifted(frames, poses, gamma=0.5)
+    after = fitted(g, seen(frames, poses))
+    row = {tuple(mean): n for n, mean in enumerate(g.means.tolist())}
+    g = g[np.array([row[tuple(mean)] for mean in after.means.tolist()])]
+    axes, before = (quats_to_rotations(x.quats_wxyz.astype(float))[:, :, 2] for x in (after, g))
+    np.testing.assert_allclose(axes, before, atol=1e-4)
+    np.testing.assert_allclose(after.scales[:, 2], g.scales[:, 2], rtol=1e-4)
+    np.testing.assert_allclose((after.scales[:, :2] ** -2.0).mean(1), (g.scales[:, :2] ** -2.0).mean(1), rtol=1e-3)
+    assert np.abs(after.scales[:, 0] / after.scales[:, 1] - 1).max() > 0.05
+    np.testing.assert_allclose(np.linalg.norm(after.quats_wxyz, axis=1), 1, atol=1e-5)
+
+
+def test_free_means_move_and_their_anchors_can_follow() -> None:
+    frames, poses = walls()
+    g = lifted(frames, poses)
+    after = fitted(g, seen(frames, poses), means="free")
+    still = {tuple(mean) for mean in g.means.tolist()}
+    assert sum(tuple(mean) in still for mean in after.means.tolist()) < 0.1 * len(after)
+    followed = anchors.anchored_where_they_are(after, poses)
+    same = anchors.reanchored(followed, poses, poses)
+    np.testing.assert_allclose(same.means, after.means, atol=1e-5)
+
+
+def test_what_lies_beyond_the_depth_does_not_make_gaussians_grow() -> None:
+    frames, poses = walls(1)
+    depth = frames[0].depth_m.copy()
+    depth[:, 80:] = 0  # bright there, and nothing is anchored
+    color = frames[0].color.copy()
+    color[:, 80:] = 255
+    frames = [replace(frames[0], depth_m=depth, color=color)]
+    g = lifted(frames, poses)
+    after = fitted(g, seen(frames, poses), passes=30)
+    rendered = rendered_views.render(after, seen(frames, poses)[0], RASTERIZER)
+    assert float(rendered.alpha[:, 90:].max()) < 0.2
+
+
+@pytest.mark.parametrize("means", ["anchored", "free"])
+@pytest.mark.parametrize("case", ["one colour", "no depth in a frame", "one keyframe", "duplicates", "outliers", "far"])
+def test_nothing_runs_away(case: str, means: str) -> None:
+    frames, poses = walls()
+    rng = np.random.default_rng(0)
+    if case == "one colour":
+        frames = [replace(frame, color=np.full_like(frame.color, 200)) for frame in frames]
+    elif case == "no depth in a frame":
+        frames[1] = replace(frames[1], depth_m=np.zeros_like(frames[1].depth_m))
+    elif case == "one keyframe":
+        frames, poses = frames[:1], poses[:1]
+    elif case == "duplicates":
+        frames, poses = [frames[0]] * 3, np.tile(poses[0], (3, 1, 1))
+    elif case == "outliers":
+        for n, frame in enumerate(frames):
+            depth = frame.depth_m.copy()
+            wrong = rng.uniform(size=depth.shape) < 0.1
+            depth[wrong] = rng.uniform(0.3, 6.0, np.count_nonzero(wrong))
+            frames[n] = replace(frame, depth_m=depth)
+    elif case == "far":
+        poses[:, 0, 3] = 500.0
+    g = lifted(frames, poses)
+    after = fitted(g, seen(frames, poses), means=means)
+    for name in ("means", "scales", "quats_wxyz", "opacities"):
+        assert np.isfinite(getattr(after, name)).all()
+    assert after.scales.max() <= 4.001 * g.scales.max()
+    assert after.scales.min() >= 0.249 * g.scales.min()
+    assert len(after) > 0.5 * len(g)
+
+
+def test_no_passes_views_or_gaussians_change_nothing() -> None:
+    frames, poses = walls(1)
+    g = lifted(frames, poses)
+    assert fitted(g, seen(frames, poses), passes=0) is g
+    assert fitted(g, []) is g
+    nothing = random_gaussians(0, 0)
+    assert fitted(nothing, seen(frames, poses)) is nothing
+    unseen = rendered_views.fidelity(g, [], RASTERIZER)
+    assert unseen.psnr is None
+
+
+def test_fitting_twice_gives_the_same() -> None:
+    frames, poses = walls()
+    g, views = lifted(frames, poses), seen(frames, poses)
+    once, again = fitted(g, views, passes=3), fitted(g, views, passes=3)
+    np.testing.assert_allclose(once.scales, again.scales, rtol=1e-4)
+    assert torch.get_num_threads() >= 1
+
+
+def test_what_was_fitted_is_carried_over_by_cells() -> None:
+    frames, poses = walls()
+    g = lifted(frames, poses)
+    half = g[g.means[:, 0] < 0]
+    changed = replace(half, opacities=np.full(len(half), 0.123, np.float32))
+    carried = fitting.carried_over(g, changed, 0.04)
+    np.testing.assert_allclose(carried.opacities, np.where(g.means[:, 0] < 0, 0.123, 0.9), rtol=1e-6)
+    np.testing.assert_array_equal(carried.means, g.means)
+    assert fitting.carried_over(g, random_gaussians(0, 0), 0.04) is g
+
+
+def test_a_view_keeps_rays_and_picks_depth() -> None:
+    frame = wall_frame(2.0)
+    depth = frame.depth_m.copy()
+    depth[:, 80:] = 3.0
+    view = rendered_views.view_of(replace(frame, depth_m=depth), np.eye(4), 80, torch.device("cpu"))
+    assert view.color.shape == (60, 80, 3)
+    assert set(np.unique(view.depth_m.numpy())) == {np.float32(2.0), np.float32(3.0)}
+    assert view.camera == CAMERA.resized(80, 60)
+    assert rendered_views.view_of(frame, np.eye(4), 4000, torch.device("cpu")).camera == CAMERA
+
+
+@pytest.mark.parametrize("wrong", [{"means": "wild"}, {"passes": -1}, {"shape_weight": -0.1}, {"width": 0}])
+def test_options_out_of_range_are_refused(wrong) -> None:
+    with pytest.raises(ConfigError):
+        fitting.Options(**wrong)
+
+
+def test_isotropic_gaussians_are_spheres_of_their_neighbours_distance() -> None:
+    frames, poses = walls(1)
+    g = lifted(frames, poses, initialisation="isotropic")
+    assert (g.scales == g.scales[:, :1]).all()
+    inner = np.abs(g.means[:, :2]).max(axis=1) < 0.5
+    assert np.median(g.scales[inner]) == pytest.approx(0.04, rel=0.2)
+    assert len(anchors.isotropic(random_gaussians(1, 0))) == 1

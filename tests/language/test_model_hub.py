@@ -1,0 +1,239 @@
+"""Pulling models from a hub: a server that speaks the Hugging Face hub's protocol, and misbehaves when told to."""
+
+from __future__ import annotations
+
+import hashlib
+import http.server
+import json
+import re
+import shutil
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_model_packages import dense_package, graph, succeed, write_manifest
+
+from freeocc3d.cli.main import main
+from freeocc3d.core.errors import ModelError
+from freeocc3d.language import model_hub, model_packages
+
+REPOSITORY = "someone/tiny"
+
+
+class Hub(http.server.ThreadingHTTPServer):
+    """Serves a folder as the repository REPOSITORY.
+
+    cut: file -> bytes after which its connections are cut.  down: answer 503 to further downloads after a cut.
+    spoilt: files of which another content is sent than the listing's hash says.  requested: (file, Range) so far.
+    """
+
+    def __init__(self, folder: Path):
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.folder = folder
+        self.cut: dict[str, int] = {}
+        self.down = False
+        self.spoilt: set[str] = set()
+        self.requested: list[tuple[str, str | None]] = []
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    server: Hub
+
+    def do_GET(self) -> None:
+        path = self.path.split("?")[0]
+        if path == f"/api/models/{REPOSITORY}/revision/main":
+            self._answer(json.dumps(self._listing()).encode())
+            return
+        found = re.fullmatch(rf"/{REPOSITORY}/resolve/main/(.+)", path)
+        if found is None or not (self.server.folder / found[1]).is_file():
+            self.send_error(404)
+            return
+        self._file(found[1])
+
+    def _file(self, name: str) -> None:
+        wanted = self.headers.get("Range")
+        self.server.requested.append((name, wanted))
+        if self.server.down:
+            self.send_error(503)
+            return
+        content = (self.server.folder / name).read_bytes()
+        if name in self.server.spoilt:
+            content = bytes(reversed(content))
+        start = int(re.fullmatch(r"bytes=(\d+)-", wanted)[1]) if wanted else 0
+        self.send_response(206 if wanted else 200)
+        self.send_header("Content-Length", str(len(content) - start))
+        if wanted:
+            self.send_header("Content-Range", f"bytes {start}-{len(content) - 1}/{len(content)}")
+        self.end_headers()
+        if name in self.server.cut:
+            self.wfile.write(content[start : self.server.cut[name]])
+            self.wfile.flush()
+            self.server.down = True
+            self.close_connection = True
+            return
+        self.wfile.write(content[start:])
+
+    def _listing(self) -> dict[str, Any]:
+        siblings = []
+        for path in sorted(p for p in self.server.folder.rglob("*") if p.is_file()):
+            content = path.read_bytes()
+            blob = hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+            own = {"rfilename": path.relative_to(self.server.folder).as_posix(), "size": len(content), "blobId": blob}
+            if path.suffix in (".onnx", ".safetensors"):
+                digest = hashlib.sha256(content).hexdigest()
+                own["lfs"] = {"sha256": digest, "size": len(content), "pointerSize": 130}
+            siblings.append(own)
+        return {"id": REPOSITORY, "sha": "0" * 40, "siblings": siblings, "private": False, "tags": [], "downloads": 0}
+
+    def _answer(self, content: bytes) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("FREEOCC3D_MODELS", str(tmp_path / "models"))
+    return tmp_path / "models"
+
+
+@pytest.fixture
+def server(tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    folder = dense_package(tmp_path / "remote")
+    (folder / "pytorch_model.bin").write_bytes(b"\x80\x04 never fetched")
+    running = Hub(folder)
+    thread = threading.Thread(target=running.serve_forever, daemon=True)
+    thread.start()
+    monkeypatch.setenv("HF_ENDPOINT", running.url)
+    yield running
+    running.shutdown()
+    running.server_close()
+    thread.join()
+
+
+def test_a_package_is_pulled_whole(server: Hub, home: Path) -> None:
+    folder = model_hub.pull(REPOSITORY)
+    assert folder == home / "tiny"
+    model_packages.verify(model_packages.read(folder))
+    assert {path.name for path in folder.iterdir()} == {"manifest.yaml", "image.onnx", "text.onnx", "tokenizer.json"}
+    assert {path.name for path in home.iterdir()} == {"tiny"}
+
+
+def test_what_is_there_is_not_fetched_again(server: Hub) -> None:
+    model_hub.pull(REPOSITORY)
+    before = len(server.requested)
+    model_hub.pull(REPOSITORY)
+    assert len(server.requested) == before
+
+
+def test_an_interrupted_pull_goes_on_where_it_stopped(server: Hub, home: Path) -> None:
+    large = 6_000_000  # numbers; the library hands ten megabytes on at a time
+    graph(server.folder / "text.onnx", {"tokens": ["t", "l"]}, {"features": [1, 8], "more": [large]})
+    write_manifest(server.folder)
+    server.cut["text.onnx"] = 3 * large
+    with pytest.raises(ModelError, match=r"answered 503 when asked for someone/tiny"):
+        model_hub.pull(REPOSITORY)
+    assert not (home / "tiny").exists()
+    (kept,) = (path.stat().st_size for path in (home / "tiny.partial").glob("*.incomplete"))
+    assert 0 < kept <= 3 * large
+    server.cut, server.down, server.requested = {}, False, []
+    model_packages.verify(model_packages.read(model_hub.pull(REPOSITORY)))
+    assert server.requested[0] == ("text.onnx", f"bytes={kept}-")
+    assert "image.onnx" not in dict(server.requested)  # it was whole already
+
+
+def test_content_that_differs_from_its_hash_is_dropped(server: Hub, home: Path) -> None:
+    server.spoilt.add("image.onnx")
+    with pytest.raises(ModelError, match=r"image\.onnx of someone/tiny is not what the hub's hash says"):
+        model_hub.pull(REPOSITORY)
+    assert not (home / "tiny").exists()
+    assert not list((home / "tiny.partial").glob("image.onnx*"))
+    server.spoilt.clear()
+    model_packages.verify(model_packages.read(model_hub.pull(REPOSITORY)))
+
+
+def test_what_differs_from_the_manifest_is_no_package(server: Hub, home: Path) -> None:
+    (server.folder / "text.onnx").write_bytes(b"exchanged on the hub, its own hash too")
+    with pytest.raises(ModelError, match=r"text\.onnx is damaged"):
+        model_hub.pull(REPOSITORY)
+    assert not (home / "tiny").exists()
+
+
+def test_a_manifest_that_lists_what_is_not_there(server: Hub) -> None:
+    (server.folder / "text.onnx").unlink()
+    with pytest.raises(ModelError, match=r"someone/tiny lacks text\.onnx, which its manifest lists"):
+        model_hub.pull(REPOSITORY)
+
+
+def test_a_manifest_cannot_reach_out_of_its_folder(server: Hub, home: Path) -> None:
+    text = (server.folder / "manifest.yaml").read_text().replace("text.onnx", "../text.onnx")
+    (server.folder / "manifest.yaml").write_text(text)
+    with pytest.raises(ModelError, match="is not the plain name of a file"):
+        model_hub.pull(REPOSITORY)
+
+
+def test_a_checkpoint_is_pulled_without_what_could_run_code(server: Hub, home: Path) -> None:
+    for name in ("manifest.yaml", "image.onnx", "text.onnx"):
+        (server.folder / name).unlink()
+    (server.folder / "config.json").write_text("{}")
+    (server.folder / "model.safetensors").write_bytes(b"weights")
+    (server.folder / "modeling.py").write_text("import os")
+    folder = model_hub.pull(REPOSITORY)
+    assert folder == home / ".checkpoints" / "tiny"
+    assert {path.name for path in folder.iterdir()} == {"config.json", "model.safetensors", "tokenizer.json"}
+    assert not model_packages.installed()
+
+
+def test_pickled_weights_are_refused(server: Hub) -> None:
+    for path in server.folder.iterdir():
+        if path.suffix != ".bin":
+            path.unlink()
+    with pytest.raises(ModelError, match=r"neither a model package .* nor weights as safetensors"):
+        model_hub.pull(REPOSITORY)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("someone/else", "has no repository someone/else"),
+        ("clip-b16-opena", r"is not OWNER/NAME .* \(did you mean 'clip-b16-openai'\?\)"),
+        ("a/b/c", "is not OWNER/NAME"),
+        ("a/..", "is not OWNER/NAME"),
+    ],
+)
+def test_names_that_are_none(server: Hub, name: str, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        model_hub.pull(name)
+
+
+def test_no_network_is_told_in_a_sentence(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")  # nobody listens there
+    with pytest.raises(SystemExit, match="1"):
+        main(["models", "pull", REPOSITORY])
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "someone/tiny could not be fetched from http://127.0.0.1:9" in said
+    assert "pull again once the network is back" in said
+
+
+def test_the_command_says_where_it_is(server: Hub, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    succeed(["models", "pull", REPOSITORY])
+    assert capsys.readouterr().out.strip() == str(home / "tiny")
+    shutil.rmtree(home)
+    for name in ("manifest.yaml", "image.onnx", "text.onnx"):
+        (server.folder / name).unlink()
+    (server.folder / "model.safetensors").write_bytes(b"weights")
+    succeed(["models", "pull", REPOSITORY])
+    assert "a checkpoint, to be exported: python tools/export_encoder.py" in " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,231 @@
+"""Model packages: what is read, and what is refused, in words."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import tiny_models
+import yaml
+from onnx import TensorProto, helper, numpy_helper
+
+from freeocc3d.cli.main import main
+from freeocc3d.core.errors import ModelError
+from freeocc3d.language import model_packages
+
+
+def graph(path: Path, inputs: dict[str, list[Any]], outputs: dict[str, list[Any]]) -> None:
+    """An ONNX network that ignores its inputs and gives zeros."""
+    nodes, constants = [], []
+    for name, shape in outputs.items():
+        zeros = np.zeros([n if isinstance(n, int) else 1 for n in shape], np.float32)
+        constants.append(numpy_helper.from_array(zeros, f"{name}_zeros"))
+        nodes.append(helper.make_node("Identity", [f"{name}_zeros"], [name]))
+    made = helper.make_graph(
+        nodes, "g",
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in inputs.items()],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()],
+        constants,
+    )  # fmt: skip
+    onnx.save(helper.make_model(made, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
+
+
+def dense_package(folder: Path, **changes: Any) -> Path:
+    """The smallest package with a text side."""
+    folder.mkdir(parents=True)
+    graph(folder / "image.onnx", {"image": ["b", 3, "h", "w"]}, {"features": [1, 2, 2, 8]})
+    graph(folder / "text.onnx", {"tokens": ["t", "l"]}, {"features": [1, 8]})
+    (folder / "tokenizer.json").write_text(tiny_models.tokenizer(), encoding="utf-8")
+    write_manifest(folder, **changes)
+    return folder
+
+
+def write_manifest(folder: Path, **changes: Any) -> None:
+    parts = {"image": "image.onnx", "text": "text.onnx", "tokenizer": "tokenizer.json"}
+    manifest = {
+        "format": 1, "name": folder.name, "kind": "dense", "dimension": 8, "mean": [0.5] * 3, "std": [0.5] * 3,
+        "patch": 14, "input_size": 224, "prefix_tokens": 0, "logit_scale": 100, "precision": "fp32", "licence": "none",
+        "source": "a test", "parts": parts,
+        "files": {file: model_packages.sha256(folder / file) for file in parts.values()}, **changes,
+    }  # fmt: skip
+    (folder / "manifest.yaml").write_text(yaml.safe_dump(manifest), encoding="utf-8")
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("FREEOCC3D_MODELS", str(tmp_path / "models"))
+    return tmp_path / "models"
+
+
+def test_a_package_is_read_verified_and_run(tmp_path: Path) -> None:
+    package = model_packages.read(dense_package(tmp_path / "tiny"))
+    model_packages.verify(package)
+    assert (package.name, package.kind, package.dimension, package.logit_scale) == ("tiny", "dense", 8, 100.0)
+    assert package.bytes == sum(path.stat().st_size for path in package.folder.iterdir() if path.stem != "manifest")
+    assert package.session("image").run(["features"], {"image": np.zeros((1, 3, 28, 28), np.float32)})[0].shape[-1] == 8
+
+
+def test_a_manifest_may_be_json(tmp_path: Path) -> None:
+    folder = dense_package(tmp_path / "tiny")
+    manifest = yaml.safe_load((folder / "manifest.yaml").read_text())
+    (folder / "manifest.yaml").unlink()
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    assert model_packages.read(folder).dimension == 8
+
+
+def test_a_wrong_hash_is_told(tmp_path: Path) -> None:
+    folder = dense_package(tmp_path / "tiny")
+    content = bytearray((folder / "text.onnx").read_bytes())
+    content[-5] ^= 1
+    (folder / "text.onnx").write_bytes(content)
+    package = model_packages.read(folder)
+    for check in (lambda: model_packages.verify(package), lambda: package.session("text")):
+        with pytest.raises(ModelError, match=r"text\.onnx is damaged: its sha256 is .*…, the manifest says"):
+            check()
+    package.session("image")
+
+
+def test_what_is_not_onnx_is_told(tmp_path: Path) -> None:
+    folder = dense_package(tmp_path / "tiny")
+    (folder / "image.onnx").write_bytes(b"\x80\x04a pickle, perhaps")
+    write_manifest(folder)
+    with pytest.raises(ModelError, match=r"image\.onnx is not an ONNX network"):
+        model_packages.read(folder).session("image")
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "message"),
+    [
+        ({"pixels": [1, 3, 8, 8]}, {"features": [1, 2, 2, 8]}, r"takes pixels and gives features; the image network"),
+        ({"image": [1, 3, 8, 8]}, {"logits": [1, 2]}, r"takes image and gives logits; the image network of a 'dense'"),
+        (
+            {"image": [1, 3, 8, 8], "size": [2]},
+            {"features": [1, 2, 2, 8]},
+            r"takes image, size and gives features",
+        ),
+        (
+            {"image": [1, 3, 8, 8]},
+            {"features": [1, 2, 2, 16]},
+            r"gives features of 16 dimensions, the manifest says 8: image and text networks must be of one model",
+        ),
+    ],
+)
+def test_other_inputs_and_outputs_are_told(tmp_path: Path, inputs: Any, outputs: Any, message: str) -> None:
+    folder = dense_package(tmp_path / "tiny")
+    graph(folder / "image.onnx", inputs, outputs)
+    write_manifest(folder)
+    with pytest.raises(ModelError, match=message):
+        model_packages.read(folder).session("image")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": 2}, "it must state format: 1"),
+        ({"kind": "diffusion"}, "kind 'diffusion' is not one of clip"),
+        ({"dimension": "8"}, "'dimension' is missing or not a int"),
+        ({"dimension": True}, "'dimension' is missing or not a int"),
+        ({"dimension": 0}, "must be greater than 0"),
+        ({"dimension": 1 << 40}, "must be greater than 0, and usual"),
+        ({"patch": 300}, "nor 'input_size' less than 'patch'"),
+        ({"mean": [0.5]}, "'mean' and 'std' must be three numbers"),
+        ({"std": [0.5, 0.5, 0.0]}, "must be greater than 0"),
+        ({"std": [0.5, 0.5, float("nan")]}, "must be finite"),
+        ({"licence": None}, "'licence' is missing"),
+        ({"parts": {"image": "image.onnx"}}, "'parts' lacks text, tokenizer"),
+        ({"files": {}}, "'parts' and 'files' must name the same files"),
+    ],
+)
+def test_unusable_manifests_are_told(tmp_path: Path, changes: Any, message: str) -> None:
+    folder = dense_package(tmp_path / "tiny", **changes)
+    with pytest.raises(ModelError, match=message) as caught:
+        model_packages.read(folder)
+    assert "manifest.yaml" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["../text.onnx", "/etc/passwd.json", "a/b.onnx", ".hidden.json", "..\\x.onnx"])
+def test_no_file_lies_outside_of_its_folder(tmp_path: Path, name: str) -> None:
+    parts = {"image": "image.onnx", "text": name, "tokenizer": "tokenizer.json"}
+    folder = dense_package(tmp_path / "tiny", parts=parts, files=dict.fromkeys(parts.values(), "0" * 64))
+    with pytest.raises(ModelError, match="is not the plain name of a file in its folder"):
+        model_packages.read(folder)
+
+
+@pytest.mark.parametrize("name", ["text.pt", "text.bin", "text.pkl", "text"])
+def test_other_formats_are_no_part_of_a_package(tmp_path: Path, name: str) -> None:
+    parts = {"image": "image.onnx", "text": name, "tokenizer": "tokenizer.json"}
+    folder = dense_package(tmp_path / "tiny", parts=parts, files=dict.fromkeys(parts.values(), "0" * 64))
+    with pytest.raises(ModelError, match=r"is not a file of \.onnx, \.safetensors"):
+        model_packages.read(folder)
+
+
+def test_manifests_run_nothing(tmp_path: Path) -> None:
+    folder = dense_package(tmp_path / "tiny")
+    (folder / "manifest.yaml").write_text("!!python/object/apply:os.system ['true']\n")
+    with pytest.raises(ModelError, match=r"manifest\.yaml cannot be read"):
+        model_packages.read(folder)
+    (folder / "manifest.yaml").write_text("a: " + "x" * (1 << 20))
+    with pytest.raises(ModelError, match="more than a megabyte"):
+        model_packages.read(folder)
+
+
+def test_what_is_lacking_is_told(tmp_path: Path, home: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ModelError, match="lacks a manifest"):
+        model_packages.read(tmp_path / "empty")
+    folder = dense_package(tmp_path / "tiny")
+    (folder / "text.onnx").unlink()
+    with pytest.raises(ModelError, match=r"lacks its text\.onnx"):
+        model_packages.read(folder)
+
+
+def test_packages_are_found_by_folder_and_by_name(tmp_path: Path, home: Path) -> None:
+    with pytest.raises(ModelError, match="neither as a folder nor by name"):
+        model_packages.find("tiny", ("dense",), "language.dinov2.model")
+    dense_package(home / "tiny")
+    assert model_packages.find("tiny", ("dense",), "x").folder == home / "tiny"
+    assert model_packages.find(str(home / "tiny"), ("dense",), "x").name == "tiny"
+    with pytest.raises(ModelError, match=r"There is no model 'tinny' \(did you mean 'tiny'\?\)"):
+        model_packages.find("tinny", ("dense",), "x")
+    with pytest.raises(ModelError, match=r"language\.clip\.model needs a model of kind clip; .* is of kind dense"):
+        model_packages.find("tiny", ("clip",), "language.clip.model")
+    (tmp_path / "beside").mkdir()
+    with pytest.raises(ModelError, match=r"There is no model '\.\./beside'"):
+        model_packages.find("../beside", ("dense",), "x")
+
+
+def test_the_command_lists_and_verifies(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    succeed(["models", "list"])
+    assert "There are no models" in capsys.readouterr().out
+    dense_package(home / "good")
+    shutil.copytree(home / "good", home / "bad")
+    (home / "bad" / "text.onnx").write_bytes(b"")
+    (home / "strange").mkdir()
+    succeed(["models", "list", "--json"])
+    listed = json.loads(capsys.readouterr().out)["models"]
+    assert listed["good"]["dimension"] == 8
+    assert "lacks a manifest" in listed["strange"]["error"]
+    succeed(["models", "list"])
+    assert "unusable" in capsys.readouterr().out
+    succeed(["models", "verify", "good"])
+    assert "3 files are as they should be" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="1"):
+        main(["models", "verify", "bad"])
+    assert "text.onnx is damaged" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="1"):
+        main(["models", "verify"])  # one that is damaged hides no other
+    said = capsys.readouterr()
+    assert "good: 3 files are as they should be" in said.out
+    assert "text.onnx is damaged" in said.err
+    assert "strange is no model package" in said.err
+
+
+def succeed(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 0

@@ -1,0 +1,115 @@
+"""What is and is not seen of Gaussians, and how well: the compiled kernel against NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenes import CAMERA, gaussians, random_gaussians
+
+from freeocc3d.core.types import Frame
+from freeocc3d.language.lifting import Options
+from freeocc3d.language.visibility import Seen, seen, seen_reference
+
+FLAT = Options(border=0.0)
+
+
+def frame(depth_m: object) -> Frame:
+    shape = CAMERA.height, CAMERA.width
+    depth = np.broadcast_to(np.asarray(depth_m, np.float32), shape).copy()
+    return Frame(0, 0.0, np.zeros((*shape, 3), np.uint8), depth, CAMERA)
+
+
+def pose(seed: int) -> NDArray[np.float64]:
+    """A camera about two metres from the origin that looks at it, turned a little."""
+    rng = np.random.default_rng(seed)
+    U, _, Vt = np.linalg.svd(np.eye(3) + 0.2 * rng.normal(size=(3, 3)))
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag((1, 1, np.linalg.det(U @ Vt))) @ Vt
+    T[:3, 3] = T[:3, :3] @ (0.1, -0.2, -2.0)
+    return T
+
+
+def is_seen(z: float, depth_m: object, scale: float = 0.01, options: Options = FLAT) -> bool:
+    """Whether one Gaussian on the optical axis is seen in a depth image."""
+    return len(seen(gaussians((0.0, 0.0, z), scale), frame(depth_m), np.eye(4), options).rows) == 1
+
+
+def weight(z: float, depth_m: object, options: Options | None = None, x: float = 0.0) -> float:
+    found = seen(
+        gaussians((x, 0.0, z), 0.01), frame(depth_m), np.eye(4), options or Options(visible_within=10.0, border=0.0)
+    )
+    return float(found.weights[0])
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("measured", [0.0, 0.6, 1.0])
+def test_kernel_agrees_with_numpy(seed: int, measured: float) -> None:
+    rng = np.random.default_rng(seed)
+    cloud = random_gaussians(3000, seed, extent=3.0)
+    depth = 2.0 + rng.normal(0, 0.3, (CAMERA.height, CAMERA.width))
+    depth[rng.random(depth.shape) >= measured] = 0
+    options = Options(visible_within=0.3, visible_share=0.1)
+    found = seen(cloud, frame(depth), pose(seed), options)
+    pixels, weights = seen_reference(cloud, frame(depth), pose(seed), options)
+    ours = np.zeros(len(cloud))
+    ours[found.rows] = found.weights
+    assert 100 < np.count_nonzero(weights) < 2500
+    # float32 puts a few Gaussians on the other side of a pixel's border or of the tolerance
+    assert np.isclose(ours, weights, rtol=1e-3, atol=1e-6).mean() > 0.99
+    assert (found.pixels == pixels[found.rows]).mean() > 0.99
+
+
+def test_hidden_and_outside_are_not_seen() -> None:
+    assert is_seen(2.0, 2.0)
+    assert not is_seen(2.0, 1.5)  # behind what the image shows
+    assert not is_seen(2.0, 2.5)  # before it: what the image shows was seen through the Gaussian
+    assert not is_seen(-2.0, 2.0)
+
+
+def test_where_nothing_is_measured_the_rendered_depth_decides() -> None:
+    cloud = gaussians([(0.0, 0.0, 2.0), (0.0, 0.0, 3.0), (0.5, 0.0, 3.0)], 0.02)
+    np.testing.assert_array_equal(seen(cloud, frame(0.0), np.eye(4), FLAT).rows, [0, 2])
+    # a measured depth is not overruled: what it shows through a Gaussian is seen
+    np.testing.assert_array_equal(seen(cloud, frame(3.0), np.eye(4), FLAT).rows, [1, 2])
+
+
+def test_tolerance_grows_with_depth_and_with_the_gaussian() -> None:
+    assert is_seen(1.0, 1.025, 0.001)
+    assert not is_seen(1.0, 1.045, 0.001)
+    assert is_seen(4.0, 4.045, 0.001)
+    assert is_seen(1.0, 1.045, 0.02)
+
+
+def test_a_gaussians_extent_counts_along_the_ray_alone() -> None:
+    flat = (0.5, 0.5, 0.001)
+    for quat, expected in (((1, 0, 0, 0), False), ((np.sqrt(0.5), 0, np.sqrt(0.5), 0), True)):
+        cloud = gaussians((0.0, 0.0, 2.0), flat, quats=quat)
+        assert bool(len(seen(cloud, frame(2.2), np.eye(4), FLAT).rows)) == expected
+
+
+def test_near_views_count_more() -> None:
+    assert weight(1.0, 1.0) / weight(2.0, 2.0) == pytest.approx(4, rel=1e-3)
+    assert weight(0.2, 0.2) == pytest.approx(weight(0.5, 0.5), rel=1e-3)
+
+
+def test_views_along_the_surface_count_less() -> None:
+    """A plane z = 2 + x tan(60°) is seen at 60° to its normal on the optical axis."""
+    slope = (np.arange(CAMERA.width) - CAMERA.cx) / CAMERA.fx
+    tilted = 2.0 / (1.0 - slope * np.tan(np.deg2rad(60)))
+    assert weight(2.0, tilted[None]) / weight(2.0, 2.0) == pytest.approx(0.5, rel=0.05)
+
+
+def test_the_image_edge_counts_less_and_the_middle_in_full() -> None:
+    half = 2.0 * (CAMERA.width / 2 - 0.6) / CAMERA.fx  # the last column, at 2 m
+    plain, bordered = Options(border=0.0), Options(border=0.2)
+    assert weight(2.0, 2.0, bordered) == pytest.approx(weight(2.0, 2.0, plain))
+    assert weight(2.0, 2.0, bordered, x=half) / weight(2.0, 2.0, plain, x=half) == pytest.approx(0.25, rel=0.1)
+
+
+def test_cells_are_those_that_the_pixels_lie_in() -> None:
+    """Pixel borders and cell borders, for images whose size is no multiple of the features'."""
+    row, column = (axis.reshape(-1) for axis in np.mgrid[0:120:7, 0:160:3])
+    pixels = (row * 160 + column).astype(np.int32)
+    view = Seen(np.arange(len(pixels), dtype=np.int32), pixels, np.ones(len(pixels), np.float32), (120, 160))
+    np.testing.assert_array_equal(view.cells((7, 9)), row * 7 // 120 * 9 + column * 9 // 160)

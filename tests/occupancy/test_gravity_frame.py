@@ -1,0 +1,94 @@
+"""The gravity frame of rooms whose floor, walls and cameras are known, seen from any frame."""
+
+import numpy as np
+import pytest
+from scenes import gaussians
+
+from freeocc3d.core.transforms import invert, is_rigid, quats_to_rotations, transform
+from freeocc3d.occupancy.gravity_frame import first_camera_frame, floor_height, gravity_frame
+
+
+def room(seed=0, table=1500, floor=3000, noise=0.004):
+    """Surface points of a room of 4 x 6 x 2.5 m, z up, floor at 0, with a table, a ceiling, and a few
+    points below the floor as reflections make them, as spheres."""
+    rng = np.random.default_rng(seed)
+
+    def sheet(n, low, high, axis):
+        points = rng.uniform(low, high, (n, 3))
+        points[:, "xyz".index(axis)] += rng.normal(0, noise, n)
+        return points
+
+    sheets = [
+        sheet(floor, (0, 0, 0), (4, 6, 0), "z"),
+        sheet(table, (1, 1, 0.75), (2.5, 2, 0.75), "z"),
+        sheet(1500, (0, 0, 0), (0, 6, 2.5), "x"),
+        sheet(1000, (0, 0, 0), (4, 0, 2.5), "y"),
+        sheet(2500, (0, 0, 2.5), (4, 6, 2.5), "z"),
+        sheet(40, (0, 0, -1.5), (4, 6, -0.1), "z"),
+    ]
+    return gaussians(np.concatenate(sheets), 0.02)
+
+
+def cameras(n=30):
+    """A walk at 1.5 m that looks around and down by 37 degrees; OpenCV axes."""
+    out = []
+    for turn in np.linspace(0.3, 2 * np.pi, n):
+        forward = np.array((0.8 * np.cos(turn), 0.8 * np.sin(turn), -0.6))
+        right = np.array((np.sin(turn), -np.cos(turn), 0.0))
+        T = np.eye(4)
+        T[:3, :3] = np.stack((right, np.cross(forward, right), forward), axis=1)
+        T[:3, 3] = (2 + np.cos(turn), 3 + np.sin(turn), 1.5)
+        out.append(T)
+    return np.stack(out)
+
+
+def moved(scene, poses, seed):
+    """The same in another frame, and the transform there."""
+    rng = np.random.default_rng(seed)
+    quat = rng.normal(size=4)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = quats_to_rotations(quat / np.linalg.norm(quat)), rng.uniform(-5, 5, 3)
+    return gaussians(transform(T, scene.means.astype(float)), scene.scales), T @ poses, T
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_floor_walls_and_heading_are_found_in_any_frame(seed) -> None:
+    scene, poses, T = moved(room(seed), cameras(), seed)
+    found = gravity_frame(poses, scene) @ T  # from the room's own frame
+    assert is_rigid(found)
+    assert np.degrees(np.arccos(found[2, 2])) < 0.15
+    floor = transform(found, np.array([(0.0, 0, 0), (4, 0, 0), (0, 6, 0), (4, 6, 0)]))
+    assert np.abs(floor[:, 2]).max() < 0.015
+    turn = np.degrees(np.arctan2(found[1, 0], found[0, 0]))
+    assert abs((turn + 45) % 90 - 45) < 0.5  # along the walls …
+    assert (found[:3, :3] @ cameras()[0][:3, 2])[0] > 0.6  # … and about where the first camera looked
+    np.testing.assert_allclose(transform(found, cameras()[0][:3, 3])[:2], 0, atol=1e-6)
+
+
+def test_a_table_larger_than_the_visible_floor_is_no_floor() -> None:
+    found = gravity_frame(cameras(), room(table=5000, floor=2000))
+    assert abs(transform(found, np.array((2.0, 3, 0)))[2]) < 0.02
+
+
+def test_the_first_camera_is_the_origin_and_looks_along_x() -> None:
+    scene, poses, _ = moved(room(), cameras(), 3)
+    T_gravity_map = gravity_frame(poses, scene)
+    T = first_camera_frame(T_gravity_map, poses[0])
+    assert is_rigid(T)
+    np.testing.assert_allclose(transform(T, poses[0][:3, 3]), 0, atol=1e-9)
+    looks = T[:3, :3] @ poses[0][:3, 2]
+    assert looks[0] > 0.79
+    assert abs(looks[1]) < 1e-9
+    np.testing.assert_allclose((T @ invert(T_gravity_map))[2, :3], (0, 0, 1), atol=1e-9)  # z stays up
+
+
+def test_without_a_floor_or_anything_there_is_a_frame_still() -> None:
+    assert floor_height(np.array((2.0, 3.0)), 1.5) is None
+    nothing = gaussians(np.zeros((0, 3)), np.zeros((0, 3)))
+    for poses in (np.zeros((0, 4, 4)), np.eye(4)[None]):
+        found = gravity_frame(poses, nothing)
+        assert is_rigid(found)
+        np.testing.assert_allclose(found[2, :3], (0, -1, 0), atol=1e-6)
+    down = np.eye(4)
+    down[:3, :3] = np.diag((1.0, -1.0, -1.0))  # looks straight down, z up
+    assert is_rigid(gravity_frame(down[None], room()))

@@ -1,0 +1,471 @@
+"""From a folder to a map: the whole run on the built-in room and on a piece of a real scan; interruption, resuming,
+bad input."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from helpers import data_folder, truncate, write_scannet, write_seven_scenes
+from vision_servers import saying, serving
+
+import freeocc3d
+from freeocc3d.capture import base as capture_base
+from freeocc3d.capture import open_capture
+from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, Interrupted, MapError, TrackingError
+from freeocc3d.core.progress import Progress
+from freeocc3d.core.types import FREE, OCCUPIED
+from freeocc3d.gaussians import rendered_views
+from freeocc3d.pipeline import run
+from freeocc3d.settings import config, registry
+from freeocc3d.storage import store
+
+ROOM = {"capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "stop": 24}}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> store.Map:
+    return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", ROOM)
+
+
+def listing(folder) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_the_room_becomes_a_map_with_every_layer(room) -> None:
+    assert (room.trajectory.has_pose[:24]).all()
+    assert (room.trajectory.status[24:] == "unused").all()
+    assert len(room.gaussians) > 500
+    states = room.occupancy.state
+    assert np.count_nonzero(states == OCCUPIED) > 300
+    assert np.count_nonzero(states == FREE) > np.count_nonzero(states == OCCUPIED)
+    assert len(room.occupancy.features) == len(room.occupancy.occupied_voxels())
+    assert room.gaussian_features.shape == (len(room.gaussians), room.manifest["encoder"]["dimension"])
+    assert len(room.keyframes) == len(room.trajectory.keyframes)
+    assert {p.name for p in room.path.iterdir()} == {
+        "map.yaml", "config.yaml", "report.json", "trajectory.txt", "gaussians.ply", "occupancy.npz", "features.npz",
+        "keyframes", "trajectory.png", "gaussians.png",
+    }  # fmt: skip
+
+
+def test_the_rooms_poses_are_right(room) -> None:
+    capture = open_capture("builtin:room", *_synthetic())
+    first = np.linalg.inv(capture.pose(int(room.trajectory.keyframes[0])))
+    for i in range(24):
+        error = np.linalg.inv(first @ capture.pose(i)) @ room.trajectory.T_world_cam[i]
+        assert np.linalg.norm(error[:3, 3]) < 0.03
+
+
+def _synthetic():
+    settings = config.resolve(ROOM)
+    return registry.build_options(capture_base, config.options(settings, "capture")), settings["capture"]
+
+
+def test_means_on_file_are_their_anchors_at_the_files_poses(room) -> None:
+    g, T = room.gaussians, room.trajectory.T_world_keyframe
+    world = np.einsum("nij,nj->ni", T[g.anchor_keyframe, :3, :3], g.anchor_cam.astype(float))
+    np.testing.assert_allclose(world + T[g.anchor_keyframe, :3, 3], g.means, atol=1e-4)
+
+
+def test_the_report_says_how_well_the_map_renders(room) -> None:
+    rendering = json.loads((room.path / "report.json").read_text())["rendering"]
+    assert rendering["psnr_measured"] > 20
+    assert 0 < rendering["depth_l1_m"] < 0.15
+    assert 0.8 < rendering["covered"] <= 1
+    assert cv2.imread(str(room.path / store.RENDER_PICTURE)).std() > 10
+
+
+def test_fitting_while_frames_come_in_keeps_what_was_fitted(tmp_path) -> None:
+    """Each keyframe is fitted when it comes, then carried along; the last map renders all of them better than what
+    the same keyframes start with."""
+    capture = open_capture("builtin:room", *_synthetic())
+    settings = config.resolve({**ROOM, "fitting": {"window": 2, "window_passes": 4}})
+    mapper = run.Mapper(settings, capture, tmp_path)
+    current = None
+    for index in range(24):
+        if mapper.add(capture[index]).status == "keyframe":
+            current = mapper.update_gaussians()
+    assert len(mapper.keyframes) > 3
+    mapper.refine()
+    current = mapper.update_gaussians()
+    views = mapper.views(mapper.trajectory())
+    before, after = (rendered_views.fidelity(g, views, mapper.rasterizer) for g in (mapper.anchor_gaussians(), current))
+    assert after.psnr_measured > before.psnr_measured + 0.5
+    oldest_before, oldest_after = (
+        rendered_views.fidelity(g, views[:1], mapper.rasterizer) for g in (mapper.anchor_gaussians(), current)
+    )
+    assert oldest_after.psnr_measured > oldest_before.psnr_measured
+    world = mapper.trajectory().T_world_keyframe[current.anchor_keyframe]
+    anchored = np.einsum("nij,nj->ni", world[:, :3, :3], current.anchor_cam.astype(float)) + world[:, :3, 3]
+    np.testing.assert_allclose(anchored, current.means, atol=1e-4)
+
+
+def test_a_pose_free_run_never_reads_poses_or_class_images(tmp_path, monkeypatch) -> None:
+    from freeocc3d.capture.readers.seven_scenes import Reader
+
+    def forbidden(self, index):
+        raise AssertionError("the truth was read")
+
+    monkeypatch.setattr(Reader, "pose", forbidden)
+    monkeypatch.setattr(Reader, "labels", forbidden)
+    made = freeocc3d.reconstruct(
+        data_folder() / "7scenes-kitchen", tmp_path / "map", {"capture": {"stop": 40, "stride": 4}}
+    )
+    assert made.manifest["counts"]["frames_with_pose"] == 10
+    assert made.manifest["counts"]["voxels"]["occupied"] > 500
+
+
+class Stopper(Progress):
+    """Ctrl-C after some frames of a stage."""
+
+    def __init__(self, stage: str, after: int):
+        self.target, self.after, self.now = stage, after, ""
+
+    def stage(self, name, total=None) -> None:
+        self.now = name
+
+    def advance(self, done) -> None:
+        if self.now == self.target and done == self.after:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(("stage", "after"), [("tracking", 12), ("tracking", 3), ("language", 1)])
+def test_an_interrupted_run_leaves_no_map_and_resumes_to_the_same(tmp_path, room, monkeypatch, stage, after) -> None:
+    monkeypatch.setattr(run, "_CHECKPOINT_FRAMES", 5)
+    output = tmp_path / "map"
+    with pytest.raises(Interrupted, match="--resume" if after != 3 else "nothing is kept"):
+        freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper(stage, after))
+    assert not output.exists()
+    if after != 3:  # there was a checkpoint
+        with pytest.raises(MapError, match="--resume"):
+            freeocc3d.reconstruct("builtin:room", output, ROOM)
+    resumed = freeocc3d.reconstruct("builtin:room", output, ROOM, resume=True)
+    assert not (tmp_path / "map.partial").exists()
+    np.testing.assert_allclose(resumed.trajectory.T_world_cam[:24], room.trajectory.T_world_cam[:24], atol=5e-3)
+    assert resumed.manifest["keyframes"] == room.manifest["keyframes"]
+
+
+def test_a_run_is_not_resumed_with_other_options_and_loses_nothing_by_the_attempt(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(run, "_CHECKPOINT_FRAMES", 5)
+    output, work = tmp_path / "map", tmp_path / "map.partial"
+    with pytest.raises(Interrupted):
+        freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper("tracking", 12))
+    before = listing(work)
+    for other in ({"tracking": {"backend": "known"}}, {"tracking": {"rgbd": {"neighbours": -1}}}):
+        with pytest.raises(FreeOccError):
+            freeocc3d.reconstruct("builtin:room", output, {**ROOM, **other}, resume=True)
+    with pytest.raises(CaptureError):
+        freeocc3d.reconstruct(tmp_path / "typo", output, overwrite=True)
+    assert listing(work) == before
+    more_broken = {**ROOM, "capture": {**ROOM["capture"], "max_broken": 0.5}}
+    assert freeocc3d.reconstruct("builtin:room", output, more_broken, resume=True).trajectory.has_pose[:24].all()
+
+
+def test_time_before_an_interruption_counts(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(run, "_CHECKPOINT_FRAMES", 20)
+    with pytest.raises(Interrupted):
+        freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, progress=Stopper("tracking", 21))
+    state = np.load(tmp_path / "map.partial" / "tracking.npz")
+    spent = json.loads(str(state["log"]))["seconds"]["tracking"]
+    assert spent > 0.05
+    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, resume=True)
+    assert made.report["seconds"]["tracking"] > spent
+
+
+def test_neighbouring_folders_are_left_alone(tmp_path, room) -> None:
+    output = shutil.copytree(room.path, tmp_path / "map")
+    (tmp_path / "map.old").mkdir()
+    (tmp_path / "map.old" / "backup.txt").write_text("mine")
+    short = {"capture": {**ROOM["capture"], "stop": 4}}
+    freeocc3d.reconstruct("builtin:room", output, short, overwrite=True)
+    assert (tmp_path / "map.old" / "backup.txt").read_text() == "mine"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["map", "map.old"]
+    (tmp_path / "next.partial").mkdir()
+    (tmp_path / "next.partial" / "notes.txt").write_text("mine")
+    for options in ({}, {"overwrite": True}, {"resume": True}):
+        with pytest.raises(MapError, match="in the way"):
+            freeocc3d.reconstruct("builtin:room", tmp_path / "next", short, **options)
+    with pytest.raises(MapError, match="cannot be the name"):
+        freeocc3d.reconstruct("builtin:room", ".", short)
+
+
+def test_a_disk_that_fills_up_at_the_very_end_costs_nothing(tmp_path, monkeypatch) -> None:
+    def full(*arguments) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "write_manifest", full)
+        with pytest.raises(MapError, match="disk is full"):
+            freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM)
+    kept = np.load(tmp_path / "map.partial" / "tracking.npz")
+    assert int(kept["done"]) == 24
+    assert freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, resume=True).query("red").matched
+
+
+def test_an_existing_map_is_not_touched_without_overwrite(tmp_path, room) -> None:
+    output = shutil.copytree(room.path, tmp_path / "map")
+    before = listing(output)
+    with pytest.raises(MapError, match="--overwrite"):
+        freeocc3d.reconstruct("builtin:room", output, ROOM)
+    with pytest.raises(CaptureError):
+        freeocc3d.reconstruct(tmp_path / "nothing", output, overwrite=True)
+    assert listing(output) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+
+
+def test_a_folder_that_is_no_map_is_never_overwritten(tmp_path) -> None:
+    precious = tmp_path / "home"
+    precious.mkdir()
+    (precious / "thesis.txt").write_text("years of work")
+    with pytest.raises(MapError, match="not a map"):
+        freeocc3d.reconstruct("builtin:room", precious, ROOM, overwrite=True)
+    assert (precious / "thesis.txt").read_text() == "years of work"
+
+
+def test_overwrite_replaces_a_map(tmp_path, room) -> None:
+    output = shutil.copytree(room.path, tmp_path / "map")
+    short = {"capture": {**ROOM["capture"], "stop": 6}}
+    made = freeocc3d.reconstruct("builtin:room", output, short, overwrite=True)
+    assert made.manifest["counts"]["frames_with_pose"] == 6
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+
+
+def test_a_full_disk_is_told_and_what_was_done_is_kept(tmp_path, monkeypatch) -> None:
+    from freeocc3d.storage.keyframes import Keyframes
+
+    written = []
+
+    def append(self, frame) -> None:
+        if len(written) == 1:
+            raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path / "x"))
+        written.append(frame.index)
+        original(self, frame)
+
+    original = Keyframes.append
+    monkeypatch.setattr(Keyframes, "append", append)
+    with pytest.raises(MapError, match=r"disk is full.*--resume"):
+        freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM)
+    assert not (tmp_path / "map").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"traking": {}}, "tracking"),
+        ({"tracking": {"odometry": {"itertions": [1, 1, 1]}}}, "iterations"),
+        ({"occupancy": {"voxel_size": "big"}}, "must be float"),
+        ({"tracking": {"backend": "rgdb"}}, "rgbd"),
+        ({"language": {"encoder": "color"}}, "colour"),
+        ({"occupancy": {"voxel_size": -0.1}}, "voxel_size"),
+    ],
+)
+def test_a_wrong_configuration_is_named_before_any_work_and_leaves_nothing(tmp_path, settings, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_such_capture_leaves_nothing(tmp_path) -> None:
+    with pytest.raises(CaptureError, match="no folder"):
+        freeocc3d.reconstruct(tmp_path / "nothing", tmp_path / "map")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_that_cannot_be_read_are_skipped_and_counted(tmp_path) -> None:
+    scan = tmp_path / "scan"
+    scan.mkdir()
+    for i in range(20):
+        for kind in ("color.jpg", "depth.png"):
+            shutil.copy(data_folder() / "7scenes-kitchen" / f"frame-{i:06d}.{kind}", scan)
+    truncate(scan / "frame-000007.color.jpg")
+    truncate(scan / "frame-000011.depth.png")
+    made = freeocc3d.reconstruct(scan, tmp_path / "map")
+    assert made.report["frames"]["broken"] == 2
+    assert len(made.report["broken"]) == 2
+    assert "frame-000007.color.jpg" in made.report["broken"]["7"]
+    assert made.trajectory.status[7] == made.trajectory.status[11] == "broken"
+    assert any("2 frames could not be read" in text for text in made.report["warnings"])
+    for i in (3, 4, 5):
+        truncate(scan / f"frame-{i:06d}.color.jpg")
+    with pytest.raises(CaptureError, match=r"capture\.max_broken"):
+        freeocc3d.reconstruct(scan, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_scan_without_any_depth_says_so(tmp_path) -> None:
+    scan = write_scannet(tmp_path / "scan", 4)
+    for path in (scan / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+    with pytest.raises(TrackingError, match=r"capture\.depth_scale"):
+        freeocc3d.reconstruct(scan, tmp_path / "map")
+    assert [p.name for p in tmp_path.iterdir()] == ["scan"]
+
+
+def test_depth_in_the_wrong_unit_is_warned_about(tmp_path) -> None:
+    scan = write_seven_scenes(tmp_path / "scan", 4)
+    told: list[str] = []
+
+    class Listener(Progress):
+        def warn(self, text: str) -> None:
+            told.append(text)
+
+    with pytest.raises(FreeOccError):
+        freeocc3d.reconstruct(scan, tmp_path / "map", {"capture": {"depth_scale": 1.0}}, progress=Listener())
+    assert any("capture.depth_scale" in text for text in told)
+
+
+def test_labels_of_the_capture_answer_by_class(tmp_path) -> None:
+    made = freeocc3d.reconstruct(
+        data_folder() / "house" / "bedroom",
+        tmp_path / "map",
+        {
+            "capture": {"stop": 60, "stride": 6},
+            "tracking": {"backend": "known"},
+            "language": {"encoder": "labels"},
+        },
+    )
+    found = made.query("bed")
+    assert found.matched
+    truth = np.load(data_folder() / "house" / "bedroom" / "ground_truth.npz")
+    centers = made.occupancy.centers(made.occupancy.occupied_voxels()[found.regions[0].rows])
+    voxel = np.floor((centers - truth["origin"]) / truth["voxel_size"]).astype(int)
+    labels = truth["labels"][tuple(voxel.T)]
+    bed = truth["classes"].tolist().index("bed")
+    assert (labels == bed).sum() > 0.7 * ((labels != 255) & (labels != 0)).sum()
+    assert not made.query("bathtub").matched
+
+
+@pytest.fixture(scope="module")
+def glued(tmp_path_factory):
+    """A folder that holds two places: 15 frames of the bedroom, then 8 of the living room."""
+    folder = tmp_path_factory.mktemp("glued") / "scan"
+    (folder / "results").mkdir(parents=True)
+    house = data_folder() / "house"
+    shutil.copy(house / "bedroom" / "cam_params.json", folder)
+    shown = [*((house / "bedroom", i) for i in range(0, 60, 4)), *((house / "living", i) for i in range(0, 32, 4))]
+    for n, (source, i) in enumerate(shown):
+        for kind in ("frame{:06d}.jpg", "depth{:06d}.png"):
+            shutil.copy(source / "results" / kind.format(i), folder / "results" / kind.format(n))
+    return folder
+
+
+def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -> None:
+    from freeocc3d.cli import summary
+
+    made = freeocc3d.reconstruct(glued, tmp_path / "map")
+    assert made.manifest["counts"]["submaps"] == 2
+    assert made.manifest["counts"]["frames_with_pose"] == 15
+    assert made.report["frames"]["apart"] == 8
+    assert [(s["first"], s["last"], s["mapped"]) for s in made.report["submaps"]] == [(0, 14, True), (15, 22, False)]
+    assert (made.trajectory.status[15:] == "apart").all()
+    assert any("8 frames" in text and "frame 15" in text for text in made.report["warnings"])
+    assert len(made.keyframes) == len(made.trajectory.keyframes) == len(made.manifest["keyframes"])
+    assert [frame.index for frame in made.keyframes] == made.trajectory.keyframes.tolist()
+    assert len(list((made.path / "keyframes").glob("*.color.jpg"))) == len(made.keyframes)
+    assert made.gaussians.anchor_keyframe.max() < len(made.keyframes)
+    text = summary.to_text(made)
+    assert "2 submaps" in text
+    assert "frames 15 to 22: 8 with a pose" in text
+    assert "apart, not in the map" in text
+    assert cv2.imread(str(made.path / "trajectory.png")).shape[2] == 3
+
+
+def test_a_run_with_two_submaps_resumes_to_the_same(tmp_path, glued, monkeypatch) -> None:
+    def full(*arguments) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    whole = freeocc3d.reconstruct(glued, tmp_path / "whole")
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "write_manifest", full)
+        with pytest.raises(MapError, match="disk is full"):
+            freeocc3d.reconstruct(glued, tmp_path / "map")
+    resumed = freeocc3d.reconstruct(glued, tmp_path / "map", resume=True)
+    np.testing.assert_allclose(resumed.trajectory.T_world_cam, whole.trajectory.T_world_cam, atol=1e-6)
+    assert resumed.trajectory.keyframes.tolist() == whole.trajectory.keyframes.tolist()
+    np.testing.assert_array_equal(resumed.occupancy.state, whole.occupancy.state)
+
+
+def test_poses_of_another_system_make_a_map(tmp_path) -> None:
+    capture = data_folder() / "house" / "bedroom"
+    poses = np.stack([open_capture(capture).pose(i) for i in range(40)])
+    np.savetxt(tmp_path / "kitti.txt", poses.reshape(40, 16)[:, :12])
+    settings = {
+        "capture": {"stop": 40, "stride": 4},
+        "tracking": {"backend": "file", "file": {"path": str(tmp_path / "kitti.txt")}},
+    }
+    made = freeocc3d.reconstruct(capture, tmp_path / "map", settings)
+    assert made.manifest["counts"]["frames_with_pose"] == 10
+    np.testing.assert_allclose(made.trajectory.T_world_cam[8], poses[8], atol=1e-5)
+    assert made.manifest["frame"].startswith("world frame of the trajectory file")
+
+
+def test_a_color_camera_of_another_focal_length_is_told_and_corrected(tmp_path) -> None:
+    kitchen = data_folder() / "7scenes-kitchen"
+    given = {"capture": {"stop": 8, "color_focal": 0.9}}
+    made = freeocc3d.reconstruct(kitchen, tmp_path / "given", given)
+    assert made.report["color_focal"] == 0.9
+    assert not made.report["warnings"]
+    left = freeocc3d.reconstruct(kitchen, tmp_path / "left", {"capture": {"stop": 8, "color_focal": 1.0}})
+    assert np.abs(made.keyframes[0].color.astype(int) - left.keyframes[0].color).mean() > 5
+    np.testing.assert_array_equal(made.keyframes[0].depth_m, left.keyframes[0].depth_m)
+    found = freeocc3d.reconstruct(kitchen, tmp_path / "found", {"capture": {"stop": 250, "stride": 10}})
+    assert found.report["color_focal"] == pytest.approx(0.903, abs=0.02)
+    assert any("0.9" in text and "capture.color_focal=1" in text for text in found.report["warnings"])
+
+
+def _with_vocabulary(url: str, **more) -> dict:
+    return {**ROOM, "vocabulary": {"endpoint": url, "model": "a-model", "keyframes": 3, "retries": 0, **more}}
+
+
+def test_names_by_a_model_are_kept_in_the_map_and_its_key_is_not(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("ROOM_KEY", "sk-never-written")
+    with serving(saying('["table", "red cup"]', '["table"]')) as server:
+        settings = _with_vocabulary(server.url, api_key_env="ROOM_KEY")
+        made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings)
+    named = made.manifest["vocabulary"]
+    assert len(server.asked) == len(named["keyframes"]) == 3
+    assert set(named["keyframes"]) <= set(made.manifest["keyframes"])
+    assert named["names"]["table"] == {"count": 3, "keyframes": named["keyframes"]}
+    assert named["names"]["red cup"]["count"] == 1
+    assert made.report["seconds"]["vocabulary"] > 0
+    assert server.headers[0]["Authorization"] == "Bearer sk-never-written"
+    assert not any(b"never-written" in content for content in listing(made.path).values())
+    assert "vocabulary.stage.json" not in listing(made.path)
+
+
+def test_a_model_that_cannot_be_asked_costs_names_and_a_warning(tmp_path) -> None:
+    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", _with_vocabulary("http://127.0.0.1:9/v1"))
+    assert made.manifest["vocabulary"]["names"] == {}
+    (warning,) = (text for text in made.report["warnings"] if "vocabulary" in text)
+    assert "lacks 3 of 3 keyframes" in warning
+    assert made.query("red").matched
+
+
+def test_a_resumed_run_asks_for_no_keyframe_twice(tmp_path) -> None:
+    with serving(saying('["table"]')) as server:
+        settings = _with_vocabulary(server.url)
+        for stage, after in (("vocabulary", 2), ("language", 1)):
+            with pytest.raises(Interrupted):
+                freeocc3d.reconstruct(
+                    "builtin:room",
+                    tmp_path / "map",
+                    settings,
+                    progress=Stopper(stage, after),
+                    resume=stage != "vocabulary",
+                )
+        made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings, resume=True)
+    assert len(server.asked) == 3
+    assert made.manifest["vocabulary"]["names"]["table"]["count"] == 3
+
+
+def test_a_key_that_is_not_set_is_told_before_any_work(tmp_path, monkeypatch) -> None:
+    monkeypatch.delenv("ROOM_KEY", raising=False)
+    with pytest.raises(ConfigError, match="ROOM_KEY"):
+        freeocc3d.reconstruct(
+            "builtin:room", tmp_path / "map", _with_vocabulary("http://127.0.0.1:9/v1", api_key_env="ROOM_KEY")
+        )
+    assert not (tmp_path / "map.partial").exists()

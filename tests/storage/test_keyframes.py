@@ -1,0 +1,60 @@
+"""Keyframes on disk: what comes back, scaled as well, and what is damaged."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import wall_frame, with_sigma
+
+from freeocc3d.core.errors import MapError
+from freeocc3d.storage.keyframes import INDEX, Keyframes
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Keyframes:
+    """A frame of a sensor, and one whose depth says how uncertain it is, with a hole."""
+    keyframes = Keyframes(tmp_path / "keyframes")
+    keyframes.append(wall_frame(2.0, 0))
+    frame = with_sigma(wall_frame(1.5, 7))
+    frame.depth_m[:50] = 0
+    keyframes.append(frame)
+    keyframes.save_index()
+    return keyframes
+
+
+def test_depth_comes_back_to_half_a_millimetre_and_its_sigma_to_a_quarter(kept: Keyframes) -> None:
+    sensor, stereo = Keyframes.load(kept.folder)
+    assert sensor.depth_sigma_m is None
+    np.testing.assert_allclose(sensor.depth_m, 2.0, atol=5e-4)
+    known = stereo.depth_m > 0
+    np.testing.assert_array_equal(known, wall_frame(1.5).depth_m * (np.arange(120) >= 50)[:, None] > 0)
+    expected = with_sigma(wall_frame(1.5, 7)).depth_sigma_m
+    np.testing.assert_allclose(stereo.depth_sigma_m[known], expected[known], atol=3e-4)
+
+
+def test_a_sigma_below_what_is_kept_is_not_zero(tmp_path: Path) -> None:
+    keyframes = Keyframes(tmp_path)
+    keyframes.append(with_sigma(wall_frame(1.0), 1e-7, 2e-7))
+    np.testing.assert_allclose(keyframes[0].depth_sigma_m, 5e-4)
+
+
+def test_both_are_scaled(kept: Keyframes, tmp_path: Path) -> None:
+    kept.write_scaled(tmp_path / "half", 0.5)
+    for frame, half in zip(kept, Keyframes.load(tmp_path / "half"), strict=True):
+        np.testing.assert_allclose(half.depth_m, 0.5 * frame.depth_m, atol=6e-4)
+        np.testing.assert_array_equal(half.color, frame.color)
+        assert (half.depth_sigma_m is None) == (frame.depth_sigma_m is None)
+    np.testing.assert_allclose(half.depth_sigma_m, 0.5 * frame.depth_sigma_m, atol=3e-4)
+
+
+def test_an_image_that_is_gone_is_named_and_one_that_no_index_lists_is_removed(kept: Keyframes) -> None:
+    (sigma,) = kept.folder.glob("*.depth_sigma.png")
+    kept.truncate(1)
+    kept.save_index()
+    kept.drop_unlisted()
+    assert not sigma.exists()
+    entries = json.loads((kept.folder / INDEX).read_text())
+    (kept.folder / INDEX).write_text(json.dumps([{**entries[0], "sigma": 1.0}]))
+    with pytest.raises(MapError, match=r"000000\.depth_sigma\.png"):
+        _ = Keyframes.load(kept.folder)[0]

@@ -1,0 +1,192 @@
+"""Places, closures, the joint refinement, submaps: on rendered and real captures, and with closures that are wrong."""
+
+import numpy as np
+import pytest
+from helpers import data_folder
+
+from freeocc3d.capture import open_capture
+from freeocc3d.core.transforms import apart, invert, quats_to_rotations
+from freeocc3d.tracking import pose_graph
+from freeocc3d.tracking.pose_graph import Edge
+from freeocc3d.tracking.rgbd import joint_refinement, loop_closures, place_recognition
+from freeocc3d.tracking.rgbd.keyframe_registration import keyframe_view
+
+FRAMES = range(0, 60, 4)
+
+
+@pytest.fixture(scope="module")
+def room():
+    own = {"synthetic": {"frames": 60, "width": 320, "height": 240, "noise": True}}
+    return open_capture("builtin:room", None, own)
+
+
+@pytest.fixture(scope="module")
+def views(room):
+    return [keyframe_view(room[i]) for i in FRAMES]
+
+
+@pytest.fixture(scope="module")
+def true(room) -> list:
+    first = invert(room.pose(0))
+    return [first @ room.pose(i) for i in FRAMES]
+
+
+def disturbed(poses, degrees: float, metres: float, seed: int = 0) -> list:
+    """All but the first."""
+    rng = np.random.default_rng(seed)
+    out = [poses[0].copy()]
+    for pose in poses[1:]:
+        quat = np.array([1.0, *(0.5 * np.deg2rad(degrees) * rng.normal(size=3) / np.sqrt(3))])
+        D = np.eye(4)
+        D[:3, :3] = quats_to_rotations(quat / np.linalg.norm(quat))
+        D[:3, 3] = metres * rng.normal(size=3) / np.sqrt(3)
+        out.append(pose @ D)
+    return out
+
+
+def worst(poses, true) -> tuple[float, float]:
+    off = np.array([apart(a, b) for a, b in zip(poses, true, strict=True)])
+    return tuple(off.max(axis=0))
+
+
+# Places
+
+
+def test_similar_places_are_told_from_others(views) -> None:
+    described = [view.features.descriptors for view in views]
+    vocabulary = place_recognition.Vocabulary(described)
+    histograms = np.stack([vocabulary.histogram(d) for d in described])
+    assert [int(h.sum()) for h in histograms] == [len(d) for d in described]
+    alike = place_recognition.similarity(histograms)
+    np.testing.assert_allclose(np.diag(alike), 1.0, atol=1e-5)
+    np.testing.assert_allclose(alike, alike.T, atol=1e-6)
+    neighbours = np.diag(alike, 1)
+    far = [alike[n, (n + len(views) // 2) % len(views)] for n in range(len(views))]
+    assert np.median(neighbours) > np.median(far) + 0.1
+
+
+def test_a_frame_without_features_is_like_none() -> None:
+    rng = np.random.default_rng(0)
+    vocabulary = place_recognition.Vocabulary([rng.integers(0, 256, (600, 32), dtype=np.uint8)])
+    none = vocabulary.histogram(np.zeros((0, 32), np.uint8))
+    assert none.sum() == 0
+    assert (
+        place_recognition.similarity(
+            np.stack((none, vocabulary.histogram(rng.integers(0, 256, (50, 32), dtype=np.uint8))))
+        )[0, 1]
+        == 0
+    )
+
+
+# Closures
+
+
+def test_the_way_round_a_room_is_closed(views, true) -> None:
+    count = len(views)
+    found = loop_closures.find(views, [0] * count, true)
+    spans = {(edge.source, edge.target) for edge in found}
+    assert any(a - b > count // 2 for a, b in spans), "the end sees the start again"
+    for edge in found:
+        metres, degrees = apart(invert(true[edge.target]) @ true[edge.source], edge.T_target_source)
+        assert metres < 0.03
+        assert degrees < 1.0
+        assert edge.uncertain
+
+
+def test_other_places_are_not_closed() -> None:
+    house = data_folder() / "house"
+    shown = [open_capture(house / name) for name in ("bedroom", "living")]
+    keyframes = [keyframe_view(capture[i]) for capture in shown for i in range(0, 260, 20)]
+    submap = [0] * 13 + [1] * 13
+    poses = [capture.pose(i) for capture in shown for i in range(0, 260, 20)]
+    found = loop_closures.find(keyframes, submap, poses)
+    assert all(submap[edge.source] == submap[edge.target] for edge in found)
+
+
+# The joint refinement
+
+
+def test_disturbed_poses_fall_into_place_together(views, true) -> None:
+    start = disturbed(true, 1.0, 0.03)
+    assert worst(start, true)[0] > 0.03
+    refined = joint_refinement.refine(views, start)
+    metres, degrees = worst(refined, true)
+    assert metres < 0.01
+    assert degrees < 0.25
+    np.testing.assert_allclose(refined[0], true[0], atol=1e-6)
+    assert worst(start, true)[0] > 0.03, "the poses that were given are left alone"
+
+
+def test_one_keyframe_needs_no_refinement(views, true) -> None:
+    np.testing.assert_array_equal(joint_refinement.refine(views[:1], true[:1])[0], true[0])
+
+
+def test_each_keyframe_is_paired_with_a_bounded_number_of_others(views, true) -> None:
+    pairs = joint_refinement.overlapping_pairs(views, true, neighbours=3, least=0.35)
+    assert {(n, n - 1) for n in range(1, len(views))} <= set(pairs)
+    counts = np.bincount([source for source, _ in pairs])
+    assert counts.max() <= 4
+    assert all(source > target for source, target in pairs)
+
+
+# The pose graph
+
+
+def motion(angle_deg: float, x: float) -> np.ndarray:
+    T = np.eye(4)
+    half = np.deg2rad(angle_deg) / 2
+    T[:3, :3] = quats_to_rotations(np.array([np.cos(half), 0, np.sin(half), 0]))
+    T[0, 3] = x
+    return T
+
+
+def ring(count: int = 10) -> tuple[list, list]:
+    """Keyframes on a circle, and the odometry between neighbours, without error."""
+    true = [motion(36 * k, 0.0) @ motion(0, 1.0) for k in range(count)]
+    information = np.diag([1e4] * 6)
+    edges = [Edge(k, k - 1, invert(true[k - 1]) @ true[k], information, uncertain=False) for k in range(1, count)]
+    return true, edges
+
+
+@pytest.mark.parametrize("wrong", [motion(80, 2.0), motion(15, 0.3), motion(0, -1.0)])
+def test_one_wrong_closure_does_not_bend_a_map(wrong) -> None:
+    true, edges = ring()
+    information = np.diag([1e4] * 6)
+    good = [Edge(k + 5, k, invert(true[k]) @ true[k + 5], information, uncertain=True) for k in range(4)]
+    bad = Edge(8, 2, invert(true[2]) @ true[8] @ wrong, information, uncertain=True)
+    placed = pose_graph.optimize_piece(true, [*edges, *good, bad], range(10))
+    assert worst(placed, [invert(true[0]) @ T for T in true] if np.allclose(placed[0], np.eye(4)) else true)[0] < 0.02
+
+
+def test_two_submaps_are_tied_by_closures_that_agree() -> None:
+    information = np.eye(6)
+    submap = [0, 0, 0, 1, 1]
+    poses = [motion(0, 0.1 * k) for k in range(3)] + [motion(0, 0.1 * k) for k in range(2)]
+    one = Edge(3, 1, motion(0, 0.5), information, uncertain=True)  # submap 1 begins at x = 0.6
+    other = Edge(2, 4, motion(0, -0.5), information, uncertain=True)  # says the same, from the other side
+    wrong = Edge(4, 2, motion(60, 3.0), information, uncertain=True)
+    within = Edge(2, 0, motion(0, 0.2), information, uncertain=True)
+    certain = Edge(3, 2, motion(0, 1.0), information, uncertain=False)
+    for edges, kept in (
+        ([], []),
+        ([one], []),
+        ([one, wrong], []),
+        ([one, wrong, other, within], [one, other, within]),
+        ([certain, wrong], [certain]),
+    ):
+        found = pose_graph.agreeing(poses, submap, edges)
+        assert found == kept
+        tied = any(edge is not within for edge in kept)
+        assert pose_graph.pieces(submap, found) == ([[0, 1, 2, 3, 4]] if tied else [[0, 1, 2], [3, 4]])
+
+
+def test_a_tied_submap_is_laid_where_its_closures_say() -> None:
+    true, edges = ring()
+    information = np.diag([1e4] * 6)
+    own = [edge for edge in edges if edge.source != 5]  # the path breaks between 4 and 5
+    away = motion(120, 4.0)
+    poses = true[:5] + [away @ T for T in true[5:]]
+    ties = [Edge(k, k - 2, invert(true[k - 2]) @ true[k], information, uncertain=True) for k in (5, 6)]
+    placed = pose_graph.optimize_piece(poses, [*own, *ties], range(10))
+    relative = [invert(placed[0]) @ T for T in placed]
+    assert worst(relative, [invert(true[0]) @ T for T in true])[0] < 1e-3
