@@ -148,9 +148,9 @@ def score_map(map: str, capture: str, out: str) -> Figures:
     all frames in ``out``."""
     from freeocc3d.evaluation import scoring
     from freeocc3d.evaluation.ground_truth import load_ground_truth
-    from freeocc3d.evaluation.trajectory_alignment import align, estimated_poses, true_poses
     from freeocc3d.evaluation.trajectory_errors import trajectory_errors
     from freeocc3d.storage.store import load_map
+    from freeocc3d.tracking.trajectory_alignment import align, estimated_poses, true_poses
 
     loaded = load_map(map)
     estimated, true = estimated_poses(loaded.trajectory), true_poses(scoring.capture_of(loaded))
@@ -202,8 +202,8 @@ def dense_slam(capture: str, frames: int | None, out: str) -> Figures:
     import peers
 
     from freeocc3d.capture import open_capture
-    from freeocc3d.evaluation.trajectory_alignment import Poses, align, true_poses
     from freeocc3d.evaluation.trajectory_errors import trajectory_errors
+    from freeocc3d.tracking.trajectory_alignment import Poses, align, true_poses
 
     opened = open_capture(capture)
     used = range(len(opened))[:frames]
@@ -265,7 +265,7 @@ def occupancy(kind: str, capture: str, frames: int | None, poses: str | None, tr
     from freeocc3d.capture import open_capture
     from freeocc3d.evaluation.confusion import Prediction, Scores, confusion
     from freeocc3d.evaluation.ground_truth import load_ground_truth
-    from freeocc3d.evaluation.trajectory_alignment import true_poses
+    from freeocc3d.tracking.trajectory_alignment import true_poses
 
     opened, expected = open_capture(capture), load_ground_truth(truth)
     if poses is None:

@@ -35,10 +35,10 @@ def measure_plan(map_path: str, picture: str | None = None) -> Figures:
     from freeocc3d.core.transforms import invert, transform
     from freeocc3d.evaluation import scoring
     from freeocc3d.evaluation.ground_truth import load_ground_truth
-    from freeocc3d.evaluation.trajectory_alignment import align, estimated_poses, true_poses
     from freeocc3d.export import export_map
     from freeocc3d.export.nav2 import Options
     from freeocc3d.storage.store import load_map
+    from freeocc3d.tracking.trajectory_alignment import align, estimated_poses, true_poses
 
     made = load_map(map_path)
     capture = scoring.capture_of(made)
@@ -103,7 +103,7 @@ def agreement(plan: Any, true: Any, measured: Any) -> Figures:
 def _measured(capture: Any, truth: Any) -> Any:
     """(X, Y, Z) bool: the truth's voxels that some frame's depth image reaches, at the true poses."""
     from freeocc3d.core.transforms import invert, transform
-    from freeocc3d.evaluation.trajectory_alignment import true_poses
+    from freeocc3d.tracking.trajectory_alignment import true_poses
 
     poses = true_poses(capture)
     frames = dict(zip(poses.timestamps.tolist(), poses.T_world_cam, strict=True))

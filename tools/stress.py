@@ -15,10 +15,10 @@ from freeocc3d.capture.base import Capture, Options
 from freeocc3d.capture.focal_correction import Reregistered
 from freeocc3d.capture.read_ahead import read_ahead
 from freeocc3d.core.types import Frame, Trajectory
-from freeocc3d.evaluation.trajectory_alignment import Poses, align
 from freeocc3d.evaluation.trajectory_errors import trajectory_errors
 from freeocc3d.tracking.rgbd import focal_calibration
 from freeocc3d.tracking.trackers import rgbd
+from freeocc3d.tracking.trajectory_alignment import Poses, align
 
 Figures = dict[str, Any]
 Change = Callable[[int, Frame], Frame]

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import tum_files
 from ..core.errors import CaptureError
-from ..core.transforms import invert, is_rigid, quats_to_rotations
+from ..core.transforms import invert, is_rigid
 from .base import Capture
 
 SAME_TIME_S = 0.02
@@ -133,17 +134,9 @@ def _read_text(path: Path) -> PoseFile:
     lines = [line.replace(",", " ").split() for line in path.read_text(encoding="utf-8").splitlines()]
     rows = [line for line in lines if line and not line[0].startswith("#")]
     lengths = {len(row) for row in rows}
-    if lengths == {8}:
-        table = np.array(rows, np.float64)
-        finite = np.isfinite(table).all(axis=1)
-        quats_wxyz = table[:, [7, 4, 5, 6]]
-        norms = np.linalg.norm(quats_wxyz, axis=1, keepdims=True)
-        if not finite.all() or (norms == 0).any():
-            raise ValueError
-        T = np.tile(np.eye(4), (len(table), 1, 1))
-        T[:, :3, 3] = table[:, 1:4]
-        T[:, :3, :3] = quats_to_rotations(quats_wxyz / norms)
-        return PoseFile(path, T, timestamps=table[:, 0])
+    if lengths == {tum_files.NUMBERS}:
+        timestamps, T = tum_files.tum_poses(rows)
+        return PoseFile(path, T, timestamps)
     if lengths in ({12}, {16}):
         T = np.tile(np.eye(4), (len(rows), 1, 1))
         T[:, : len(rows[0]) // 4] = np.array(rows, np.float64).reshape(len(rows), -1, 4)

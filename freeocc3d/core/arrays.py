@@ -1,4 +1,5 @@
-"""Arrays in .npz files, read with care: nothing is unpickled, and sizes are checked before memory is taken."""
+"""Arrays in .npz files: written whole, and read with care. Nothing is unpickled, and sizes are checked before memory is
+taken."""
 
 from __future__ import annotations
 
@@ -13,9 +14,16 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from .atomic_files import replace_file
 from .errors import MapError
 
 _LARGEST_ARRAY = 8 << 30
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False) -> None:
+    """Write an .npz file, in place of one that is there. Raises OSError."""
+    save = np.savez_compressed if compressed else np.savez
+    replace_file(path, lambda temporary: save(temporary, **arrays))
 
 
 def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]]) -> dict[str, NDArray[Any]]:

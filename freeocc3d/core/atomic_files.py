@@ -10,6 +10,29 @@ from pathlib import Path
 
 from .errors import ExportError
 
+_TEMPORARY = "tmp"
+
+
+def replace_file(path: Path, write: Callable[[Path], object]) -> None:
+    """Let ``write`` fill a temporary file in the folder of ``path``, with the same suffix; then give it the name
+    ``path``. A reader finds the file before or the new one, each whole. Raises OSError."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.{_TEMPORARY}{path.suffix}")
+    try:
+        write(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """``replace_file`` with a text. Raises OSError."""
+    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def is_temporary(path: Path) -> bool:
+    """Whether ``replace_file`` made it, in a process that was stopped before it was done."""
+    return path.name.startswith(".") and _TEMPORARY in path.name.split(".")
+
 
 def refuse_existing(path: Path, overwrite: bool = False) -> None:
     """Raises ExportError if the file exists or its folder does not: before work is done that could not be written."""
@@ -25,7 +48,7 @@ def write_whole(path: Path, write: Callable[[Path], None], overwrite: bool = Fal
     """Let ``write`` fill a file or folder of that name, with what else belongs to it, in a temporary folder beside
     ``path``; then move everything, ``path`` last. Raises ExportError."""
     refuse_existing(path, overwrite)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{_TEMPORARY}")
     try:
         temporary.mkdir()
         write(temporary / path.name)

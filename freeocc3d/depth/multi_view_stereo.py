@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..capture import read_ahead
 from ..capture.base import Capture
-from ..core.arrays import read_arrays
+from ..core.arrays import read_arrays, write_arrays
 from ..core.errors import ConfigError, FrameError, MapError, TrackingError
 from ..core.progress import Progress
 from ..core.types import Frame, Intrinsics
@@ -272,11 +272,9 @@ class StereoDepth:
 
     def _save(self, surface: Surface, planes: Layout) -> None:
         """The surface last: where it is, both are."""
-        _write_arrays(self.folder / "layout.npz", **planes.to_arrays())
-        _write_arrays(
-            self._surface_path, vertices=surface.vertices, sigma_m=surface.sigma_m, triangles=surface.triangles,
-            cell_m=np.array([surface.cell_m]),
-        )  # fmt: skip
+        write_arrays(self.folder / "layout.npz", planes.to_arrays())
+        arrays = {name: getattr(surface, name) for name in ("vertices", "sigma_m", "triangles")}
+        write_arrays(self._surface_path, {**arrays, "cell_m": np.array([surface.cell_m])})
 
     def _view(self, frame: int) -> View:
         stored = self._load("view", frame)
@@ -294,7 +292,7 @@ class StereoDepth:
         return self.folder / f"{frame:06d}.{stage}.npz"
 
     def _write(self, stage: str, frame: int, **arrays: NDArray[np.generic]) -> None:
-        _write_arrays(self._path(stage, frame), **arrays)
+        write_arrays(self._path(stage, frame), arrays)
 
     def _load(self, stage: str, frame: int) -> dict[str, NDArray[np.generic]]:
         path = self._path(stage, frame)
@@ -305,12 +303,6 @@ class StereoDepth:
                     self._read.popitem(last=False)
             self._read.move_to_end(path)
             return self._read[path]
-
-
-def _write_arrays(path: Path, **arrays: NDArray[np.generic]) -> None:
-    temporary = path.with_suffix(".tmp.npz")
-    np.savez(temporary, **arrays)  # type: ignore[arg-type]
-    temporary.replace(path)
 
 
 def _shrunk(view: View, size: int) -> View:

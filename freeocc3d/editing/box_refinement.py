@@ -23,6 +23,7 @@ from ..capture.focal_correction import Reregistered
 from ..core.errors import FreeOccError, MapError
 from ..core.progress import Progress
 from ..core.transforms import back_project, transform
+from ..core.tum_files import write_tum
 from ..core.types import BLOCK, Frame, Gaussians, Occupancy, PosedFrame, Trajectory
 from ..gaussians import anchors
 from ..gaussians.point_cloud import write_ply
@@ -131,7 +132,7 @@ def refine(
         keyframes.save_index()
         write_ply(gaussians, folder / store.GAUSSIANS)
         store.write_occupancy(folder, occupancy, Codec.fit(features), features)
-        store.write_tum(folder / store.TRAJECTORY, trajectory)
+        write_tum(folder / store.TRAJECTORY, trajectory)
         (folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
         store.write_manifest(folder, _manifest(scan_map, box, trajectory.keyframes, gaussians, occupancy))
     return load_map(output)

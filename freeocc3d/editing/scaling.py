@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from ..capture import associate, read_trajectory
 from ..core.errors import FreeOccError, MapError
 from ..core.transforms import back_project, transform
+from ..core.tum_files import write_tum
 from ..core.types import Gaussians, Submap, Trajectory
 from ..evaluation.scoring import capture_of
-from ..evaluation.trajectory_alignment import Poses, align, estimated_poses, read_poses
 from ..gaussians import rendered_views
 from ..gaussians.point_cloud import write_ply
 from ..occupancy.gravity_frame import floor_seen
@@ -32,6 +32,7 @@ from ..settings.config import Config
 from ..storage import store
 from ..storage.store import Map, load_map
 from ..storage.work_folder import WorkFolder
+from ..tracking.trajectory_alignment import Poses, align, estimated_poses, read_poses
 from ..viewer import render_pictures, trajectory_picture
 
 UNKNOWN = (
@@ -69,7 +70,7 @@ def scaled(scan_map: Map, factor: float, by: str, output: str | Path, *, overwri
             shutil.copyfile(scan_map.path / name, folder / name)
         scan_map.keyframes.write_scaled(folder / store.KEYFRAMES, factor)
         write_ply(gaussians, folder / store.GAUSSIANS)
-        store.write_tum(folder / store.TRAJECTORY, trajectory)
+        write_tum(folder / store.TRAJECTORY, trajectory)
         (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
         _draw(scan_map, folder, trajectory, gaussians, factor)
         store.write_manifest(folder, _manifest(scan_map, factor, by))

@@ -25,10 +25,10 @@ from ..query import word_query
 from ..settings import registry
 from ..settings.config import Config
 from ..storage.store import Map
+from ..tracking.trajectory_alignment import Alignment, Poses
 from .confusion import Prediction
 from .ground_truth import GroundTruth, array, placed, read_grid_arrays
 from .scored_classes import ClassMap
-from .trajectory_alignment import Alignment, Poses
 
 _SAME_SIZE, _SAME_LATTICE = 1e-4, 1e-3
 

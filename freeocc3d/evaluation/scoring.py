@@ -26,12 +26,12 @@ from ..occupancy.up_direction import estimate_up
 from ..settings import config, registry
 from ..settings.config import Config
 from ..storage.store import CONFIG, Map, load_map
+from ..tracking.trajectory_alignment import Alignment, Poses, align, estimated_poses, read_poses, true_poses
 from . import predictions
 from .confusion import Prediction, Scores, confusion
 from .embodiedocc import find_package, read_split
 from .ground_truth import GroundTruth, load_ground_truth
 from .scored_classes import EMBODIEDOCC, SHARED, ClassMap, identity, load_class_map
-from .trajectory_alignment import Alignment, Poses, align, estimated_poses, read_poses, true_poses
 from .trajectory_errors import TrajectoryErrors, trajectory_errors
 
 PRIMARY_MASK = "label"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..capture import associate
 from ..core.errors import FreeOccError
 from ..core.transforms import invert
-from .trajectory_alignment import Alignment, Poses
+from ..tracking.trajectory_alignment import Alignment, Poses
 
 DISTANCES_M = (0.1, 0.5, 1.0, 2.0)
 """Travelled distances of the relative errors."""

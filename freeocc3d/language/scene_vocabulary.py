@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.atomic_files import replace_text
 from ..core.errors import ConfigError
 from ..core.types import Frame
 from ..settings.registry import require_positive
@@ -127,9 +128,7 @@ class Namer:
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:16]
 
     def _keep(self, path: Path, answers: dict[int, list[str]]) -> None:
-        temporary = path.with_name(path.name + ".tmp")
-        temporary.write_text(json.dumps({"of": self._marks(), "answers": answers}), encoding="utf-8")
-        temporary.replace(path)
+        replace_text(path, json.dumps({"of": self._marks(), "answers": answers}))
 
     def _restored(self, path: Path) -> dict[int, list[str]]:
         """Answers of an interrupted run to the same questions; none where there are none that can be read."""

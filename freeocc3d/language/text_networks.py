@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import read_arrays, write_arrays
 from ..core.errors import ConfigError, MapError, ModelError
 from . import model_packages
 from .encoders.base import TextEncoder, TextFeatures
@@ -158,11 +157,11 @@ class TextNetwork:
 def _read_cache(path: Path, dimension: int) -> dict[str, NDArray[np.float32]]:
     """Embeddings by word; a file that cannot be used counts as none."""
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            words, features = arrays["words"], arrays["features"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        arrays = read_arrays(path, {"words": ("U", 1), "features": ("f", 2)})
+    except MapError:
         return {}
-    fit = words.dtype.kind == "U" and words.ndim == 1 and features.shape == (len(words), dimension)
+    words, features = arrays["words"], arrays["features"]
+    fit = features.shape == (len(words), dimension)
     if not fit or features.dtype != np.float32 or not np.isfinite(features).all():
         return {}
     return dict(zip(words.tolist(), features, strict=True))
@@ -171,11 +170,7 @@ def _read_cache(path: Path, dimension: int) -> dict[str, NDArray[np.float32]]:
 def _write_cache(path: Path, known: dict[str, NDArray[np.float32]]) -> None:
     """Keep embeddings for later processes; where that is not possible, they are computed again."""
     kept = [word for word in list(known)[-_KEPT:] if len(word) <= _LONGEST]
-    temporary = path.with_name(f"{path.stem}.{os.getpid()}.tmp.npz")
+    arrays = {"words": np.array(kept, dtype=str), "features": np.array([known[word] for word in kept])}
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            np.savez(temporary, words=np.array(kept, dtype=str), features=np.array([known[word] for word in kept]))
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_arrays(path, arrays)

@@ -25,6 +25,7 @@ from ..capture import base as capture_base
 from ..capture.focal_correction import Reregistered
 from ..core.errors import CaptureError, FrameError, Interrupted, MapError, TrackingError
 from ..core.progress import Progress
+from ..core.tum_files import write_tum
 from ..core.types import Frame, Gaussians, Occupancy, PosedFrame, Submap, Trajectory
 from ..depth import multi_view_stereo
 from ..editing import adaptive_voxels, scaling
@@ -508,7 +509,7 @@ def _save(
     with work.timed("saving"):
         codec = Codec.fit(features)
         store.write_occupancy(folder, occupancy, codec, features)
-        store.write_tum(folder / store.TRAJECTORY, trajectory)
+        write_tum(folder / store.TRAJECTORY, trajectory)
         settings = mapper.settings
         if not mapper.tracker.metric:  # says how fine its Gaussians are when the map is put on other lattices
             settings = {**settings, "gaussians": {**settings["gaussians"], "cell_size": mapper.cell_size}}

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from ..core.arrays import read_arrays
 from ..core.errors import MapError
-from ..core.transforms import is_rigid, quats_to_rotations, rotations_to_quats
+from ..core.transforms import is_rigid
+from ..core.tum_files import read_tum
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, Trajectory
 from ..language.feature_codec import Codec, CodedFeatures
 from ..settings import registry
@@ -143,7 +144,7 @@ class Map:
                 status=np.array(log["status"], dtype="<U12"),
                 confidence=np.array(log["confidence"], np.float32),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (OSError, KeyError, TypeError, ValueError) as error:
             raise MapError(f"{self.path / REPORT} or {TRAJECTORY} is damaged: {error}.") from error
 
     @functools.cached_property
@@ -369,39 +370,6 @@ def write_occupancy(folder: Path, occupancy: Occupancy, codec: Codec, gaussian_f
     )
     tables: dict[str, Any] = {f"codec_{name}": table for name, table in codec.tables().items()}
     np.savez_compressed(folder / FEATURES, gaussian_codes=codec.encode(gaussian_features), **tables)
-
-
-def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write the posed frames as TUM lines ``timestamp tx ty tz qx qy qz qw``. Raises OSError."""
-    rows = np.flatnonzero(trajectory.has_pose)
-    T = trajectory.T_world_cam[rows]
-    quats_wxyz = rotations_to_quats(T[:, :3, :3])
-    lines = ["# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes, metres, seconds)"]
-    for time, t, (w, x, y, z) in zip(
-        trajectory.timestamps[rows].tolist(), T[:, :3, 3].tolist(), quats_wxyz.tolist(), strict=True
-    ):
-        lines.append(f"{time!r} {t[0]:.9f} {t[1]:.9f} {t[2]:.9f} {x:.9f} {y:.9f} {z:.9f} {w:.9f}")
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(M,) timestamps and (M, 4, 4) poses of a TUM file. Raises MapError."""
-    try:
-        table = np.loadtxt(path, dtype=np.float64, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise MapError(f"Cannot read the trajectory {path}: {error}.") from error
-    if table.size == 0:
-        return np.zeros(0), np.zeros((0, 4, 4))
-    if table.shape[1] != 8 or not np.isfinite(table).all():
-        raise MapError(f"The trajectory {path} is not of TUM's form: 8 finite numbers a line.")
-    T = np.tile(np.eye(4), (len(table), 1, 1))
-    T[:, :3, 3] = table[:, 1:4]
-    quats_wxyz = table[:, [7, 4, 5, 6]]
-    lengths = np.linalg.norm(quats_wxyz, axis=1, keepdims=True)
-    if (lengths == 0).any():
-        raise MapError(f"The trajectory {path} has a quaternion of zeros, which is no rotation.")
-    T[:, :3, :3] = quats_to_rotations(quats_wxyz / lengths)
-    return table[:, 0], T
 
 
 def _place(timestamps: NDArray[np.float64], times: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.float64]:

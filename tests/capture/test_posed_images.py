@@ -17,7 +17,7 @@ from freeocc3d.capture.base import NOMINAL_DEPTH
 from freeocc3d.core.errors import CaptureError, ConfigError, FrameError
 from freeocc3d.core.transforms import invert, rotations_to_quats
 from freeocc3d.core.types import Intrinsics
-from freeocc3d.evaluation.trajectory_alignment import read_poses
+from freeocc3d.tracking.trajectory_alignment import read_poses
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 DISTORTIONS = [

@@ -12,6 +12,7 @@ from test_main import refused, run
 from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import FreeOccError, MapError
 from freeocc3d.core.transforms import is_rigid, transform
+from freeocc3d.core.tum_files import write_tum
 from freeocc3d.editing import scaling
 from freeocc3d.pipeline import run as pipeline
 from freeocc3d.storage import store
@@ -159,7 +160,7 @@ def test_metric_poses_of_the_capture_or_of_a_file(room: Map, half: Map, tmp_path
     rng = np.random.default_rng(0)
     T = room.trajectory.T_world_cam.copy()
     T[:, :3, 3] = rng.normal(size=(len(T), 3))
-    store.write_tum(tmp_path / "other.txt", dataclasses.replace(room.trajectory, T_world_cam=T))
+    write_tum(tmp_path / "other.txt", dataclasses.replace(room.trajectory, T_world_cam=T))
     with pytest.raises(FreeOccError, match=r"The poses of .*other\.txt are not this map's"):
         scaling.by_poses(half, str(tmp_path / "other.txt"))
 

@@ -16,10 +16,10 @@ from freeocc3d.evaluation import predictions, scoring
 from freeocc3d.evaluation.confusion import Prediction
 from freeocc3d.evaluation.ground_truth import GroundTruth, save_ground_truth
 from freeocc3d.evaluation.scored_classes import ClassMap, identity
-from freeocc3d.evaluation.trajectory_alignment import Alignment, Poses, align, estimated_poses
 from freeocc3d.occupancy import carve, splat_reference
 from freeocc3d.occupancy.splat import Options
 from freeocc3d.settings import config
+from freeocc3d.tracking.trajectory_alignment import Alignment, Poses, align, estimated_poses
 
 SHAPE = (40, 40, 48)
 ORIGIN = np.array((-1.6, -1.6, 0.0))

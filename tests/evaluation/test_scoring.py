@@ -16,7 +16,7 @@ from freeocc3d.evaluation.confusion import Prediction
 from freeocc3d.evaluation.ground_truth import GroundTruth, load_ground_truth, save_ground_truth
 from freeocc3d.evaluation.scored_classes import identity
 from freeocc3d.evaluation.scoring import Asked, Evaluation, Scene, evaluate
-from freeocc3d.evaluation.trajectory_alignment import Alignment
+from freeocc3d.tracking.trajectory_alignment import Alignment
 
 CLASSES = Path(__file__).parents[2] / "configs" / "classes" / "house_to_embodiedocc.yaml"
 

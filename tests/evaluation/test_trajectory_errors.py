@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.transforms import quats_to_rotations
+from freeocc3d.core.tum_files import write_tum
 from freeocc3d.core.types import Trajectory
-from freeocc3d.evaluation.trajectory_alignment import Alignment, Poses, align, read_poses
 from freeocc3d.evaluation.trajectory_errors import pairs_by_path, relative_error, trajectory_errors
-from freeocc3d.storage.store import write_tum
+from freeocc3d.tracking.trajectory_alignment import Alignment, Poses, align, read_poses
 
 
 def walk(n: int, seed: int, rests: bool = False) -> NDArray[np.float64]:

@@ -9,7 +9,6 @@ from scenes import random_gaussians
 
 import freeocc3d
 from freeocc3d.core.errors import MapError
-from freeocc3d.core.types import Trajectory
 from freeocc3d.gaussians.point_cloud import from_point_cloud, read_ply, to_point_cloud, write_ply
 from freeocc3d.query.conditions import Where
 from freeocc3d.storage import store
@@ -86,19 +85,6 @@ def test_the_point_cloud_shares_memory(tmp_path) -> None:
     cloud = to_point_cloud(g)
     g.scales[2] = 7.0
     assert (cloud.point["scale"].numpy()[2] == 7.0).all()
-
-
-def test_tum_poses_come_back(tmp_path) -> None:
-    from freeocc3d.capture.readers.synthetic import camera_on_the_walk
-
-    T = np.stack([camera_on_the_walk(p) for p in (0.0, 0.1, 0.2, 0.7)])
-    T[2] = np.nan
-    stamps = np.array([0.0, 1 / 30, 2 / 30, 1305031102.175304])
-    trajectory = Trajectory(stamps, T, np.array([0], np.int32), np.array(["tracked"] * 4), np.ones(4, np.float32))
-    store.write_tum(tmp_path / "t.txt", trajectory)
-    times, poses = store.read_tum(tmp_path / "t.txt")
-    np.testing.assert_array_equal(times, stamps[[0, 1, 3]])
-    np.testing.assert_allclose(poses, T[[0, 1, 3]], atol=1e-7)
 
 
 def test_not_a_map(tmp_path, copy) -> None:

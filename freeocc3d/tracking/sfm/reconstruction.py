@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...capture.base import NOMINAL_DEPTH
 from ...capture.undistortion import Lens, Rectified
-from ...core.arrays import read_arrays
+from ...core.arrays import read_arrays, write_arrays
 from ...core.types import Intrinsics
 
 _EXPECTED = {
@@ -75,10 +75,7 @@ class Reconstruction:
         numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *self.lens.distortion)
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _EXPECTED if name not in ("camera", "warnings")}
         arrays["warnings"] = np.array(self.warnings, "U")
-
-        temporary = path.with_name(f"tmp.{path.name}")
-        np.savez(temporary, **arrays, camera=np.array(numbers))
-        temporary.replace(path)
+        write_arrays(path, {**arrays, "camera": np.array(numbers)})
 
     @classmethod
     def load(cls, path: Path) -> Reconstruction:

@@ -21,6 +21,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
+from ...core.atomic_files import replace_text
 from ...core.errors import FrameError
 from ...core.progress import Progress
 from ...core.types import Intrinsics
@@ -115,9 +116,7 @@ def _chosen(capture: Capture, frames: Sequence[int], path: Path, budget: int, pr
     if path.is_file():
         return list(json.loads(path.read_text(encoding="utf-8")))
     found = frame_selection.choose(capture, frames, budget, progress)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(found), encoding="utf-8")
-    temporary.replace(path)
+    replace_text(path, json.dumps(found))
     return found
 
 

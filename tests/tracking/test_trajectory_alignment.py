@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from freeocc3d.capture import associate, open_capture
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.transforms import quats_to_rotations
+from freeocc3d.core.tum_files import write_tum
 from freeocc3d.core.types import Trajectory
-from freeocc3d.evaluation.trajectory_alignment import Alignment, Poses, align, estimated_poses, read_poses, true_poses
-from freeocc3d.storage.store import write_tum
+from freeocc3d.tracking.trajectory_alignment import Alignment, Poses, align, estimated_poses, read_poses, true_poses
 
 
 def poses(T_world_cam: NDArray[np.float64]) -> Poses:

@@ -1,7 +1,7 @@
 """The estimated trajectory against the true one: which poses belong together, and the best alignment of the two worlds.
 
-Sources: S. Umeyama, PAMI 1991 (``geometry.umeyama``) on the camera centres of the frames that have a pose in both
-(paper, "Coordinate System Alignment"); J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS
+Sources: S. Umeyama, PAMI 1991 (``core.transforms.umeyama``) on the camera centres of the frames that have a pose in
+both (paper, "Coordinate System Alignment"); J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS
 2012, for the association by time.
 """
 

@@ -1,0 +1,57 @@
+"""Trajectories in the form of the TUM RGB-D benchmark: ``timestamp tx ty tz qx qy qz qw``, one camera-to-world pose a
+line.
+
+Source: J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .transforms import quats_to_rotations, rotations_to_quats
+from .types import Trajectory
+
+NUMBERS = 8
+"""Numbers on a line."""
+
+_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes, metres, seconds)"
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write the frames that have a pose. Raises OSError."""
+    rows = np.flatnonzero(trajectory.has_pose)
+    T = trajectory.T_world_cam[rows]
+    quats_wxyz = rotations_to_quats(T[:, :3, :3])
+    lines = [_HEADER]
+    for time, t, (w, x, y, z) in zip(
+        trajectory.timestamps[rows].tolist(), T[:, :3, 3].tolist(), quats_wxyz.tolist(), strict=True
+    ):
+        lines.append(f"{time!r} {t[0]:.9f} {t[1]:.9f} {t[2]:.9f} {x:.9f} {y:.9f} {z:.9f} {w:.9f}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(M,) timestamps and (M, 4, 4) poses of a file. Raises OSError, and ValueError with what is wrong."""
+    lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+    rows = [line for line in lines if line and not line[0].startswith("#")]
+    return tum_poses(rows)
+
+
+def tum_poses(rows: list[list[str]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(M,) timestamps and (M, 4, 4) poses of M lines, split into words. Raises ValueError with what is wrong."""
+    if any(len(row) != NUMBERS for row in rows):
+        raise ValueError(f"a line does not hold {NUMBERS} numbers")
+    table = np.array(rows, np.float64).reshape(-1, NUMBERS)
+    if not np.isfinite(table).all():
+        raise ValueError("a number is not finite")
+    quats_wxyz = table[:, [7, 4, 5, 6]]
+    lengths = np.linalg.norm(quats_wxyz, axis=1, keepdims=True)
+    if (lengths == 0).any():
+        raise ValueError("a quaternion is all zeros, which is no rotation")
+    T = np.tile(np.eye(4), (len(table), 1, 1))
+    T[:, :3, 3] = table[:, 1:4]
+    T[:, :3, :3] = quats_to_rotations(quats_wxyz / lengths)
+    return table[:, 0], T
