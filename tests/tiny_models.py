@@ -6,17 +6,15 @@ import collections
 import contextlib
 import functools
 import itertools
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
-
-import encoder_tokenizers
-import export_encoder
+from freeocc3d.language.model_export.checkpoint_networks import build_clip
+from freeocc3d.language.model_export.package_writer import write_package
+from freeocc3d.language.model_export.tokenizer_files import clip_tokenizer_from
 
 CLIP_MEAN, CLIP_STD = [0.48145466, 0.4578275, 0.40821073], [0.26862954, 0.26130258, 0.27577711]
 START, END = "<|startoftext|>", "<|endoftext|>"
@@ -68,7 +66,7 @@ def _merged(word: tuple[str, ...], pair: tuple[str, str]) -> tuple[str, ...]:
 
 
 def tokenizer() -> str:
-    return encoder_tokenizers.clip_tokenizer_of(*vocabulary())
+    return clip_tokenizer_from(*vocabulary())
 
 
 def clip(dimension: int = 24, seed: int = 0) -> Any:
@@ -146,8 +144,8 @@ def seeded(seed: int) -> Iterator[None]:
 
 def clip_package(folder: Path, precision: str = "fp32", **options: Any) -> Path:
     """A tiny CLIP, written as a model package."""
-    checkpoint = export_encoder.clip(clip(**options), tokenizer(), CLIP_MEAN, CLIP_STD)
-    export_encoder.export(checkpoint, folder, folder.name, "random weights", "none", precision)
+    checkpoint = build_clip(clip(**options), tokenizer(), CLIP_MEAN, CLIP_STD)
+    write_package(checkpoint, folder, folder.name, "random weights", "none", precision)
     return folder
 
 

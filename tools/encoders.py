@@ -11,7 +11,7 @@ import statistics
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 Figures = dict[str, Any]
 Line = tuple[str, str, str]
@@ -26,12 +26,12 @@ _EDGE_PIXELS, _STRIDE = 16, 4
 
 def measure_encoders() -> Figures:
     """Bytes, seconds and cosines to fp32 of each precision; shares of pixels near edges that get their class."""
-    import export_encoder
     import numpy as np
 
     from freeocc3d.core.types import Frame, Intrinsics
     from freeocc3d.language import model_packages
     from freeocc3d.language.encoders import clip
+    from freeocc3d.language.model_export.package_writer import write_package
     from freeocc3d.language.text_networks import TextNetwork
 
     rgb = np.random.default_rng(0).integers(0, 256, (FRAME[0] // 32, FRAME[1] // 32, 3), dtype=np.uint8)
@@ -43,9 +43,9 @@ def measure_encoders() -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["FREEOCC3D_MODELS"] = folder
         checkpoint = _checkpoint()
-        for precision in export_encoder.PRECISIONS:
+        for precision in get_args(model_packages.Precision):
             path = Path(folder) / precision
-            export_encoder.export(checkpoint, path, precision, "random weights", "none", precision)
+            write_package(checkpoint, path, precision, "random weights", "none", precision)
             package = model_packages.read(path)
             encoder = clip.load(clip.Options(model=str(path)))
             text = TextNetwork(package)
@@ -66,11 +66,12 @@ def measure_encoders() -> Figures:
 
 
 def _checkpoint() -> Any:
-    import encoder_tokenizers
-    import export_encoder
     import torch
     from tokenizers import pre_tokenizers
     from transformers import CLIPConfig, CLIPModel
+
+    from freeocc3d.language.model_export.checkpoint_networks import build_clip
+    from freeocc3d.language.model_export.tokenizer_files import clip_tokenizer_from
 
     letters = pre_tokenizers.ByteLevel.alphabet()
     tokens = [*letters, *(letter + "</w>" for letter in letters), "<|startoftext|>", "<|endoftext|>"]
@@ -82,8 +83,8 @@ def _checkpoint() -> Any:
     model = CLIPModel(
         CLIPConfig(**own, vision_config={**SHAPE, **own, "patch_size": PATCH, "image_size": 224}, text_config=text)
     ).eval()
-    tokenizer = encoder_tokenizers.clip_tokenizer_of(vocabulary, [])
-    return export_encoder.clip(model, tokenizer, [0.5] * 3, [0.25] * 3)
+    tokenizer = clip_tokenizer_from(vocabulary, [])
+    return build_clip(model, tokenizer, [0.5] * 3, [0.25] * 3)
 
 
 def measure_edges() -> Figures:

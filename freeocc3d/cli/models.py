@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from ..core.errors import FreeOccError, ModelError
 from .console import ConsoleProgress, Json
 
-app = typer.Typer(help="Fetch, list and verify the networks that encoders are made of.", no_args_is_help=True)
+Precision = Literal["fp32", "fp16", "int8"]
+
+app = typer.Typer(help="Fetch, export, list and verify the networks that encoders are made of.", no_args_is_help=True)
 
 
 @app.command("pull")
@@ -30,9 +32,54 @@ def models_pull(
     finally:
         progress.close()
     if folder.parent.name == model_hub.CHECKPOINTS:
-        print(f"{folder}: a checkpoint, to be exported: python tools/export_encoder.py {folder} -o {folder.name}")
+        print(f"{folder}: a checkpoint, to be exported: freeocc3d models export {folder} -o {folder.name}")
     else:
         print(folder)
+
+
+@app.command("export")
+def models_export(
+    checkpoint: Annotated[
+        str,
+        typer.Argument(
+            metavar="CHECKPOINT",
+            help="Folder of a checkpoint of CLIP, SigLIP, DINO, DINOv2 or SAM, OWNER/NAME on the Hugging Face hub, or "
+            "open_clip:ARCHITECTURE/WEIGHTS.",
+        ),
+    ],
+    output: Annotated[
+        str, typer.Option("-o", "--output", metavar="NAME", help="Folder to write; a plain name: in the models folder.")
+    ],
+    precision: Annotated[
+        Precision, typer.Option("--precision", help="Of the weights; fp16 and int8 are smaller and faster.")
+    ] = "fp32",
+    tokenizer: Annotated[
+        Path | None,
+        typer.Option("--tokenizer", metavar="FOLDER", help="Where the tokenizer is, if not in CHECKPOINT."),
+    ] = None,
+    text: Annotated[
+        str | None, typer.Option("--text", metavar="CLIP", help="Checkpoint of the CLIP that gives a DINOv2 its words.")
+    ] = None,
+    text_head: Annotated[
+        Path | None,
+        typer.Option("--text-head", metavar="FILE", help="Safetensors file of Talk2DINO's projection, with --text."),
+    ] = None,
+    license_name: Annotated[
+        str | None,
+        typer.Option("--license", "--licence", metavar="NAME", help="Of the weights, if not what the model card says."),
+    ] = None,
+) -> None:
+    """Turn a checkpoint into a model package: ONNX networks, tokenizer and manifest.
+
+    CHECKPOINT holds config.json with model.safetensors, or open_clip_config.json with open_clip_model.safetensors, and
+    for words tokenizer.json, or vocab.json with merges.txt. Weights are read from safetensors files only.
+    """
+    from ..language.model_export.export_checkpoint import export_checkpoint
+
+    if (text is None) != (text_head is None):
+        raise typer.BadParameter("--text and --text-head belong together.")
+    made = export_checkpoint(checkpoint, output, precision, tokenizer, text, text_head, license_name)
+    print(f"{made.folder}: {made.kind}, {made.dimension} dimensions, {made.precision}, {made.bytes:,} bytes")
 
 
 @app.command("list")

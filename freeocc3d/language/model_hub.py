@@ -27,7 +27,7 @@ NAMES = {
     "dinov2-b14": "facebook/dinov2-base",
     "sam-b": "facebook/sam-vit-base",
 }
-"""Short names of repositories whose checkpoints ``tools/export_encoder.py`` takes."""
+"""Short names of repositories whose checkpoints ``freeocc3d models export`` takes."""
 
 CHECKPOINTS = ".checkpoints"
 """Folder in the models folder for what is not a package yet."""

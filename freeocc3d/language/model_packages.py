@@ -3,7 +3,7 @@
     manifest.yaml (or .json)   what the package is, the parts it has, and the sha256 of every file
     image.onnx  head.onnx  text.onnx  tokenizer.json   … by kind, see ``KINDS``
 
-``tools/export_encoder.py`` writes packages, ``freeocc3d models`` fetches, lists and verifies them. They lie in the
+``freeocc3d models`` exports checkpoints as packages, and fetches, lists and verifies packages. They lie in the
 models folder (the environment variable FREEOCC3D_MODELS, else ~/.cache/freeocc3d/models) or anywhere else. Nothing in
 a package is ever unpickled.
 """
@@ -17,7 +17,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -28,6 +28,8 @@ from ..settings.registry import nearest
 MANIFESTS = ("manifest.yaml", "manifest.json")
 FORMAT = 1
 SUFFIXES = (".onnx", ".safetensors", ".json", ".yaml")
+Precision = Literal["fp32", "fp16", "int8"]
+"""Of a package's weights."""
 """Of the files that a package may hold."""
 
 _LARGEST_MANIFEST = 1 << 20
@@ -133,7 +135,7 @@ class Package:
             raise ModelError(
                 f"{path} takes {', '.join(inputs)} and gives {', '.join(outputs)}; the {part} network of a "
                 f"'{self.kind}' model takes {', '.join(expected.inputs)} and gives {', '.join(expected.outputs)}: "
-                "export it again with tools/export_encoder.py."
+                "export it again with 'freeocc3d models export'."
             )
         for name in ("features", "reduced", "pooled", "embeddings") if "text" in self.parts else ():
             if part == "image" and self.kind == "clip":
@@ -159,7 +161,7 @@ def find(model: str, kinds: tuple[str, ...], option: str) -> Package:
     if not model:
         raise ModelError(
             f"{option} names no model: give the folder of one, or its name ({_known()}); "
-            "tools/export_encoder.py makes them, 'freeocc3d models pull' fetches them."
+            "'freeocc3d models export' makes them, 'freeocc3d models pull' fetches them."
         )
     folder = Path(model).expanduser()
     if not folder.is_dir():
@@ -216,7 +218,7 @@ def read(folder: Path) -> Package:
     path = next((folder / name for name in MANIFESTS if (folder / name).is_file()), None)
     if path is None:
         raise ModelError(
-            f"{folder} is no model package: it lacks a {MANIFESTS[0]}; tools/export_encoder.py writes one."
+            f"{folder} is no model package: it lacks a {MANIFESTS[0]}; 'freeocc3d models export' writes one."
         )
     package = parse(load_manifest(path), folder, path)
     for name in package.files:

@@ -10,13 +10,14 @@ import pytest
 import tiny_models
 import torch
 from numpy.typing import NDArray
-from tiny_models import export_encoder
 from torch.nn import functional as F
 
 from freeocc3d.core.errors import ConfigError, ModelError
 from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.language import model_packages
 from freeocc3d.language.encoders import clip
+from freeocc3d.language.model_export.checkpoint_networks import build_siglip
+from freeocc3d.language.model_export.package_writer import write_package
 
 SIZES = ((32, 32), (48, 80), (24, 16), (64, 104))
 """Heights and widths in pixels; the first is that of training."""
@@ -30,8 +31,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def siglip_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("models") / "tiny-siglip"
-    checkpoint = export_encoder.siglip(tiny_models.siglip(), tiny_models.tokenizer(), [0.5] * 3, [0.5] * 3)
-    export_encoder.export(checkpoint, made, made.name, "random weights", "none")
+    checkpoint = build_siglip(tiny_models.siglip(), tiny_models.tokenizer(), [0.5] * 3, [0.5] * 3)
+    write_package(checkpoint, made, made.name, "random weights", "none")
     return made
 
 

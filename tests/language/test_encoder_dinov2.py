@@ -9,11 +9,12 @@ import pytest
 import tiny_models
 import torch
 from test_encoder_clip import frame
-from tiny_models import export_encoder
 from torch.nn import functional as F
 
 from freeocc3d.core.errors import ConfigError
 from freeocc3d.language.encoders import dinov2
+from freeocc3d.language.model_export.checkpoint_networks import build_text_aligned
+from freeocc3d.language.model_export.package_writer import write_package
 from freeocc3d.language.patch_features import resampled
 
 
@@ -35,8 +36,8 @@ def registers(request: pytest.FixtureRequest) -> int:
 def folder(tmp_path_factory: pytest.TempPathFactory, registers: int) -> Path:
     made = tmp_path_factory.mktemp("models") / "talk2dino"
     model = tiny_models.dinov2(registers=registers)
-    checkpoint = export_encoder.dense(model, tiny_models.clip(), tiny_models.tokenizer(), head())
-    export_encoder.export(checkpoint, made, made.name, "random weights", "none")
+    checkpoint = build_text_aligned(model, tiny_models.clip(), tiny_models.tokenizer(), head())
+    write_package(checkpoint, made, made.name, "random weights", "none")
     return made
 
 

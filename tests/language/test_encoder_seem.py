@@ -9,12 +9,13 @@ import pytest
 import tiny_models
 import torch
 from test_encoder_clip import frame
-from tiny_models import export_encoder
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from freeocc3d.core.errors import ConfigError
 from freeocc3d.language.encoders import seem
+from freeocc3d.language.model_export.checkpoint_networks import Checkpoint, Network, build_clip
+from freeocc3d.language.model_export.package_writer import write_package
 
 QUERIES = 5
 
@@ -42,14 +43,12 @@ def network() -> Masks:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("models") / "tiny-seem"
-    words = export_encoder.clip(tiny_models.clip(), tiny_models.tokenizer(), [0.5] * 3, [0.25] * 3)
-    image = export_encoder.Network(
-        network(), {"image": torch.zeros(2, 3, 16, 20)}, {"image": (0, 2, 3)}, ("masks", "embeddings")
-    )
+    words = build_clip(tiny_models.clip(), tiny_models.tokenizer(), [0.5] * 3, [0.25] * 3)
+    image = Network(network(), {"image": torch.zeros(2, 3, 16, 20)}, {"image": (0, 2, 3)}, ("masks", "embeddings"))
     facts = {**words.facts, "patch": 4, "prefix_tokens": 0}
     parts = {"image": image, "text": words.networks["text"]}
-    checkpoint = export_encoder.Checkpoint("masks", parts, facts, words.tokenizer)
-    export_encoder.export(checkpoint, made, made.name, "random weights", "none")
+    checkpoint = Checkpoint("masks", parts, facts, words.tokenizer)
+    write_package(checkpoint, made, made.name, "random weights", "none")
     return made
 
 

@@ -11,12 +11,13 @@ import tiny_models
 import torch
 from numpy.typing import NDArray
 from test_encoder_clip import frame
-from tiny_models import export_encoder
 from torch.nn import functional as F
 
 from freeocc3d.core.errors import ConfigError, ModelError
 from freeocc3d.language.encoders import trident
 from freeocc3d.language.encoders.trident import correlation, gathering, pooled
+from freeocc3d.language.model_export.checkpoint_networks import build_backbone, build_sam
+from freeocc3d.language.model_export.package_writer import write_package
 
 DINO_MEAN, DINO_STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
 GRID = 6, 8
@@ -30,10 +31,10 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     root = tmp_path_factory.mktemp("models")
     tiny_models.clip_package(root / "clip")
     for name, checkpoint in (
-        ("dino", export_encoder.backbone(tiny_models.dinov2(), DINO_MEAN, DINO_STD)),
-        ("sam", export_encoder.sam(tiny_models.sam(), DINO_MEAN, DINO_STD)),
+        ("dino", build_backbone(tiny_models.dinov2(), DINO_MEAN, DINO_STD)),
+        ("sam", build_sam(tiny_models.sam(), DINO_MEAN, DINO_STD)),
     ):
-        export_encoder.export(checkpoint, root / name, name, "random weights", "none")
+        write_package(checkpoint, root / name, name, "random weights", "none")
     return {"model": str(root / "clip"), "dino": str(root / "dino"), "sam": str(root / "sam")}
 
 

@@ -15,12 +15,14 @@ import pytest
 import regex
 import tiny_models
 import torch
-from tiny_models import encoder_tokenizers, export_encoder
 from tokenizers import Tokenizer
 
 from freeocc3d.core.errors import MapError, ModelError
 from freeocc3d.language import model_packages
 from freeocc3d.language.encoders import clip
+from freeocc3d.language.model_export.checkpoint_networks import build_siglip
+from freeocc3d.language.model_export.package_writer import write_package
+from freeocc3d.language.model_export.tokenizer_files import clip_tokenizer
 
 ALPHABETS = (
     "abcdefghijklmnopqrstuvwxyz", "ABCDEFGHIJ KLM", "0123456789 .,;:!?'\"()-_/&@#%", "äöüßéèêñçøåœ",
@@ -75,7 +77,7 @@ def unpadded(tokenizer: str) -> Tokenizer:
 
 
 def test_the_tokenizer_equals_clips_own_on_1000_strings() -> None:
-    made = unpadded(encoder_tokenizers.clip_tokenizer(tiny_models.tokenizer(), 77))
+    made = unpadded(clip_tokenizer(tiny_models.tokenizer(), 77))
     texts = strings()
     for text, encoding in zip(texts, made.encode_batch(texts), strict=True):
         assert encoding.ids == reference_tokens(text), repr(text[:80])
@@ -86,14 +88,14 @@ def test_the_tokenizer_equals_transformers_on_1000_strings() -> None:
 
     vocabulary, merges = tiny_models.vocabulary()
     theirs = CLIPTokenizer(vocab=vocabulary, merges=merges)
-    made = unpadded(encoder_tokenizers.clip_tokenizer(tiny_models.tokenizer(), 77))
+    made = unpadded(clip_tokenizer(tiny_models.tokenizer(), 77))
     texts = strings()
     expected = theirs(texts, truncation=True, max_length=77)["input_ids"]
     assert [encoding.ids for encoding in made.encode_batch(texts)] == [list(row) for row in expected]
 
 
 def test_texts_are_cut_to_what_clip_takes_and_padded_to_the_longest() -> None:
-    made = Tokenizer.from_str(encoder_tokenizers.clip_tokenizer(tiny_models.tokenizer(), 77))
+    made = Tokenizer.from_str(clip_tokenizer(tiny_models.tokenizer(), 77))
     long, short = (encoding.ids for encoding in made.encode_batch(["chair " * 500, "sofa"]))
     assert len(long) == len(short) == 77
     end = tiny_models.vocabulary()[0][tiny_models.END]
@@ -120,7 +122,7 @@ def state(package: model_packages.Package, **options: Any) -> dict[str, Any]:
 
 def text_features(texts: list[str]) -> np.ndarray:
     """Unit features of transformers' own forward pass, one text at a time, without padding."""
-    made = unpadded(encoder_tokenizers.clip_tokenizer(tiny_models.tokenizer(), 77))
+    made = unpadded(clip_tokenizer(tiny_models.tokenizer(), 77))
     model, rows = tiny_models.clip(), []
     for text in texts:
         with torch.no_grad():
@@ -211,8 +213,8 @@ def test_a_damaged_state_is_told() -> None:
 def test_siglips_texts_are_lowered_stripped_and_of_one_length(tmp_path: Path, home: Path) -> None:
     made = tmp_path / "siglip"
     model = tiny_models.siglip()
-    checkpoint = export_encoder.siglip(model, tiny_models.tokenizer(), [0.5] * 3, [0.5] * 3)
-    export_encoder.export(checkpoint, made, made.name, "random weights", "none")
+    checkpoint = build_siglip(model, tiny_models.tokenizer(), [0.5] * 3, [0.5] * 3)
+    write_package(checkpoint, made, made.name, "random weights", "none")
     found = clip.load_text(state(model_packages.read(made), templates=("{}",))).encode_words(["Red, CHAIR!", "a" * 300])
     tokens = [
         encoding.ids

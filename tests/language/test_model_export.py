@@ -14,16 +14,17 @@ import pytest
 import tiny_models
 import torch
 from safetensors.torch import save_file
-from tiny_models import encoder_tokenizers, export_encoder
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from freeocc3d.core.errors import ModelError
 from freeocc3d.language import model_packages
 from freeocc3d.language.encoders import clip
+from freeocc3d.language.model_export.checkpoint_files import read_checkpoint
+from freeocc3d.language.model_export.package_writer import write_package
+from freeocc3d.language.model_export.tokenizer_files import end_token
 from freeocc3d.language.text_networks import TextNetwork
 
-TOOL = Path(__file__).parents[2] / "tools" / "export_encoder.py"
 WIDTH, DIMENSION, LENGTH = 32, 24, 77
 
 
@@ -125,7 +126,7 @@ def write_open_clip(folder: Path, quick: bool) -> Path:
 @pytest.mark.parametrize("quick", [True, False])
 def test_open_clip_checkpoints_equal_their_own_forward_pass(tmp_path: Path, quick: bool) -> None:
     source = write_open_clip(tmp_path / "source", quick)
-    export_encoder.export(export_encoder.read_checkpoint(str(source), None, None, None), tmp_path / "m", "m", "s", "l")
+    write_package(read_checkpoint(str(source), None, None, None), tmp_path / "m", "m", "s", "l")
     package = model_packages.read(tmp_path / "m")
     assert (package.dimension, package.mean, package.logit_scale) == (24, (0.5, 0.4, 0.3), pytest.approx(100, abs=0.01))
     given = np.random.default_rng(0).normal(size=(2, 3, 32, 32)).astype(np.float32)
@@ -140,8 +141,8 @@ def test_open_clip_checkpoints_equal_their_own_forward_pass(tmp_path: Path, quic
 
 def run(*arguments: Any, code: int = 0, **environment: str) -> str:
     done = subprocess.run(
-        [sys.executable, str(TOOL), *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False,
-        env={**os.environ, **environment},
+        [sys.executable, "-m", "freeocc3d.cli", "models", "export", *map(str, arguments)],
+        capture_output=True, text=True, timeout=600, check=False, env={**os.environ, **environment},
     )  # fmt: skip
     assert done.returncode == code, done.stderr
     return done.stdout if code == 0 else done.stderr.strip().splitlines()[-1]
@@ -169,8 +170,8 @@ def test_dino_and_dinov2_checkpoints_are_backbones(tmp_path: Path) -> None:
     for name, model, patch in (("dino", vit, 8), ("dinov2", tiny_models.dinov2(), 7)):
         model.save_pretrained(tmp_path / name)
         made = tmp_path / f"{name}.model"
-        checkpoint = export_encoder.read_checkpoint(str(tmp_path / name), None, None, None)
-        export_encoder.export(checkpoint, made, name, "s", "l")
+        checkpoint = read_checkpoint(str(tmp_path / name), None, None, None)
+        write_package(checkpoint, made, name, "s", "l")
         given = np.random.default_rng(1).normal(size=(2, 3, 3 * patch, 6 * patch)).astype(np.float32)
         (features,) = model_packages.read(made).session("image").run(["features"], {"image": given})
         options = {"interpolate_pos_encoding": True} if name == "dino" else {}
@@ -182,8 +183,8 @@ def test_dino_and_dinov2_checkpoints_are_backbones(tmp_path: Path) -> None:
 
 def test_sam_equals_transformers_forward_pass(tmp_path: Path) -> None:
     tiny_models.sam().save_pretrained(tmp_path / "source")
-    checkpoint = export_encoder.read_checkpoint(str(tmp_path / "source"), None, None, None)
-    export_encoder.export(checkpoint, tmp_path / "m", "m", "s", "l")
+    checkpoint = read_checkpoint(str(tmp_path / "source"), None, None, None)
+    write_package(checkpoint, tmp_path / "m", "m", "s", "l")
     package = model_packages.read(tmp_path / "m")
     given, points = torch.randn(1, 3, 64, 64), 64 * torch.rand(1, 7, 1, 2)
     features, attention = package.session("image").run(["features", "attention"], {"image": given.numpy()})
@@ -208,23 +209,23 @@ def test_weights_that_are_pickled_are_not_read(tmp_path: Path) -> None:
     torch.save({}, tmp_path / "pytorch_model.bin")
     (tmp_path / "model.safetensors").unlink()
     with pytest.raises(ModelError, match="is no checkpoint"):
-        export_encoder.read_checkpoint(str(tmp_path), None, None, None)
+        read_checkpoint(str(tmp_path), None, None, None)
 
 
 def test_a_tokenizer_that_is_lacking_is_told(tmp_path: Path) -> None:
     tiny_models.clip().save_pretrained(tmp_path)
     with pytest.raises(ModelError, match=r"holds neither tokenizer\.json nor vocab.json"):
-        export_encoder.read_checkpoint(str(tmp_path), None, None, None)
+        read_checkpoint(str(tmp_path), None, None, None)
 
 
 def test_open_clip_weights_that_do_not_fit_are_told(tmp_path: Path) -> None:
     source = write_open_clip(tmp_path / "source", quick=True)
     save_file({"logit_scale": torch.zeros(())}, source / "open_clip_model.safetensors")
     with pytest.raises(ModelError, match="is no OpenCLIP ViT in its usual form"):
-        export_encoder.read_checkpoint(str(source), None, None, None)
+        read_checkpoint(str(source), None, None, None)
 
 
 @pytest.mark.parametrize("stated", [2, None])
 def test_the_end_token_of_first_configurations_is_the_largest(stated: int | None) -> None:
     end = tiny_models.vocabulary()[0][tiny_models.END]
-    assert encoder_tokenizers.end_token(end if stated is None else stated, tiny_models.tokenizer()) == end
+    assert end_token(end if stated is None else stated, tiny_models.tokenizer()) == end

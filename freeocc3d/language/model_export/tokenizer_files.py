@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from freeocc3d.core.errors import ModelError
+from ...core.errors import ModelError
 
 _SIGLIP_PUNCTUATION = r"[!\"#$%&'()*+,\-./:;<=>?@\[\\\]^_`{|}~]"
 
@@ -47,7 +47,7 @@ def siglip_tokenizer(tokenizer: str, length: int, pad_id: int) -> str:
     return str(made.to_str())
 
 
-def clip_tokenizer_of(vocabulary: dict[str, int], merges: list[tuple[str, str]]) -> str:
+def clip_tokenizer_from(vocabulary: dict[str, int], merges: list[tuple[str, str]]) -> str:
     """tokenizer.json of CLIP's vocab.json and merges.txt: byte-level BPE of lower-case words that end with </w>."""
     from tokenizers import Regex, Tokenizer, normalizers, pre_tokenizers, processors
     from tokenizers.models import BPE
@@ -78,6 +78,6 @@ def read_tokenizer(folder: Path) -> str:
         vocabulary = json.loads((folder / "vocab.json").read_text(encoding="utf-8"))
         lines = (folder / "merges.txt").read_text(encoding="utf-8").splitlines()
         pairs = [line.split() for line in lines if line and not line.startswith("#version")]
-        return clip_tokenizer_of(vocabulary, [(left, right) for left, right in pairs])
+        return clip_tokenizer_from(vocabulary, [(left, right) for left, right in pairs])
     except (OSError, ValueError, KeyError) as error:
         raise ModelError(f"{folder} holds neither tokenizer.json nor vocab.json with merges.txt: {error}.") from error

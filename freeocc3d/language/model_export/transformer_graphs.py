@@ -6,8 +6,6 @@ patches) go in. Attention is written out, so that the last block can be cut befo
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -200,65 +198,6 @@ class Talk2DinoHead(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return self.linear_layer2(torch.tanh(self.linear_layer(x)))
-
-
-def clip_of_open_clip(state: dict[str, Tensor], config: dict[str, Any]) -> nn.Module:
-    """transformers' CLIPModel with the weights of an OpenCLIP (or OpenAI) ViT. config: its ``model_cfg``.
-
-    Raises KeyError or RuntimeError if the weights are not those of such a network.
-    """
-    from transformers import CLIPConfig, CLIPModel
-
-    vision, text = config["vision_cfg"], config["text_cfg"]
-    act = "quick_gelu" if config.get("quick_gelu") else "gelu"
-    tokens = text["vocab_size"]
-    model = CLIPModel(
-        CLIPConfig(
-            projection_dim=config["embed_dim"],
-            vision_config={
-                "hidden_size": vision["width"], "num_hidden_layers": vision["layers"], "hidden_act": act,
-                "num_attention_heads": vision["width"] // vision.get("head_width", 64),
-                "intermediate_size": int(vision["width"] * vision.get("mlp_ratio", 4)),
-                "image_size": vision["image_size"], "patch_size": vision["patch_size"],
-                "projection_dim": config["embed_dim"],
-            },
-            text_config={
-                "hidden_size": text["width"], "num_hidden_layers": text["layers"], "hidden_act": act,
-                "num_attention_heads": text["heads"], "intermediate_size": 4 * text["width"], "vocab_size": tokens,
-                "max_position_embeddings": text["context_length"], "projection_dim": config["embed_dim"],
-                "eos_token_id": tokens - 1, "bos_token_id": tokens - 2, "pad_token_id": tokens - 1,
-            },
-        )
-    )  # fmt: skip
-    renamed = {
-        "logit_scale": state["logit_scale"],
-        "visual_projection.weight": state["visual.proj"].T,
-        "text_projection.weight": state["text_projection"].T,
-        "vision_model.embeddings.class_embedding": state["visual.class_embedding"],
-        "vision_model.embeddings.patch_embedding.weight": state["visual.conv1.weight"],
-        "vision_model.embeddings.position_embedding.weight": state["visual.positional_embedding"],
-        "text_model.embeddings.token_embedding.weight": state["token_embedding.weight"],
-        "text_model.embeddings.position_embedding.weight": state["positional_embedding"],
-    }
-    norms = {"visual.ln_pre": "vision_model.pre_layrnorm", "visual.ln_post": "vision_model.post_layernorm",
-             "ln_final": "text_model.final_layer_norm"}  # fmt: skip
-    for tower, blocks, count in (
-        ("vision_model", "visual.transformer.resblocks", vision["layers"]),
-        ("text_model", "transformer.resblocks", text["layers"]),
-    ):
-        for n in range(count):
-            theirs, ours = f"{blocks}.{n}", f"{tower}.encoder.layers.{n}"
-            norms |= {f"{theirs}.ln_1": f"{ours}.layer_norm1", f"{theirs}.ln_2": f"{ours}.layer_norm2",
-                      f"{theirs}.attn.out_proj": f"{ours}.self_attn.out_proj",
-                      f"{theirs}.mlp.c_fc": f"{ours}.mlp.fc1", f"{theirs}.mlp.c_proj": f"{ours}.mlp.fc2"}  # fmt: skip
-            for kind in ("weight", "bias"):
-                parts = state[f"{theirs}.attn.in_proj_{kind}"].chunk(3)
-                for letter, part in zip("qkv", parts, strict=True):
-                    renamed[f"{ours}.self_attn.{letter}_proj.{kind}"] = part
-    for theirs, ours in norms.items():
-        renamed |= {f"{ours}.{kind}": state[f"{theirs}.{kind}"] for kind in ("weight", "bias")}
-    model.load_state_dict({name: value.contiguous() for name, value in renamed.items()}, strict=True)
-    return model.eval()
 
 
 class SamImage(nn.Module):

@@ -1,0 +1,134 @@
+"""Checkpoints on disk or on the Hugging Face hub, read into networks. Weights come from safetensors alone: nothing is
+unpickled."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+from torch import Tensor, nn
+
+from ...core.errors import ModelError
+from .. import model_hub
+from .checkpoint_networks import (
+    CLIP_MEAN,
+    CLIP_STD,
+    DINO_MEAN,
+    DINO_STD,
+    Checkpoint,
+    build_backbone,
+    build_clip,
+    build_sam,
+    build_siglip,
+    build_text_aligned,
+)
+from .open_clip_weights import clip_from_open_clip
+from .tokenizer_files import read_tokenizer
+
+
+def read_checkpoint(source: str, tokenizer: Path | None, text: str | None, text_head: Path | None) -> Checkpoint:
+    """What SOURCE is, made ready for export. Raises ModelError."""
+    if source.startswith("open_clip:"):
+        model, mean, std = _from_open_clip(source.removeprefix("open_clip:"))
+        if tokenizer is None:
+            raise ModelError("open_clip brings no tokenizer.json: name a folder that holds one with --tokenizer.")
+        return build_clip(model, read_tokenizer(tokenizer), mean, std)
+    folder = _local(source)
+    if (folder / "open_clip_config.json").is_file():
+        model, mean, std = _from_open_clip_folder(folder)
+        return build_clip(model, read_tokenizer(tokenizer or folder), mean, std)
+    model = _from_transformers(folder)
+    mean, std = _normalization(folder, model.config.model_type)
+    kind = model.config.model_type
+    if text is not None and text_head is not None:
+        other = _local(text)
+        return build_text_aligned(model, _clip_of(other), read_tokenizer(tokenizer or other), _safetensors(text_head))
+    if kind == "clip":
+        return build_clip(model, read_tokenizer(tokenizer or folder), mean, std)
+    if kind == "siglip":
+        return build_siglip(model, read_tokenizer(tokenizer or folder), mean, std)
+    return build_sam(model, mean, std) if kind == "sam" else build_backbone(model, mean, std)
+
+
+def _clip_of(folder: Path) -> nn.Module:
+    opened = (folder / "open_clip_config.json").is_file()
+    return _from_open_clip_folder(folder)[0] if opened else _from_transformers(folder)
+
+
+def _local(source: str) -> Path:
+    """The folder of a checkpoint, fetched from the hub where it is no folder here."""
+    if Path(source).is_dir():
+        return Path(source)
+    return model_hub.pull(source)
+
+
+def _from_transformers(folder: Path) -> nn.Module:
+    import transformers
+
+    transformers.logging.set_verbosity_error()
+    try:
+        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        name = {
+            "clip": "CLIPModel", "siglip": "SiglipModel", "vit": "ViTModel", "dinov2": "Dinov2Model",
+            "dinov2_with_registers": "Dinov2WithRegistersModel", "sam": "SamModel",
+        }[config["model_type"]]  # fmt: skip
+        loaded = getattr(transformers, name).from_pretrained(
+            folder, use_safetensors=True, local_files_only=True, attn_implementation="eager"
+        )
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise ModelError(
+            f"{folder} is no checkpoint of CLIP, SigLIP, DINO, DINOv2 or SAM as config.json and model.safetensors: "
+            f"{' '.join(str(error).split())}."
+        ) from error
+    return loaded.float().eval()
+
+
+def _from_open_clip_folder(folder: Path) -> tuple[nn.Module, list[float], list[float]]:
+    try:
+        config = json.loads((folder / "open_clip_config.json").read_text(encoding="utf-8"))
+        state = _safetensors(folder / "open_clip_model.safetensors")
+        model = clip_from_open_clip(state, config["model_cfg"])
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise ModelError(f"{folder} is no OpenCLIP ViT in its usual form: {said}.") from error
+    own = config.get("preprocess_cfg", {})
+    return model, list(own.get("mean", CLIP_MEAN)), list(own.get("std", CLIP_STD))
+
+
+def _from_open_clip(name: str) -> tuple[nn.Module, list[float], list[float]]:
+    import open_clip
+
+    architecture, _, weights = name.partition("/")
+    made = open_clip.create_model(architecture, pretrained=weights)
+    state = {key: value.float() for key, value in made.state_dict().items()}
+    config = {
+        **open_clip.get_model_config(architecture),
+        "quick_gelu": "quickgelu" in architecture or weights == "openai",
+    }
+    return clip_from_open_clip(state, config), CLIP_MEAN, CLIP_STD
+
+
+def _safetensors(path: Path) -> dict[str, Tensor]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return {name: value.float() for name, value in load_file(path).items()}
+    except (OSError, SafetensorError) as error:
+        raise ModelError(f"Cannot read the weights {path}: {error}.") from error
+
+
+def _normalization(folder: Path, kind: str) -> tuple[list[float], list[float]]:
+    """Mean and standard deviation that a checkpoint's preprocessor_config.json states, or that its kind usually has."""
+    path = folder / "preprocessor_config.json"
+    stated = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    usual = {"clip": (CLIP_MEAN, CLIP_STD), "siglip": ([0.5] * 3, [0.5] * 3)}.get(kind, (DINO_MEAN, DINO_STD))
+    return list(stated.get("image_mean", usual[0])), list(stated.get("image_std", usual[1]))
+
+
+def stated_licence(source: str) -> str:
+    """The licence that a model card states, if there is one."""
+    card = Path(source) / "README.md"
+    found = re.search(r"^license:\s*(\S+)", card.read_text(encoding="utf-8"), re.M) if card.is_file() else None
+    return found[1] if found else "not stated: see the source"

@@ -1,0 +1,140 @@
+"""A checkpoint's networks as the parts of a model package, with their inputs and outputs and the manifest's facts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from . import transformer_graphs as graphs
+from .tokenizer_files import clip_tokenizer, end_token, siglip_tokenizer
+
+CLIP_MEAN, CLIP_STD = [0.48145466, 0.4578275, 0.40821073], [0.26862954, 0.26130258, 0.27577711]
+"""Of the images that CLIP was trained with."""
+
+DINO_MEAN, DINO_STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
+"""ImageNet's."""
+
+_TALK2DINO_TEMPERATURE = 0.07
+"""That Talk2DINO is trained with."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """A module to export: example inputs by name, which of their axes may have any length, and its outputs' names."""
+
+    module: nn.Module
+    inputs: dict[str, Tensor]
+    dynamic: dict[str, tuple[int, ...]]
+    outputs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What is exported: networks by part, the tokenizer as JSON, and the manifest's facts."""
+
+    kind: str
+    networks: dict[str, Network]
+    facts: dict[str, Any]
+    tokenizer: str | None = None
+
+
+def build_clip(model: nn.Module, tokenizer: str, mean: list[float], std: list[float]) -> Checkpoint:
+    """Of transformers' CLIPModel, as its tokenizer.json is cut and padded by ``clip_tokenizer``."""
+    text, vision = model.config.text_config, model.config.vision_config
+    network = graphs.ClipText(model, end_token(text.eos_token_id, tokenizer))
+    tokens = torch.zeros((2, 7), dtype=torch.int64)
+    return Checkpoint(
+        "clip",
+        {**_image_networks(model, graphs.ClipHead(model)), "text": _text_network(network, tokens, (0, 1))},
+        _facts(model.config.projection_dim, mean, std, vision, 1, math.exp(model.logit_scale.item())),
+        clip_tokenizer(tokenizer, text.max_position_embeddings),
+    )
+
+
+def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[float]) -> Checkpoint:
+    """Of transformers' SiglipModel."""
+    text, vision = model.config.text_config, model.config.vision_config
+    tokens = torch.zeros((2, text.max_position_embeddings), dtype=torch.int64)
+    words = _text_network(graphs.SiglipText(model), tokens, (0,))
+    return Checkpoint(
+        "clip",
+        {**_image_networks(model, graphs.SiglipHead(model)), "text": words},
+        _facts(vision.hidden_size, mean, std, vision, 0, math.exp(model.logit_scale.item())),
+        siglip_tokenizer(tokenizer, text.max_position_embeddings, text.pad_token_id),
+    )  # fmt: skip
+
+
+def build_backbone(model: nn.Module, mean: list[float], std: list[float]) -> Checkpoint:
+    """Of transformers' ViTModel (DINO) or Dinov2Model, with registers or without."""
+    network = Network(graphs.DinoPatches(model), {"image": _image(model.config)}, {"image": (0, 2, 3)}, ("features",))
+    facts = _facts(model.config.hidden_size, mean, std, model.config, 0, 1.0)
+    return Checkpoint("backbone", {"image": network}, facts)
+
+
+def build_text_aligned(model: nn.Module, text_model: nn.Module, tokenizer: str, head: dict[str, Tensor]) -> Checkpoint:
+    """A DINOv2 whose patches a CLIP's words are brought to by ``head``, as Talk2DINO's are."""
+    seen = build_backbone(model, DINO_MEAN, DINO_STD)
+    text = text_model.config.text_config
+    network = graphs.ClipText(text_model, end_token(text.eos_token_id, tokenizer), graphs.Talk2DinoHead(head))
+    tokens = torch.zeros((2, 7), dtype=torch.int64)
+    return Checkpoint(
+        "dense",
+        {**seen.networks, "text": _text_network(network, tokens, (0, 1))},
+        {**seen.facts, "logit_scale": 1 / _TALK2DINO_TEMPERATURE},
+        clip_tokenizer(tokenizer, text.max_position_embeddings),
+    )
+
+
+def build_sam(model: nn.Module, mean: list[float], std: list[float]) -> Checkpoint:
+    """Of transformers' SamModel with "eager" attention, whose weights are given out."""
+    vision = model.config.vision_config
+    side, grid = vision.image_size, vision.image_size // vision.patch_size
+    features = torch.zeros((1, vision.output_channels, grid, grid))
+    points = torch.zeros((1, 5, 2))
+    return Checkpoint(
+        "sam",
+        {
+            "image": Network(
+                graphs.SamImage(model), {"image": torch.zeros((1, 3, side, side))}, {}, ("features", "attention")
+            ),
+            "masks": Network(
+                graphs.SamMasks(model), {"features": features, "points": points}, {"points": (1,)}, ("masks", "scores")
+            ),
+        },
+        _facts(vision.output_channels, mean, std, vision, 0, 1.0),
+    )
+
+
+def _image(config: Any) -> Tensor:
+    patch = config.patch_size
+    return torch.zeros((2, 3, 3 * patch, 5 * patch))
+
+
+def _image_networks(model: nn.Module, head: nn.Module) -> dict[str, Network]:
+    config = model.config.vision_config
+    trunk, image = graphs.ImageTrunk(model.vision_model), _image(config)
+    stream = torch.zeros((2, 11, config.hidden_size))
+    return {
+        "image": Network(trunk, {"image": image}, {"image": (0, 2, 3)}, ("queries", "keys", "values", "stream")),
+        "head": Network(
+            head, {"mixed": stream, "stream": stream.clone()}, {"mixed": (0, 1), "stream": (0, 1)},
+            ("features", "reduced", "pooled"),
+        ),
+    }  # fmt: skip
+
+
+def _text_network(module: nn.Module, tokens: Tensor, dynamic: tuple[int, ...]) -> Network:
+    return Network(module, {"tokens": tokens}, {"tokens": dynamic}, ("features",))
+
+
+def _facts(
+    dimension: int, mean: list[float], std: list[float], vision: Any, prefix: int, logit_scale: float
+) -> dict[str, Any]:
+    return {
+        "dimension": int(dimension), "mean": mean, "std": std, "patch": int(vision.patch_size),
+        "input_size": int(vision.image_size), "prefix_tokens": prefix, "logit_scale": round(logit_scale, 4),
+    }  # fmt: skip

@@ -1,0 +1,44 @@
+"""A checkpoint in, a model package out: what ``freeocc3d models export`` does."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+from ...core.errors import DependencyError
+from .. import model_packages
+
+_NEEDED = ("onnx", "onnxscript", "safetensors", "tokenizers", "transformers")
+
+
+def export_checkpoint(
+    source: str,
+    output: str,
+    precision: model_packages.Precision = "fp32",
+    tokenizer: Path | None = None,
+    text: str | None = None,
+    text_head: Path | None = None,
+    licence: str | None = None,
+) -> model_packages.Package:
+    """Write the checkpoint as a model package, and read it back.
+
+    source: a folder with config.json and model.safetensors (CLIP, SigLIP, DINO, DINOv2, SAM of transformers), a folder
+    with open_clip_config.json and open_clip_model.safetensors, ``open_clip:ARCHITECTURE/WEIGHTS``, or OWNER/NAME on the
+    Hugging Face hub.  output: the folder to write; a plain name means a folder in the models folder.
+    tokenizer: folder with tokenizer.json, or vocab.json and merges.txt, if the checkpoint has neither.
+    text: checkpoint of the CLIP whose words ``text_head``, the safetensors file of Talk2DINO's projection, brings into
+    the space of a DINOv2.  licence: of the weights; None = what the model card says.
+
+    Raises ModelError: no such checkpoint, or the folder exists. Raises DependencyError: a package is not installed.
+    """
+    if missing := [name for name in _NEEDED if find_spec(name) is None]:
+        raise DependencyError(
+            f"The export of a model needs {', '.join(missing)}: install them with pip install 'freeocc3d[export]'."
+        )
+    from .checkpoint_files import read_checkpoint, stated_licence
+    from .package_writer import write_package
+
+    folder = model_packages.models_folder() / output if Path(output).name == output else Path(output)
+    checkpoint = read_checkpoint(source, tokenizer, text, text_head)
+    write_package(checkpoint, folder, folder.name, source, licence or stated_licence(source), precision)
+    return model_packages.read(folder)
