@@ -18,12 +18,12 @@ FOLDER = Path(__file__).resolve().parents[1] / "configs" / "ablations"
 _TRY = """
 import sys
 from pathlib import Path
-from freeocc3d.pipeline import run
+from freeocc3d.pipeline import checks
 from freeocc3d.settings import config
 from freeocc3d.core.errors import FreeOccError
 for path in sys.argv[1:]:
     try:
-        run.check(config.load(Path(path)))
+        checks.check(config.load(Path(path)))
         print("")
     except FreeOccError as error:
         print(error)

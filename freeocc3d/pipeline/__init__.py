@@ -1,1 +1,1 @@
-"""All four layers together: frames in, a map out."""
+"""The only room that knows all four layers: capture -> track -> gaussians -> language -> occupancy -> store."""

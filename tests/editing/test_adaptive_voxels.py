@@ -16,6 +16,7 @@ from freeocc3d.editing import adaptive_voxels
 from freeocc3d.export import export_map
 from freeocc3d.occupancy import build, carve, levels, splat
 from freeocc3d.occupancy.connected_components import connected
+from freeocc3d.pipeline import checks
 from freeocc3d.pipeline import run as pipeline
 from freeocc3d.settings import config
 from freeocc3d.storage.store import Map
@@ -213,7 +214,7 @@ def test_as_an_option_of_reconstruct_it_is_the_same_map(room: Map, tmp_path: Pat
     agree = made.occupancy.state == later.occupancy.state
     assert agree.mean() > 0.999  # features decide where to look; a saved map's are coded
     with pytest.raises((ConfigError, MapError), match="by halves"):
-        pipeline.check(pipeline.config.resolve({"occupancy": {"finest": 0.03}}))
+        checks.check(config.resolve({"occupancy": {"finest": 0.03}}))
 
 
 def test_what_cannot_be_refined(room: Map, fine: Map, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.editing import box_refinement
 from freeocc3d.language.encoders import segmenter
 from freeocc3d.language.encoders.segmenter import Options, SegmenterEncoder, SegmenterWords, load, load_text
-from freeocc3d.pipeline import run
+from freeocc3d.pipeline import checks
 from freeocc3d.settings import config
 
 NAMES = ["void", "tomato", "lettuce", "bluebell"]
@@ -215,7 +215,7 @@ def test_networks_that_fit_neither_classes_nor_sizes_are_told(tmp_path: Path) ->
 def test_files_that_are_not_there_are_told_before_any_work(tmp_path: Path) -> None:
     settings = {"language": {"encoder": "segmenter", "segmenter": {"model": str(tmp_path / "absent.onnx")}}}
     with pytest.raises(ConfigError, match=r"absent\.onnx, which language\.segmenter\.model names"):
-        run.check(config.resolve(settings))
+        checks.check(config.resolve(settings))
 
 
 def test_what_shapes_leave_open_is_told_before_there_is_work_to_lose(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, Inter
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import FREE, OCCUPIED
 from freeocc3d.gaussians import rendered_views
+from freeocc3d.pipeline import mapper as pipeline_mapper
 from freeocc3d.pipeline import run
 from freeocc3d.settings import config, registry
 from freeocc3d.storage import store
@@ -84,7 +85,7 @@ def test_fitting_while_frames_come_in_keeps_what_was_fitted(tmp_path) -> None:
     the same keyframes start with."""
     capture = open_capture("builtin:room", *_synthetic())
     settings = config.resolve({**ROOM, "fitting": {"window": 2, "window_passes": 4}})
-    mapper = run.Mapper(settings, capture, tmp_path)
+    mapper = pipeline_mapper.Mapper(settings, capture, tmp_path)
     current = None
     for index in range(24):
         if mapper.add(capture[index]).status == "keyframe":

@@ -1,0 +1,227 @@
+"""The online engine: frames in, one by one; layers 2-4 of what was seen so far out."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import Capture, read_ahead
+from ..capture import base as capture_base
+from ..core.errors import FrameError, TrackingError
+from ..core.progress import Progress
+from ..core.types import Frame, Gaussians, Occupancy, PosedFrame, Trajectory
+from ..depth import multi_view_stereo
+from ..editing import adaptive_voxels
+from ..gaussians import anchors, fitting, rendered_views
+from ..gaussians.rasterizers.base import Rasterizer
+from ..language import lifting
+from ..language.encoders.base import Encoder
+from ..occupancy import build, carve, splat
+from ..settings import config
+from ..settings.config import Config
+from ..storage import store
+from ..storage.keyframes import Keyframes
+from ..tracking.base import Tracked, Tracker
+from .backends import load_backend, options_of
+
+_FINE = 0.01
+"""Edge of cells over the usual depth, where the scale is unknown: about what stereo can tell apart."""
+
+
+class Mapper:
+    """Takes frames one by one. ``folder`` receives the keyframes; what is in memory grows with keyframes only."""
+
+    def __init__(self, settings: Config, capture: Capture, folder: Path):
+        self.settings = settings
+        self.capture = capture
+        self.keyframes = Keyframes(folder / store.KEYFRAMES)
+        self.tracker: Tracker = load_backend(settings, "tracking", "backend", capture)
+        if self.tracker.needs_depth and not capture.has_depth:
+            raise TrackingError(
+                f"tracking.backend={settings['tracking']['backend']} needs depth, which {capture.path} has none of (or "
+                "capture.depth=false): estimate poses from colour with tracking.backend=colmap, or give them (known, "
+                "file)."
+            )
+        self.tracker.stereo = options_of(multi_view_stereo, settings["tracking"]["stereo"])
+        self.rasterizer: Rasterizer = load_backend(settings, "fitting", "rasterizer")
+        self._fitted: tuple[Gaussians, Trajectory] | None = None
+
+    def add(self, frame: Frame) -> Tracked:
+        """Track the next frame, and keep it if it is a keyframe."""
+        frame = self.tracker.completed(frame)
+        tracked = self.tracker.track(frame)
+        if tracked.status == "keyframe":
+            self.keyframes.append(frame)
+        return tracked
+
+    def refine(self) -> None:
+        """Make all poses so far consistent with each other."""
+        self.tracker.optimize()
+
+    def trajectory(self) -> Trajectory:
+        """Poses so far, one row per frame of the capture."""
+        return self.tracker.trajectory(self.capture.timestamps)
+
+    def mapped(self, trajectory: Trajectory) -> Keyframes:
+        """The keyframes that are mapped: those of the largest submap."""
+        return self.keyframes.only(trajectory.keyframes)
+
+    def frames_used(self, trajectory: Trajectory, every: int) -> NDArray[np.int64]:
+        """Indices of the mapped keyframes and of every n-th mapped frame that was tracked (0 = none of these)."""
+        measured = np.flatnonzero(np.isin(trajectory.status, ("keyframe", "tracked", "relocalised")))
+        return np.union1d(trajectory.keyframes, measured[::every] if every else [])
+
+    def posed(self, trajectory: Trajectory, every: int) -> Iterator[PosedFrame]:
+        """Those frames. Keyframes are read as they were kept, the others from the capture; one that cannot be decoded
+        any more is left out."""
+        keyframes, own = self.mapped(trajectory), trajectory.keyframes.tolist()
+        between = np.setdiff1d(self.frames_used(trajectory, every), own)
+        stream = read_ahead(self.capture, between.tolist())
+        try:
+            following = next(stream, None)
+            for row, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True)):
+                yield PosedFrame(frame, T, row)
+                while following is not None and (row + 1 == len(own) or following[0] < own[row + 1]):
+                    index, found = following
+                    if not isinstance(found, FrameError):
+                        yield PosedFrame(self.tracker.completed(found), trajectory.T_world_cam[index], row)
+                    following = next(stream, None)
+        finally:
+            stream.close()
+
+    def build_gaussians(self, progress: Progress | None = None) -> Gaussians:
+        """Layer 2 from the mapped keyframes so far at their present poses: anchored, and fitted to all of them."""
+        return self.fit_gaussians(self.anchor_gaussians(progress), progress)
+
+    def anchor_gaussians(self, progress: Progress | None = None, every: int | None = None) -> Gaussians:
+        """Layer 2 as it is initialised: Gaussians anchored at the surface that the mapped frames so far show, every
+        n-th of them (0 = keyframes alone; by default what the configuration says)."""
+        progress = progress or Progress()
+        trajectory = self.trajectory()
+        options: anchors.Options = options_of(anchors, self.settings["gaussians"])
+        every = options.every if every is None else every
+        progress.stage("gaussians", 2 * len(self.frames_used(trajectory, every)))
+        cells = anchors.AnchoredCells(options, self.cell_size, trajectory.T_world_keyframe)
+        done = itertools.count(1)
+
+        def frames() -> Iterator[PosedFrame]:
+            for posed in self.posed(trajectory, every):
+                yield posed
+                progress.advance(next(done))
+
+        for posed in frames():
+            cells.add(posed)
+        return cells.gaussians(frames())
+
+    def fit_gaussians(self, gaussians: Gaussians, progress: Progress | None = None) -> Gaussians:
+        """Layer 2 fitted to the images of all mapped keyframes so far."""
+        progress = progress or Progress()
+        trajectory, passes = self.trajectory(), self.fit_options.passes
+        progress.stage("fitting", passes * len(trajectory.keyframes))
+        return self._fit(gaussians, trajectory, passes, progress)
+
+    def update_gaussians(self) -> Gaussians:
+        """Layer 2 kept current while frames come in: what was fitted before is carried over to the keyframes' present
+        poses, new surface is added, and all is fitted to the last ``fitting.window`` keyframes."""
+        trajectory, options = self.trajectory(), self.fit_options
+        gaussians = self.anchor_gaussians(every=0)
+        if self._fitted is not None:
+            before, then = self._fitted
+            count = len(then.keyframes)
+            if np.array_equal(trajectory.keyframes[:count], then.keyframes):  # else submaps were merged: start anew
+                moved = anchors.reanchored(before, then.T_world_keyframe, trajectory.T_world_keyframe[:count])
+                gaussians = fitting.carried_over(gaussians, moved, self.cell_size)
+        window = trajectory.only_keyframes(trajectory.keyframes[-options.window :])
+        gaussians = self._fit(gaussians, window, options.window_passes, Progress())
+        self._fitted = gaussians, trajectory
+        return gaussians
+
+    @property
+    def cell_size(self) -> float:
+        """Edge in metres of the cells that hold one Gaussian each."""
+        usual = 0.5 * self.settings["occupancy"]["voxel_size"]
+        if not self.tracker.metric:  # half a voxel may turn out to be much in metres
+            usual = min(usual, _FINE * capture_base.NOMINAL_DEPTH)
+        return float(self.settings["gaussians"]["cell_size"] or usual)
+
+    @property
+    def fit_options(self) -> fitting.Options:
+        """The configuration's."""
+        options: fitting.Options = options_of(fitting, config.options(self.settings, "fitting"))
+        return options
+
+    def views(self, trajectory: Trajectory) -> list[rendered_views.View]:
+        """The keyframes as they are rendered and compared."""
+        device, width = self.rasterizer.device, self.fit_options.width
+        posed = zip(self.mapped(trajectory), trajectory.T_world_keyframe, strict=True)
+        return [rendered_views.view_of(frame, T, width, device) for frame, T in posed]
+
+    def _fit(self, gaussians: Gaussians, trajectory: Trajectory, passes: int, progress: Progress) -> Gaussians:
+        """Fitted to the trajectory's keyframes, ``passes`` times each."""
+        options = self.fit_options
+        if passes == 0 or not len(gaussians):
+            return gaussians
+        made = fitting.fitted(gaussians, self.views(trajectory), self.rasterizer, options, passes, progress.advance)
+        if options.means == "free":
+            made = anchors.anchored_where_they_are(made, self.trajectory().T_world_keyframe)
+        return made
+
+    def build_features(
+        self, gaussians: Gaussians, encoder: Encoder, progress: Progress | None = None
+    ) -> NDArray[np.float16]:
+        """Layer 3: (N, D) unit features of the Gaussians, fused over the keyframes that see them."""
+        trajectory = self.trajectory()
+        options: lifting.Options = options_of(lifting, config.options(self.settings, "language"))
+        keyframes = self.mapped(trajectory)
+        return lifting.lift(gaussians, keyframes, trajectory.T_world_keyframe, encoder, options, progress)
+
+    def build_occupancy(
+        self, gaussians: Gaussians, features: NDArray[np.float16], progress: Progress | None = None
+    ) -> Occupancy:
+        """Layer 4: voxels with probabilities, evidence, features and colours."""
+        progress = progress or Progress()
+        trajectory = self.trajectory()
+        carving: carve.Options = options_of(carve, self.settings["carving"])
+        progress.stage("occupancy", len(self.frames_used(trajectory, carving.every)))
+        return build.build_occupancy(
+            gaussians,
+            features,
+            self.posed(trajectory, carving.every),
+            options_of(splat, self.settings["occupancy"]),
+            carving,
+            progress=progress.advance,
+            least_scale=anchors.least_scale(
+                options_of(anchors, self.settings["gaussians"]),
+                self.cell_size,
+                self.settings["occupancy"]["voxel_size"],
+            ),
+        )
+
+    def refine_occupancy(
+        self,
+        occupancy: Occupancy,
+        gaussians: Gaussians,
+        features: NDArray[np.float16],
+        encoder: Encoder,
+        progress: Progress | None = None,
+    ) -> Occupancy:
+        """Layer 4 with smaller voxels where they show more, if the configuration asks for them."""
+        finest = self.settings["occupancy"]["finest"]
+        if finest is None:
+            return occupancy
+        trajectory, progress = self.trajectory(), progress or Progress()
+        return adaptive_voxels.adaptive(
+            occupancy,
+            gaussians,
+            features,
+            lambda: self.posed(trajectory, 0),
+            trajectory.T_world_keyframe,
+            lambda more: self.build_features(more, encoder, progress),
+            self.settings,
+            finest,
+            progress,
+        )
