@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError
 from ..core.types import UNKNOWN
-from .ground_truth import GroundTruth
 from .restricted_unpickler import load_pickle, short
 from .scored_classes import EMBODIEDOCC
+from .true_occupancy import GroundTruth
 
 EMBODIEDOCC_CLASSES = ("free", *EMBODIEDOCC)
 """Names of the labels 0 … 11 of Occ-ScanNet and EmbodiedOcc-ScanNet."""

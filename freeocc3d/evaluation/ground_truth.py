@@ -1,9 +1,8 @@
-"""The truth about a scene: a labelled voxel grid with what was observed of it, and its file."""
+"""Files of ground truth: ``ground_truth.npz``, and the packages that data sets publish."""
 
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,42 +13,8 @@ from ..core.atomic_files import write_whole
 from ..core.errors import FreeOccError, MapError
 from ..core.types import UNKNOWN
 from ..storage.store import read_arrays
-
-
-@dataclass(frozen=True)
-class GroundTruth:
-    """True occupancy of a scene, ``ground_truth.npz``.
-
-    labels: (X, Y, Z) uint8, 0 free, k = ``classes[k]``, 255 not observed.
-    origin: (3,) float64 lower corner of voxel (0, 0, 0) in the frame of the true poses, metres.
-    voxel_size: edge of a voxel, metres.  classes: names of the labels; ``classes[0]`` is not used.
-    frames_mask: (X, Y, Z) bool, the union of the frames' own masks, where the data set has such masks.
-    """
-
-    labels: NDArray[np.uint8]
-    origin: NDArray[np.float64]
-    voxel_size: float
-    classes: tuple[str, ...]
-    frames_mask: NDArray[np.bool_] | None = None
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Voxels along x, y and z."""
-        x, y, z = self.labels.shape
-        return x, y, z
-
-    def centers(self) -> NDArray[np.float64]:
-        """(X, Y, Z, 3) voxel centres in the frame of the true poses, metres."""
-        return self.origin + (np.moveaxis(np.indices(self.shape), 0, -1) + 0.5) * self.voxel_size
-
-    def masks(self) -> dict[str, NDArray[np.bool_]]:
-        """What may be scored, (X, Y, Z) bool each: "label", where the truth is known (label != 255), and, where the
-        data set has masks of its frames, "frames", the known voxels of their union.
-
-        EmbodiedOcc scores the second, FreeOcc's release the first.
-        """
-        known = self.labels != UNKNOWN
-        return {"label": known} | ({} if self.frames_mask is None else {"frames": known & self.frames_mask})
+from .embodiedocc import load_global_package
+from .true_occupancy import GroundTruth
 
 
 def load_ground_truth(path: str | Path, classes: tuple[str, ...] | None = None) -> GroundTruth:
@@ -61,8 +26,6 @@ def load_ground_truth(path: str | Path, classes: tuple[str, ...] | None = None) 
     """
     path = Path(path)
     if path.suffix == ".pkl":
-        from .embodiedocc import load_global_package
-
         return load_global_package(path, classes)
     arrays = read_grid_arrays(path)
     labels = array(arrays, "labels", path)

@@ -27,8 +27,9 @@ from ..settings.config import Config
 from ..storage.store import Map
 from ..tracking.trajectory_alignment import Alignment, Poses
 from .confusion import Prediction
-from .ground_truth import GroundTruth, array, placed, read_grid_arrays
+from .ground_truth import array, placed, read_grid_arrays
 from .scored_classes import ClassMap
+from .true_occupancy import GroundTruth
 
 _SAME_SIZE, _SAME_LATTICE = 1e-4, 1e-3
 

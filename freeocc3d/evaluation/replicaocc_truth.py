@@ -32,7 +32,7 @@ from ..core.types import FREE, UNKNOWN, Frame
 from ..settings import config, registry
 from ..settings.registry import require_positive
 from . import scored_classes as taxonomy
-from .ground_truth import GroundTruth
+from .true_occupancy import GroundTruth
 
 _LARGEST_GRID = 1 << 29
 _ROWS_BEFORE_MERGE = 4_000_000

@@ -22,7 +22,7 @@ import yaml
 
 from ..core.errors import FreeOccError
 from ..core.types import UNKNOWN
-from .ground_truth import GroundTruth
+from .true_occupancy import GroundTruth
 
 EMBODIEDOCC = (
     "ceiling", "floor", "wall", "window", "chair", "bed", "sofa", "table", "tvs", "furniture", "objects",

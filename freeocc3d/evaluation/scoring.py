@@ -30,9 +30,10 @@ from ..tracking.trajectory_alignment import Alignment, Poses, align, estimated_p
 from . import predictions
 from .confusion import Prediction, Scores, confusion
 from .embodiedocc import find_package, read_split
-from .ground_truth import GroundTruth, load_ground_truth
+from .ground_truth import load_ground_truth
 from .scored_classes import EMBODIEDOCC, SHARED, ClassMap, identity, load_class_map
 from .trajectory_errors import TrajectoryErrors, trajectory_errors
+from .true_occupancy import GroundTruth
 
 PRIMARY_MASK = "label"
 TOP = (10, 20, 30, 40)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numba import njit, prange
@@ -22,9 +22,6 @@ from numpy.typing import NDArray
 
 from ..core.transforms import invert, quats_to_rotations
 from ..core.types import Frame, Gaussians
-
-if TYPE_CHECKING:
-    from .lifting import Options
 
 _MIN_COSINE = np.float32(0.05)
 """Of a view along the surface, and of one next to a depth edge, where pixels mix both sides."""
@@ -36,6 +33,23 @@ _NEAR = np.float32(0.05)
 """Metres, from where Gaussians are rendered."""
 _WIDEST = 16
 """Blocks, to either side, that one Gaussian covers at most."""
+
+
+class SightLimits(Protocol):
+    """The options of layer 3 by which a frame shows a Gaussian, and shows it well: ``lifting.Options`` says what each
+    means."""
+
+    @property
+    def visible_within(self) -> float: ...
+
+    @property
+    def visible_share(self) -> float: ...
+
+    @property
+    def near(self) -> float: ...
+
+    @property
+    def border(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -58,7 +72,7 @@ class Seen:
         return np.asarray(row * h // height * w + column * w // width, np.int32)
 
 
-def seen(gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: Options) -> Seen:
+def seen(gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: SightLimits) -> Seen:
     """What a frame shows of N Gaussians."""
     camera, depth_m = frame.intrinsics, frame.depth_m
     pinhole = np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32)
@@ -75,7 +89,7 @@ def seen(gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], o
 
 
 def seen_reference(
-    gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: Options
+    gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: SightLimits
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(N,) pixels and (N,) weights, 0 for what is not seen: plain NumPy, all Gaussians at once."""
     camera, depth_m = frame.intrinsics, frame.depth_m

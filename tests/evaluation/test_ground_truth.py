@@ -8,7 +8,8 @@ import pytest
 from helpers import data_folder
 
 from freeocc3d.core.errors import ExportError, FreeOccError
-from freeocc3d.evaluation.ground_truth import GroundTruth, load_ground_truth, save_ground_truth
+from freeocc3d.evaluation.ground_truth import load_ground_truth, save_ground_truth
+from freeocc3d.evaluation.true_occupancy import GroundTruth
 
 
 def truth(**changes: Any) -> dict[str, Any]:

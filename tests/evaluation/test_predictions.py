@@ -14,8 +14,9 @@ from freeocc3d.core.transforms import quats_to_rotations, rotations_to_quats
 from freeocc3d.core.types import Gaussians, PosedFrame
 from freeocc3d.evaluation import predictions, scoring
 from freeocc3d.evaluation.confusion import Prediction
-from freeocc3d.evaluation.ground_truth import GroundTruth, save_ground_truth
+from freeocc3d.evaluation.ground_truth import save_ground_truth
 from freeocc3d.evaluation.scored_classes import ClassMap, identity
+from freeocc3d.evaluation.true_occupancy import GroundTruth
 from freeocc3d.occupancy import carve, splat_reference
 from freeocc3d.occupancy.splat import Options
 from freeocc3d.settings import config

@@ -13,7 +13,8 @@ from freeocc3d.capture.base import Capture, Options
 from freeocc3d.core.errors import ConfigError, FreeOccError
 from freeocc3d.core.types import Frame
 from freeocc3d.evaluation import replicaocc_truth
-from freeocc3d.evaluation.ground_truth import GroundTruth, load_ground_truth
+from freeocc3d.evaluation.ground_truth import load_ground_truth
+from freeocc3d.evaluation.true_occupancy import GroundTruth
 
 
 class Corner(Capture):

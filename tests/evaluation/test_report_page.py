@@ -13,9 +13,9 @@ import pytest
 from freeocc3d.core.errors import DependencyError, ExportError
 from freeocc3d.evaluation import report_page
 from freeocc3d.evaluation.confusion import Prediction
-from freeocc3d.evaluation.ground_truth import GroundTruth
 from freeocc3d.evaluation.scoring import Evaluation, Scene
 from freeocc3d.evaluation.trajectory_errors import trajectory_errors
+from freeocc3d.evaluation.true_occupancy import GroundTruth
 from freeocc3d.tracking.trajectory_alignment import Alignment, Poses
 from freeocc3d.viewer.palette import class_colors
 

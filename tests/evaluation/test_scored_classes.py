@@ -7,8 +7,9 @@ import pytest
 from helpers import data_folder
 
 from freeocc3d.core.errors import FreeOccError
-from freeocc3d.evaluation.ground_truth import GroundTruth, load_ground_truth
+from freeocc3d.evaluation.ground_truth import load_ground_truth
 from freeocc3d.evaluation.scored_classes import EMBODIEDOCC, SHARED, identity, load_class_map
+from freeocc3d.evaluation.true_occupancy import GroundTruth
 
 EXAMPLE = Path(__file__).parents[2] / "configs" / "classes" / "house_to_embodiedocc.yaml"
 

@@ -13,9 +13,10 @@ from test_main import refused, run
 import freeocc3d
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.evaluation.confusion import Prediction
-from freeocc3d.evaluation.ground_truth import GroundTruth, load_ground_truth, save_ground_truth
+from freeocc3d.evaluation.ground_truth import load_ground_truth, save_ground_truth
 from freeocc3d.evaluation.scored_classes import identity
 from freeocc3d.evaluation.scoring import Asked, Evaluation, Scene, evaluate
+from freeocc3d.evaluation.true_occupancy import GroundTruth
 from freeocc3d.tracking.trajectory_alignment import Alignment
 
 CLASSES = Path(__file__).parents[2] / "configs" / "classes" / "house_to_embodiedocc.yaml"
