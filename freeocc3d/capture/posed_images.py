@@ -17,7 +17,7 @@ from ..core.types import Frame
 from .base import NOMINAL_DEPTH, Capture, Options
 from .camera_files import given, seen_at
 from .image_files import metres, read_color, read_depth
-from .undistortion import Lens, Rectified
+from .lenses import Lens, Rectified
 
 UNITS_PER_METRE = 1000.0
 """Of stored depth, unless ``capture.depth_scale`` says otherwise."""

@@ -14,7 +14,6 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from ..core import tum_files
 from ..core.errors import CaptureError
 from ..core.transforms import invert, is_rigid
 from .base import Capture
+from .colmap_models import colmap_folder, read_colmap_model
 
 SAME_TIME_S = 0.02
 """Poses whose timestamps differ by no more belong together: the tolerance of the TUM RGB-D benchmark."""
@@ -162,29 +162,6 @@ def _read_nerfstudio(path: Path) -> PoseFile:
     T = np.array([frame["transform_matrix"] for frame in frames], np.float64).reshape(-1, 4, 4)
     T[:, :, 1:3] *= -1  # OpenGL's camera looks along -z with y up
     return PoseFile(path, T, names=tuple(Path(frame["file_path"]).name for frame in frames))
-
-
-def colmap_folder(folder: Path) -> Path | None:
-    """Where the COLMAP model of a folder lies, if it has one."""
-    models = (folder, folder / "sparse" / "0", folder / "sparse", folder / "0")
-    return next((m for m in models if any((m / name).is_file() for name in ("images.bin", "images.txt"))), None)
-
-
-def read_colmap_model(folder: Path) -> Any:
-    """The ``pycolmap.Reconstruction`` in a folder. Raises CaptureError."""
-    import pycolmap
-
-    model = pycolmap.Reconstruction()
-    try:
-        if (folder / "images.bin").is_file():
-            model.read_binary(str(folder))
-        else:
-            model.read_text(str(folder))
-    except (RuntimeError, ValueError, OSError) as error:
-        raise CaptureError(
-            f"{folder} is no COLMAP model: it needs cameras, images and points3D, all .txt or all .bin."
-        ) from error
-    return model
 
 
 def _read_colmap(folder: Path) -> PoseFile:

@@ -10,8 +10,8 @@ import pycolmap
 import pytest
 from photographs import Photographs, turning, walk
 
-from freeocc3d.capture.undistortion import Lens
-from freeocc3d.core.errors import ConfigError, TrackingError
+from freeocc3d.capture.lenses import Lens
+from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, TrackingError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.transforms import umeyama
 from freeocc3d.core.types import Intrinsics
@@ -281,24 +281,36 @@ def test_an_existing_model_is_read(text: bool, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sort(found.depths()), [4] * 9 + [5] * 3, atol=1e-5)
 
 
+def test_a_model_of_a_fisheye_is_read_and_its_lens_kept(tmp_path: Path) -> None:
+    images, true, own = walk(4)
+    camera = pycolmap.Camera.create_from_model_name(1, "OPENCV_FISHEYE", 250.0, own.width, own.height)
+    camera.params = [250.0, 251.0, 160.0, 120.0, 0.02, -0.01, 0.0, 0.0]
+    model_of(true, camera, [f"photo_00{i}.jpg" for i in range(4)]).write_binary(str(tmp_path))
+    found = colmap_reconstruction.read_model(tmp_path, Photographs(images, own))
+    assert found.lens == Lens(Intrinsics(own.width, own.height, 250.0, 251.0, 159.5, 119.5), (0.02, -0.01, 0, 0), True)
+    found.save(tmp_path / "found.npz")
+    assert Reconstruction.load(tmp_path / "found.npz").lens == found.lens
+
+
 def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     images, true, own = walk(4)
     capture = Photographs(images, own)
-    with pytest.raises(TrackingError, match="no COLMAP model"):
+    with pytest.raises(CaptureError, match="no COLMAP model"):
         colmap_reconstruction.read_model(tmp_path, capture)
-    (tmp_path / "cameras.bin").write_bytes(b"\x05")
-    with pytest.raises(TrackingError, match=r"cannot be read"):
+    for name in ("cameras.bin", "images.bin"):
+        (tmp_path / name).write_bytes(b"\x05")
+    with pytest.raises(CaptureError, match="is no COLMAP model"):
         colmap_reconstruction.read_model(tmp_path, capture)
     for number, (kind, size, name, sentence) in enumerate(
         [
             ("PINHOLE", (320, 240), "other_000.jpg", "belongs to a frame"),
             ("PINHOLE", (640, 480), "photo_000.jpg", "640 x 480"),
-            ("OPENCV_FISHEYE", (320, 240), "photo_000.jpg", "OPENCV_FISHEYE, which is not understood"),
+            ("FOV", (320, 240), "photo_000.jpg", "FOV, which is not read"),
         ]
     ):
         folder = tmp_path / str(number)
         folder.mkdir()
         camera = pycolmap.Camera.create_from_model_name(1, kind, 250.0, *size)
         model_of(true[:1], camera, [name]).write_binary(str(folder))
-        with pytest.raises(TrackingError, match=sentence):
+        with pytest.raises(FreeOccError, match=sentence):
             colmap_reconstruction.read_model(folder, capture)

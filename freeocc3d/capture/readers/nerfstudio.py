@@ -17,18 +17,17 @@ from ...core.errors import CaptureError
 from ...core.types import Intrinsics
 from ..base import Options
 from ..camera_files import Calibration, read_json
+from ..lenses import BROWN_MODELS, PINHOLE_MODELS, Lens, lens_of
 from ..posed_images import PosedImage, PosedImages, inside, nominal_scale
 from ..trajectory_files import read_trajectory
-from ..undistortion import Lens
 from .photos import natural, read_header
 
 REQUIRES: tuple[str, ...] = ()
 
 TRANSFORMS = "transforms.json"
 
-_MODELS = {"OPENCV": False, "PINHOLE": False, "SIMPLE_PINHOLE": False, "SIMPLE_RADIAL": False, "RADIAL": False,
-           "OPENCV_FISHEYE": True}  # fmt: skip
-"""Whether a camera model is a fisheye's."""
+_WITH_ALL_COEFFICIENTS = (*PINHOLE_MODELS, *BROWN_MODELS)
+"""nerfstudio applies whatever coefficients a file states, whatever it calls the model."""
 
 
 class Reader(PosedImages):
@@ -79,9 +78,8 @@ def _read_points(file: Path) -> NDArray[np.float64]:
 
 def _lens(stated: Mapping[str, Any], image: Path, file: Path) -> Lens:
     """Raises CaptureError."""
-    model = str(stated.get("camera_model", "OPENCV")).upper()
-    if model not in _MODELS:
-        raise CaptureError(f"{file} states the camera model {model}, which is not read: {', '.join(_MODELS)} are.")
+    model = "OPENCV_FISHEYE" if stated.get("is_fisheye") else str(stated.get("camera_model", "OPENCV")).upper()
+    model = "OPENCV" if model in _WITH_ALL_COEFFICIENTS else model
     try:
         width, height = int(stated.get("w", 0)), int(stated.get("h", 0))
         if min(width, height) <= 0:
@@ -92,14 +90,11 @@ def _lens(stated: Mapping[str, Any], image: Path, file: Path) -> Lens:
         fx = float(stated.get("fl_x") or 0.5 * width / math.tan(0.5 * float(stated["camera_angle_x"])))
         fy = float(stated.get("fl_y") or fx)
         cx, cy = float(stated.get("cx", width / 2)), float(stated.get("cy", height / 2))
-        k1, k2, k3, k4, p1, p2 = (float(stated.get(name, 0.0)) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+        names = ("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "k3", "k4", "p1", "p2")
+        coefficients = {name: float(stated.get(name, 0.0)) for name in names}
     except KeyError as error:
         raise CaptureError(f"{file} states no focal length: it needs fl_x, or camera_angle_x.") from error
     except (TypeError, ValueError, ZeroDivisionError) as error:
         raise CaptureError(f"{file} holds intrinsics that are no numbers: correct it.") from error
     camera: Intrinsics = Calibration((fx, fy, cx - 0.5, cy - 0.5), (width, height), str(file)).camera((width, height))
-    if _MODELS[model] or stated.get("is_fisheye"):
-        return Lens(camera, (k1, k2, k3, k4), fisheye=True)
-    if k4:
-        raise CaptureError(f"{file} states k4 of the model {model}, which is not read: undistort the images first.")
-    return Lens(camera, (k1, k2, p1, p2, k3))
+    return lens_of(model, camera, coefficients, str(file))

@@ -1,4 +1,4 @@
-"""COLMAP's models, read or just made, as plain data."""
+"""COLMAP's models, read or just made, as reconstructions of a capture's frames."""
 
 from __future__ import annotations
 
@@ -10,26 +10,23 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
-from ...capture.undistortion import Lens
-from ...core.errors import TrackingError
+from ...capture.colmap_models import colmap_folder, colmap_lens, read_colmap_model
+from ...capture.lenses import Lens
+from ...core.errors import CaptureError, TrackingError
 from ...core.types import Intrinsics
 from .reconstruction import Reconstruction
-
-_READABLE = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV"
 
 
 def read_model(folder: Path, capture: Capture) -> Reconstruction:
     """The COLMAP model of a folder (cameras, images and points3D, .bin or .txt) as that of the capture's frames, which
-    are known by their names, or by these without their endings. Its scale is unknown. Raises TrackingError."""
-    if not any((folder / f"cameras{ending}").is_file() for ending in (".bin", ".txt")):
-        raise TrackingError(
+    are known by their names, or by these without their endings. Its scale is unknown. Raises CaptureError for what
+    cannot be read, TrackingError for a model of other images."""
+    own_folder = colmap_folder(folder)
+    if own_folder is None:
+        raise CaptureError(
             f"{folder} holds no COLMAP model (tracking.colmap.model): expected cameras, images, points3D."
         )
-    try:
-        model = pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError, IndexError, MemoryError) as error:
-        said = " ".join(str(error).split())[:160].rstrip(".")
-        raise TrackingError(f"The COLMAP model in {folder} cannot be read: {said}.") from error
+    model = read_colmap_model(own_folder)
     names = [capture.name(index) for index in range(len(capture))]
     whole = {PurePath(name).name: index for index, name in enumerate(names) if name}
     stems = {PurePath(name).stem: index for index, name in enumerate(names) if name}
@@ -38,7 +35,7 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
         own = PurePath(name)
         return whole.get(own.name, stems.get(own.stem))
 
-    found = reconstruction_of(model, len(capture), frame_of)
+    found = reconstruction_of(model, len(capture), frame_of, str(folder))
     if not found.has_pose.any():
         first = next((image.name for image in model.images.values()), "no image")
         raise TrackingError(
@@ -58,11 +55,12 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
 
 
 def reconstruction_of(
-    model: pycolmap.Reconstruction, frames: int, frame_of: Callable[[str], int | None]
+    model: pycolmap.Reconstruction, frames: int, frame_of: Callable[[str], int | None], source: str
 ) -> Reconstruction:
     """A model as that of a capture of N ``frames``; ``frame_of`` tells which one an image shows by its name.
 
-    Raises TrackingError for several cameras or one that OpenCV's model does not express.
+    source: where the model is from, for messages. Raises TrackingError for several cameras, CaptureError for a camera
+    model that is not read.
     """
     T_world_cam = np.full((frames, 4, 4), np.nan)
     seen_frame, seen_id, cameras = [], [], set()
@@ -76,7 +74,7 @@ def reconstruction_of(
         seen_id.append(np.array(ids, np.uint64))
         seen_frame.append(np.full(len(ids), frame, np.int32))
         cameras.add(image.camera_id)
-    lenses = {lens_of(model.cameras[camera]) for camera in cameras} or {_NO_LENS}
+    lenses = {colmap_lens(model.cameras[camera], source) for camera in cameras} or {_NO_LENS}
     if len(lenses) > 1:
         raise TrackingError(
             f"The model has {len(lenses)} cameras, but a capture has one: make it with one shared camera "
@@ -95,31 +93,6 @@ def reconstruction_of(
         apart=np.zeros(frames, bool),
         chosen=np.ones(frames, bool),
     )
-
-
-def lens_of(camera: pycolmap.Camera) -> Lens:
-    """COLMAP's camera in OpenCV's model. Raises TrackingError if that does not express it."""
-    extra = dict(zip(_names(camera), camera.params.tolist(), strict=True))
-    if camera.model_name == "FULL_OPENCV" and not any(extra[name] for name in ("k3", "k4", "k5", "k6")):
-        model = "OPENCV"
-    else:
-        model = camera.model_name
-    if model not in _READABLE:
-        raise TrackingError(
-            f"The model's camera is {camera.model_name}, which is not understood: make it with {_READABLE}, or "
-            "undistort its images (COLMAP: image_undistorter)."
-        )
-    radial = extra.get("k1", extra.get("k", 0.0))
-    intrinsics = Intrinsics(
-        camera.width, camera.height, camera.focal_length_x if "fx" in extra else camera.focal_length,
-        camera.focal_length_y if "fy" in extra else camera.focal_length,
-        camera.principal_point_x - 0.5, camera.principal_point_y - 0.5,
-    )  # fmt: skip
-    return Lens(intrinsics, (radial, *(extra.get(name, 0.0) for name in ("k2", "p1", "p2"))))
-
-
-def _names(camera: pycolmap.Camera) -> list[str]:
-    return [name.strip() for name in camera.params_info.split(",")]
 
 
 _NO_LENS = Lens(Intrinsics(1, 1, 1.0, 1.0, 0.0, 0.0))

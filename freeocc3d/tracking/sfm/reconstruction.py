@@ -11,14 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import NOMINAL_DEPTH
-from ...capture.undistortion import Lens, Rectified
+from ...capture.lenses import Lens, Rectified
 from ...core.arrays import read_arrays, write_arrays
 from ...core.types import Intrinsics
 
 _EXPECTED = {
     "T_world_cam": ("f", 3), "camera": ("f", 1), "points": ("f", 2), "seen_frame": ("i", 1), "seen_point": ("i", 1),
-    "metric": ("b", 0), "apart": ("b", 1), "chosen": ("b", 1), "warnings": ("U", 1),
+    "fisheye": ("b", 0), "metric": ("b", 0), "apart": ("b", 1), "chosen": ("b", 1), "warnings": ("U", 1),
 }  # fmt: skip
+
+_OF_LENS = ("camera", "fisheye")
 
 
 @dataclass(frozen=True)
@@ -73,15 +75,15 @@ class Reconstruction:
         """As an .npz file that is whole or not there."""
         camera = self.lens.camera
         numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *self.lens.distortion)
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in _EXPECTED if name not in ("camera", "warnings")}
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _EXPECTED if name not in _OF_LENS}
         arrays["warnings"] = np.array(self.warnings, "U")
-        write_arrays(path, {**arrays, "camera": np.array(numbers)})
+        write_arrays(path, {**arrays, "camera": np.array(numbers), "fisheye": np.bool_(self.lens.fisheye)})
 
     @classmethod
     def load(cls, path: Path) -> Reconstruction:
         """The inverse of ``save``. Raises MapError for a damaged file."""
         arrays = read_arrays(path, _EXPECTED)
         width, height, fx, fy, cx, cy, *distortion = arrays.pop("camera").tolist()
-        lens = Lens(Intrinsics(int(width), int(height), fx, fy, cx, cy), tuple(distortion))
+        lens = Lens(Intrinsics(int(width), int(height), fx, fy, cx, cy), tuple(distortion), bool(arrays.pop("fisheye")))
         metric, warnings = bool(arrays.pop("metric")), tuple(arrays.pop("warnings").tolist())
         return cls(lens=lens, metric=metric, warnings=warnings, **arrays)

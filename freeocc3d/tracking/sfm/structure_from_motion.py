@@ -81,7 +81,7 @@ def reconstruct(
     progress.stage("adjustment")
     model = mapping.adjusted(models[0], recipe.intrinsics == "fixed", distorts=not capture.intrinsics_known)
     frame_of = {image_name(index): index for index in found}
-    result = reconstruction_of(model, len(capture), frame_of.get).normalised()
+    result = reconstruction_of(model, len(capture), frame_of.get, what).normalised()
     apart, pieces = _apart(models, result.has_pose)
     if pieces:
         warnings.append(
