@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from freeocc3d.core.transforms import invert
 from freeocc3d.core.types import Intrinsics
-from freeocc3d.depth.multi_view_stereo import View
+from freeocc3d.depth.multi_view_stereo import StereoView
 
 CAMERA = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
 
@@ -41,7 +41,7 @@ class Rectangle:
 
 def render(
     rectangles: Sequence[Rectangle], T_world_cam: NDArray[np.float64], camera: Intrinsics = CAMERA, noise: float = 1.0
-) -> tuple[View, NDArray[np.float32]]:
+) -> tuple[StereoView, NDArray[np.float32]]:
     """The view, with ``noise`` of that many grey levels, and its true depth, 0 = nothing hit."""
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack(((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)), axis=-1)
@@ -53,7 +53,7 @@ def render(
     rng = np.random.default_rng(int(1e6 * abs(T_world_cam[0, 3])) + 1)
     grey = np.clip(np.where(np.isfinite(depth), grey, 128.0) + noise * rng.normal(size=grey.shape), 0, 255)
     color = np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
-    return View(color, camera, T_world_cam), np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
+    return StereoView(color, camera, T_world_cam), np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
 
 
 def looking(x: float, y: float = 0.0, z: float = 0.0, towards: float = 2.0) -> NDArray[np.float64]:

@@ -49,9 +49,9 @@ SEGMENTER = {
 
 def absent_names(names: list[str], present: list[str]) -> list[str]:
     """The names that name nothing of what is present, in alphabetical order."""
-    from freeocc3d.language.synonyms import matching_names
+    from freeocc3d.language.synonyms import match_names
 
-    return sorted({name for name in names if not matching_names(name, present)[0]})
+    return sorted({name for name in names if not match_names(name, present)[0]})
 
 
 def spread(names: list[str]) -> list[str]:

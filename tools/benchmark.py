@@ -148,22 +148,22 @@ def score_map(map: str, capture: str, out: str) -> Figures:
     all frames in ``out``."""
     from freeocc3d.evaluation import scoring
     from freeocc3d.evaluation.ground_truth import load_ground_truth
-    from freeocc3d.evaluation.trajectory_errors import trajectory_errors
+    from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors
     from freeocc3d.storage.store import load_map
-    from freeocc3d.tracking.trajectory_alignment import align, estimated_poses, true_poses
+    from freeocc3d.tracking.trajectory_alignment import align_trajectories, read_true_poses, select_estimated_poses
 
     loaded = load_map(map)
-    estimated, true = estimated_poses(loaded.trajectory), true_poses(scoring.capture_of(loaded))
+    estimated, true = select_estimated_poses(loaded.trajectory), read_true_poses(scoring.reopen_capture(loaded))
     how = "se3" if loaded.metric else "sim3"
-    alignment = align(estimated, true, how)
-    errors = trajectory_errors(estimated, true, alignment)
+    alignment = align_trajectories(estimated, true, how)
+    errors = measure_trajectory_errors(estimated, true, alignment)
     _save_poses(Path(out), alignment.poses(loaded.trajectory.T_world_cam), errors, loaded.up @ alignment.rotation.T)
     figures: Figures = {"ate_rmse_m": errors.ate_rmse_m, "trajectory": errors.to_json()}
     figures["held_out"] = held_out.held_out(loaded)
     truth_path = Path(capture) / "ground_truth.npz"
     if truth_path.is_file():
         truth = load_ground_truth(truth_path)
-        classes = scoring.common_classes([truth])
+        classes = scoring.collect_common_classes([truth])
         scene = scoring.score_map(loaded, truth, classes, true, how)
         scored = scoring.Evaluation((scene,), classes.classes, how)
         figures |= _scores(scored.scores, scored.miou(), scored.classes_in_miou)
@@ -202,16 +202,16 @@ def dense_slam(capture: str, frames: int | None, out: str) -> Figures:
     import peers
 
     from freeocc3d.capture import open_capture
-    from freeocc3d.evaluation.trajectory_errors import trajectory_errors
-    from freeocc3d.tracking.trajectory_alignment import Poses, align, true_poses
+    from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors
+    from freeocc3d.tracking.trajectory_alignment import Poses, align_trajectories, read_true_poses
 
     opened = open_capture(capture)
     used = range(len(opened))[:frames]
     T_world_cam, seconds, failures = peers.dense_slam(opened, used)
     has_pose = np.isfinite(T_world_cam).all(axis=(1, 2))
-    estimated, true = Poses(opened.timestamps[has_pose], T_world_cam[has_pose]), true_poses(opened)
-    alignment = align(estimated, true)
-    errors = trajectory_errors(estimated, true, alignment)
+    estimated, true = Poses(opened.timestamps[has_pose], T_world_cam[has_pose]), read_true_poses(opened)
+    alignment = align_trajectories(estimated, true)
+    errors = measure_trajectory_errors(estimated, true, alignment)
     first = T_world_cam[np.flatnonzero(has_pose)[0]]
     _save_poses(Path(out), alignment.poses(T_world_cam), errors, alignment.rotation @ -first[:3, 1])
     return {
@@ -263,13 +263,13 @@ def occupancy(kind: str, capture: str, frames: int | None, poses: str | None, tr
     import peers
 
     from freeocc3d.capture import open_capture
-    from freeocc3d.evaluation.confusion import Prediction, Scores, confusion
+    from freeocc3d.evaluation.confusion import Prediction, Scores, count_confusion
     from freeocc3d.evaluation.ground_truth import load_ground_truth
-    from freeocc3d.tracking.trajectory_alignment import true_poses
+    from freeocc3d.tracking.trajectory_alignment import read_true_poses
 
     opened, expected = open_capture(capture), load_ground_truth(truth)
     if poses is None:
-        stated = true_poses(opened)
+        stated = read_true_poses(opened)
         T_true_cam = np.full((len(opened), 4, 4), np.nan)
         T_true_cam[np.searchsorted(opened.timestamps, stated.timestamps)] = stated.T_world_cam
     else:
@@ -285,7 +285,7 @@ def occupancy(kind: str, capture: str, frames: int | None, poses: str | None, tr
         run = {"back_projection": peers.back_projected_occupied, "octomap": peers.octomap_occupied}[kind]
         occupied, seconds = run(opened, T_true_cam, lattice)
     names = expected.classes[1:]
-    matrix = confusion(expected.labels, Prediction(occupied), expected.masks()["label"], len(names))
+    matrix = count_confusion(expected.labels, Prediction(occupied), expected.masks()["label"], len(names))
     return {**figures, **_scores(Scores(matrix, names), None, ()), "seconds": seconds, "frames": len(used)}
 
 

@@ -46,7 +46,7 @@ def measure_encoders() -> Figures:
         for precision in get_args(model_packages.Precision):
             path = Path(folder) / precision
             write_package(checkpoint, path, precision, "random weights", "none", precision)
-            package = model_packages.read(path)
+            package = model_packages.read_package(path)
             encoder = clip.load(clip.Options(model=str(path)))
             text = TextNetwork(package)
             patches, words = encoder.patches(rgb), text.embed(list(WORDS))
@@ -94,26 +94,26 @@ def measure_edges() -> Figures:
     import numpy as np
 
     from freeocc3d.capture import open_capture
-    from freeocc3d.language.guided_upsampling import upsample
-    from freeocc3d.language.patch_features import resampled, unit
+    from freeocc3d.language.guided_upsampling import upsample_features
+    from freeocc3d.language.patch_features import normalize_patches, resample_patches
 
     capture = open_capture("builtin:room")
-    names = unit(np.random.default_rng(0).normal(size=(len(capture.classes), 64)).astype(np.float32))
+    names = normalize_patches(np.random.default_rng(0).normal(size=(len(capture.classes), 64)).astype(np.float32))
     right: dict[str, list[float]] = {"nearest": [], "linear": [], "guided": []}
     for index in range(10, len(capture), 40):
         labels = capture.labels(index)
         assert labels is not None
         (height, width), window = labels.shape, 2 * _EDGE_PIXELS + 1
         blocks = names[labels].reshape(height // PATCH, PATCH, width // PATCH, PATCH, -1)
-        patches = unit(blocks.mean(axis=(1, 3)))
+        patches = normalize_patches(blocks.mean(axis=(1, 3)))
         edges = (cv2.Laplacian(labels.astype(np.float32), cv2.CV_32F) != 0).astype(np.uint8)
         near = cv2.dilate(edges, np.ones((window, window)))[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE] > 0
         true = labels[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE]
         share = PATCH // _STRIDE
         found = {
             "nearest": patches.repeat(share, axis=0).repeat(share, axis=1),
-            "linear": resampled(patches, true.shape),
-            "guided": upsample(patches, capture[index].color, _STRIDE).astype(np.float32),
+            "linear": resample_patches(patches, true.shape),
+            "guided": upsample_features(patches, capture[index].color, _STRIDE).astype(np.float32),
         }
         for way, features in found.items():
             right[way].append(float(((features @ names.T).argmax(axis=-1) == true)[near].mean()))

@@ -116,9 +116,9 @@ def _octomaps_own(made: Any, path: Path) -> bool:
     except ImportError:
         return False
     from freeocc3d.core.types import FREE, OCCUPIED
-    from freeocc3d.export.export_frames import placed
+    from freeocc3d.export.export_frames import place_voxels
 
-    there = placed(made, "gravity", origin=np.zeros(3)).occupancy
+    there = place_voxels(made, "gravity", origin=np.zeros(3)).occupancy
     tree = pyoctomap.OcTree(there.voxel_size)
     for state in (FREE, OCCUPIED):
         for center in there.centers(there.voxels(state)):

@@ -11,16 +11,22 @@ EVERY = 10
 def held_out(loaded: Any) -> dict[str, Any]:
     """PSNR and depth error on every tenth frame that has a pose and is no keyframe, at the map's own poses."""
     from freeocc3d.capture.focal_correction import Reregistered
-    from freeocc3d.evaluation.scoring import capture_of
+    from freeocc3d.evaluation.scoring import reopen_capture
     from freeocc3d.gaussians import fitting, rendered_views
     from freeocc3d.gaussians.rasterizers import cpu
 
-    capture, trajectory = capture_of(loaded), loaded.trajectory
+    capture, trajectory = reopen_capture(loaded), loaded.trajectory
     ratio = loaded.report.get("color_focal", 1.0)
     if ratio != 1:
         capture = Reregistered(capture, ratio)
     keyframes = set(trajectory.keyframes.tolist())
     rows = [n for n in range(0, len(trajectory), EVERY) if trajectory.has_pose[n] and n not in keyframes]
     rasterizer, width = cpu.load(), fitting.Options().width
-    views = [rendered_views.view_of(capture[n], trajectory.T_world_cam[n], width, rasterizer.device) for n in rows]
-    return {"frames": len(rows), **dataclasses.asdict(rendered_views.fidelity(loaded.gaussians, views, rasterizer))}
+    views = [
+        rendered_views.prepare_captured_view(capture[n], trajectory.T_world_cam[n], width, rasterizer.device)
+        for n in rows
+    ]
+    return {
+        "frames": len(rows),
+        **dataclasses.asdict(rendered_views.measure_fidelity(loaded.gaussians, views, rasterizer)),
+    }

@@ -30,7 +30,7 @@ def measure_splat() -> Figures:
         mark = time.perf_counter()
         bins = splat.bin_gaussians(gaussians, origin, options)
         mark = lap(seconds, "sort into blocks", mark)
-        splat.probability(bins, unpack(bins.packed))
+        splat.compute_probability(bins, unpack(bins.packed))
         lap(seconds, "evaluate", mark)
         return bins
 

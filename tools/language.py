@@ -26,12 +26,12 @@ def measure_lifting() -> Figures:
     import numpy as np
 
     from freeocc3d.language.feature_fusion import FeatureFusion
-    from freeocc3d.language.visibility import Seen
+    from freeocc3d.language.visibility import VisibleGaussians
 
     rng = np.random.default_rng(0)
     rows = np.arange(GAUSSIANS, dtype=np.int32)
     pixels = rng.permutation(480 * 640)[:GAUSSIANS].astype(np.int32)
-    seen = Seen(rows, pixels, np.ones(GAUSSIANS, np.float32), (480, 640))
+    seen = VisibleGaussians(rows, pixels, np.ones(GAUSSIANS, np.float32), (480, 640))
     moved = GAUSSIANS * DIMENSION * (2 + 4 + 4)
     found: Figures = {"copy_bytes_per_second": copy_bytes_per_second()}
     for grid in GRIDS:
@@ -54,7 +54,7 @@ def measure_fusion(map_path: Path) -> Figures:
     from freeocc3d.storage.store import load_map
 
     scan_map = load_map(map_path)
-    capture = scoring.capture_of(scan_map)
+    capture = scoring.reopen_capture(scan_map)
     scene = _Scene(scan_map, Path(str(scan_map.manifest["capture"]["path"])) / "ground_truth.npz")
 
     def encoder(kind: str | None, seed: int) -> LabelsEncoder:
@@ -129,7 +129,7 @@ class _Scene:
         settings = config.load(scan_map.path / "config.yaml")
         self.options = registry.build_options(lifting, config.options(settings, "language"))
         self.truth = load_ground_truth(truth_path)
-        self.classes = scoring.common_classes([self.truth])
+        self.classes = scoring.collect_common_classes([self.truth])
         self.words = scan_map.text_encoder.encode_words(list(self.truth.classes[1:]))
         self.gaussians, self.scan_map = scan_map.gaussians, scan_map
         labels = self.truth.labels
@@ -163,13 +163,13 @@ class _Scene:
         import numpy as np
 
         from freeocc3d.language.feature_fusion import FeatureFusion
-        from freeocc3d.language.visibility import seen
+        from freeocc3d.language.visibility import find_visible
 
         count = len(self.gaussians)
         ours = FeatureFusion(count, encoder.dimension, self.options.disagreement)
         mean, last = FeatureFusion(count, encoder.dimension), np.zeros((count, encoder.dimension), np.float16)
         for frame, T, _ in self.keyframes():
-            shown, features = seen(self.gaussians, frame, T, self.options), encoder.encode(frame)
+            shown, features = find_visible(self.gaussians, frame, T, self.options), encoder.encode(frame)
             ours.add(shown, features)
             mean.add(shown, features)
             own = features.reshape(-1, encoder.dimension)[shown.cells(features.shape[:2])]
@@ -185,20 +185,22 @@ class _Scene:
         from freeocc3d.occupancy.voxel_blocks import unpack
         from freeocc3d.query import word_query
 
-        means = splat.posterior_mean(self.bins, unpack(self.bins.packed), self.slots, features)
-        nearest = word_query.nearest_word(build.normalized(means)[self.inside], self.words)
+        means = splat.compute_posterior_mean(self.bins, unpack(self.bins.packed), self.slots, features)
+        nearest = word_query.nearest_word(build.normalize_rows(means)[self.inside], self.words)
         return self.miou((nearest + 1).astype(np.uint8))
 
     def miou(self, labels: Any) -> float:
         import numpy as np
 
-        from freeocc3d.evaluation.confusion import Prediction, Scores, confusion
+        from freeocc3d.evaluation.confusion import Prediction, Scores, count_confusion
 
         predicted, occupied = np.zeros(self.truth.shape, np.uint8), np.zeros(self.truth.shape, bool)
         predicted[self.at], occupied[self.at] = labels, True
         names = self.classes.classes
         scores = Scores(
-            confusion(self.truth.labels, Prediction(occupied, predicted), self.truth.masks()["label"], len(names)),
+            count_confusion(
+                self.truth.labels, Prediction(occupied, predicted), self.truth.masks()["label"], len(names)
+            ),
             names,
         )
         return scores.miou(scores.present)

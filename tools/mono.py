@@ -21,14 +21,14 @@ def measure_mono(capture: str) -> Figures:
 
     from freeocc3d.capture import open_capture
     from freeocc3d.capture.base import Options
-    from freeocc3d.tracking.sfm.structure_from_motion import Recipe, reconstruct
+    from freeocc3d.tracking.sfm.structure_from_motion import Recipe, reconstruct_poses
 
     opened = open_capture(capture, Options(depth=False))
     frames = range(0, len(opened), stride(len(opened)))
     true = np.stack([_or_none(opened.pose(index)) for index in frames])
     with tempfile.TemporaryDirectory() as folder:
         watch = _Watch()
-        found = reconstruct(opened, frames, Path(folder), Recipe(frames=len(frames)), watch)
+        found = reconstruct_poses(opened, frames, Path(folder), Recipe(frames=len(frames)), watch)
         watch.stage("")
         seconds, cpu_seconds = watch.seconds, time.process_time() - watch.began
     lens = found.lens

@@ -38,16 +38,16 @@ def measure_plan(map_path: str, picture: str | None = None) -> Figures:
     from freeocc3d.export import export_map
     from freeocc3d.export.nav2 import Options
     from freeocc3d.storage.store import load_map
-    from freeocc3d.tracking.trajectory_alignment import align, estimated_poses, true_poses
+    from freeocc3d.tracking.trajectory_alignment import align_trajectories, read_true_poses, select_estimated_poses
 
     made = load_map(map_path)
-    capture = scoring.capture_of(made)
+    capture = scoring.reopen_capture(made)
     truth = load_ground_truth(Path(made.manifest["capture"]["path"]) / "ground_truth.npz")
     with tempfile.TemporaryDirectory() as folder:
         export_map(made, "nav2", Path(folder) / "plan.yaml")
         told = yaml.safe_load((Path(folder) / "plan.yaml").read_text())
         plan = cv2.imread(str(Path(folder) / "plan.pgm"), cv2.IMREAD_UNCHANGED)[::-1].T
-    alignment = align(estimated_poses(made.trajectory), true_poses(capture))
+    alignment = align_trajectories(select_estimated_poses(made.trajectory), read_true_poses(capture))
     T_true_map = np.eye(4)
     T_true_map[:3, :3], T_true_map[:3, 3] = alignment.rotation, alignment.translation
     options = Options()
@@ -103,9 +103,9 @@ def agreement(plan: Any, true: Any, measured: Any) -> Figures:
 def _measured(capture: Any, truth: Any) -> Any:
     """(X, Y, Z) bool: the truth's voxels that some frame's depth image reaches, at the true poses."""
     from freeocc3d.core.transforms import invert, transform
-    from freeocc3d.tracking.trajectory_alignment import true_poses
+    from freeocc3d.tracking.trajectory_alignment import read_true_poses
 
-    poses = true_poses(capture)
+    poses = read_true_poses(capture)
     frames = dict(zip(poses.timestamps.tolist(), poses.T_world_cam, strict=True))
     at = np.argwhere(truth.labels != 255)
     centers = truth.origin + (at + 0.5) * truth.voxel_size

@@ -47,7 +47,7 @@ def measure_rasterizer() -> Figures:
     scene = surfaces_in_view(GAUSSIANS, WIDTH, HEIGHT)
     compiled = cpu.load()
     _step(compiled, *surfaces_in_view(1000, 64, 48))  # compiles
-    expected, slow = _timed(reference.Reference(), scene, 1)
+    expected, slow = _timed(reference.ReferenceRasterizer(), scene, 1)
     found, fast = _timed(compiled, scene, 7)
     figures: Figures = {
         "gaussians": GAUSSIANS,
@@ -66,7 +66,7 @@ def _on_cuda(scene: tuple[list[Any], Any, Any]) -> Figures:
 
     arrays, T, camera = scene
     there = [array.cuda() for array in arrays], T.cuda(), camera
-    expected, slow = _timed(reference.Reference("cuda:0"), there, 2)
+    expected, slow = _timed(reference.ReferenceRasterizer("cuda:0"), there, 2)
     found, fast = _timed(gsplat.load(gsplat.Options()), there, 50)
     return {
         "reference_seconds": slow,

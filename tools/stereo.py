@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from freeocc3d.capture import open_capture, used_frames
+from freeocc3d.capture import open_capture, select_frames
 from freeocc3d.capture.base import Capture, Options
-from freeocc3d.capture.depth_registration import Grid
+from freeocc3d.capture.depth_registration import PixelGrid
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import Frame
 from freeocc3d.depth import multi_view_stereo
-from freeocc3d.depth.sparse_points import triangulated
+from freeocc3d.depth.sparse_points import triangulate
 from freeocc3d.tracking.rgbd import focal_calibration
 from freeocc3d.tracking.trackers import known
 
@@ -37,8 +37,8 @@ def measure_stereo(capture: str, frames: int | None = None) -> Figures:
     opened = open_capture(capture)
     stride = 5 if _spacing(opened) < _CLOSE else 3
     opened = open_capture(capture, Options(stride=stride))
-    used = list(used_frames(opened))
-    ratio = focal_calibration.color_focal(opened, used_frames(opened))
+    used = list(select_frames(opened))
+    ratio = focal_calibration.estimate_color_focal(opened, select_frames(opened))
 
     def colour(frame: Frame) -> Frame:
         camera = frame.intrinsics
@@ -49,7 +49,7 @@ def measure_stereo(capture: str, frames: int | None = None) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         depth = multi_view_stereo.StereoDepth(Path(folder), multi_view_stereo.Options())
         started, cpu = time.perf_counter(), time.process_time()
-        scan = triangulated(opened, T_world_cam, used, Progress(), colour)
+        scan = triangulate(opened, T_world_cam, used, Progress(), colour)
         depth.compute(opened, scan, _with_others(compared, used), Progress(), colour)
         done = len(_with_others(compared, used))
         seconds, cpu = (time.perf_counter() - started) / done, (time.process_time() - cpu) / done
@@ -57,7 +57,9 @@ def measure_stereo(capture: str, frames: int | None = None) -> Figures:
         for index in compared:
             frame = opened[index]
             truth = (
-                Grid(frame.intrinsics, colour(frame).intrinsics).depth(frame.depth_m) if ratio != 1 else frame.depth_m
+                PixelGrid(frame.intrinsics, colour(frame).intrinsics).depth(frame.depth_m)
+                if ratio != 1
+                else frame.depth_m
             )
             true += np.count_nonzero(truth)
             found = depth.depth(index)

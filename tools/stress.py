@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from freeocc3d.capture import open_capture, used_frames
+from freeocc3d.capture import open_capture, select_frames
 from freeocc3d.capture.base import Capture, Options
 from freeocc3d.capture.focal_correction import Reregistered
 from freeocc3d.capture.read_ahead import read_ahead
 from freeocc3d.core.types import Frame, Trajectory
-from freeocc3d.evaluation.trajectory_errors import trajectory_errors
+from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors
 from freeocc3d.tracking.rgbd import focal_calibration
 from freeocc3d.tracking.trackers import rgbd
-from freeocc3d.tracking.trajectory_alignment import Poses, align
+from freeocc3d.tracking.trajectory_alignment import Poses, align_trajectories
 
 Figures = dict[str, Any]
 Change = Callable[[int, Frame], Frame]
@@ -80,7 +80,7 @@ def _left_missing(position: int, frame: Frame) -> Frame:
 def opened(capture: str) -> Capture:
     """A capture as the pipeline would give it to layer 1, which is not told its poses."""
     plain = open_capture(capture, Options())
-    ratio = focal_calibration.color_focal(plain, used_frames(plain))
+    ratio = focal_calibration.estimate_color_focal(plain, select_frames(plain))
     return plain if ratio == 1 else Reregistered(plain, ratio)
 
 
@@ -111,7 +111,7 @@ def stress(capture: str, name: str) -> Figures:
     known = [n for n, pose in enumerate(stated) if pose is not None and trajectory.has_pose[n]]
     estimated = Poses(trajectory.timestamps[known], trajectory.T_world_cam[known])
     true = Poses(trajectory.timestamps[known], np.stack([stated[n] for n in known]))
-    errors = trajectory_errors(estimated, true, align(estimated, true))
+    errors = measure_trajectory_errors(estimated, true, align_trajectories(estimated, true))
     lost = set(np.flatnonzero(trajectory.status == "lost").tolist())
     figures = {
         "ate_rmse_m": errors.ate_rmse_m,
@@ -151,7 +151,7 @@ def lengths(capture: str) -> Figures:
         plain = open_capture(capture, Options(stop=count))
         if len(plain) < count:
             break
-        ratio = focal_calibration.color_focal(plain, used_frames(plain))
+        ratio = focal_calibration.estimate_color_focal(plain, select_frames(plain))
         calibrated = time.perf_counter() - mark
         scan = plain if ratio == 1 else Reregistered(plain, ratio)
         tracker, _, seconds = tracked([(scan, Shown(range(count)))])

@@ -44,10 +44,10 @@ def _features() -> Figures:
     def run(count: int) -> tuple[float, int]:
         gaussians = surface_gaussians(count)
         features = np.random.default_rng(0).normal(size=(count, FEATURES)).astype(np.float16)
-        evidence = carve.Evidence(np.zeros(3), 0.08, carve.Options())
+        evidence = carve.DepthEvidence(np.zeros(3), 0.08, carve.Options())
         mark = time.perf_counter()
         bins = splat.bin_gaussians(gaussians, np.zeros(3), splat.Options())
-        made = build.of_blocks(bins.packed, bins, gaussians, features, evidence, splat.Options(), carve.Options())
+        made = build.build_blocks(bins.packed, bins, gaussians, features, evidence, splat.Options(), carve.Options())
         return time.perf_counter() - mark, len(made.features)
 
     run(2000)  # compiles
@@ -72,7 +72,7 @@ def _insertion() -> Figures:
     looks = [PosedFrame(room[index], room.pose(index), 0) for index in range(0, len(room), 6)]
 
     def carving() -> None:
-        evidence = carve.Evidence(np.zeros(3), 0.08, carve.Options())
+        evidence = carve.DepthEvidence(np.zeros(3), 0.08, carve.Options())
         for look in looks:
             evidence.add(look.frame, look.T_world_cam)
 

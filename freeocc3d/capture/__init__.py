@@ -1,7 +1,7 @@
 """INPUT: captured scans. ``open_capture`` finds the reader of a folder; ``read_ahead`` decodes on a second thread."""
 
 from .base import Capture, Options
-from .opening import check_depth_scale, open_capture, used_frames
+from .opening import check_depth_scale, open_capture, select_frames
 from .read_ahead import read_ahead
 from .trajectory_files import PoseFile, associate, read_trajectory
 
@@ -14,5 +14,5 @@ __all__ = [
     "open_capture",
     "read_ahead",
     "read_trajectory",
-    "used_frames",
+    "select_frames",
 ]

@@ -139,7 +139,7 @@ _WHITE_CLOTH = Material((238, 236, 230), PLASTER, (208, 205, 198), 0.05)
 _METAL = Material((82, 83, 88), PLASTER, (62, 63, 68), 0.04)
 
 
-def furnished() -> Room:
+def build_room() -> Room:
     """The room with everything in it."""
     room = _Builder()
     _shell(room)

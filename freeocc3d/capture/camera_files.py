@@ -73,7 +73,7 @@ def same_view(a: Size, b: Size) -> bool:
     return abs(a[0] * b[1] / (a[1] * b[0]) - 1.0) < ASPECT_TOLERANCE
 
 
-def seen_at(camera: Intrinsics, size: Size) -> Intrinsics:
+def rescale_camera(camera: Intrinsics, size: Size) -> Intrinsics:
     """The camera of images of ``size`` that show the same view. Raises CaptureError if they cannot."""
     if not same_view((camera.width, camera.height), size):
         raise CaptureError(
@@ -83,14 +83,14 @@ def seen_at(camera: Intrinsics, size: Size) -> Intrinsics:
     return camera.resized(*size)
 
 
-def usual(size: Size) -> Intrinsics:
+def guess_camera(size: Size) -> Intrinsics:
     """A guess at the camera of images of ``size`` of which nothing is known."""
     width, height = size
     focal = USUAL_FOCAL * max(size)
     return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def equivalent(focal_35mm: float, size: Size) -> Intrinsics | None:
+def convert_35mm(focal_35mm: float, size: Size) -> Intrinsics | None:
     """The camera of images of ``size`` whose lens is stated as the focal length in millimetres of a 35 mm camera with
     the same view across its diagonal; None where it cannot be one."""
     if not 8 <= focal_35mm <= 500:
@@ -100,7 +100,7 @@ def equivalent(focal_35mm: float, size: Size) -> Intrinsics | None:
     return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def reduced(camera: Intrinsics, max_size: int | None) -> Intrinsics:
+def reduce_camera(camera: Intrinsics, max_size: int | None) -> Intrinsics:
     """The camera of the same images, reduced such that their longer side has no more than ``max_size`` pixels."""
     longer = max(camera.width, camera.height)
     if max_size is None or longer <= max_size:
@@ -109,7 +109,7 @@ def reduced(camera: Intrinsics, max_size: int | None) -> Intrinsics:
     return camera.resized(width, height)
 
 
-def given(options: Options) -> Calibration | None:
+def read_given_calibration(options: Options) -> Calibration | None:
     """What ``capture.intrinsics`` says of the colour camera."""
     return Calibration(options.intrinsics, None, "capture.intrinsics") if options.intrinsics else None
 

@@ -26,7 +26,7 @@ OVERLAP_PX = 0.25
 """A patch is grown by this much on each side, so that no cracks open between patches where a surface is slanted."""
 
 
-class Grid:
+class PixelGrid:
     """The common pixel grid of a colour and a depth camera.
 
     color, depth: the two cameras.  T_color_depth: (4, 4) depth to colour camera frame, None if they coincide.

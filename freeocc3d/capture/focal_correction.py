@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.types import Frame, Intrinsics
 from .base import Capture
-from .depth_registration import Grid
+from .depth_registration import PixelGrid
 
 
 class Reregistered(Capture):
@@ -22,7 +22,7 @@ class Reregistered(Capture):
         self.timestamps, self.classes = capture.timestamps, capture.classes
         self.color_focal = color_focal
         self._capture = capture
-        self._grids: dict[Intrinsics, Grid] = {}
+        self._grids: dict[Intrinsics, PixelGrid] = {}
 
     @classmethod
     def recognises(cls, path: object) -> bool:
@@ -49,8 +49,8 @@ class Reregistered(Capture):
         labels = self._capture.labels(index)
         return None if labels is None else self._grid(self._capture[index].intrinsics).classes(labels)
 
-    def _grid(self, camera: Intrinsics) -> Grid:
+    def _grid(self, camera: Intrinsics) -> PixelGrid:
         if camera not in self._grids:
             color = replace(camera, fx=camera.fx * self.color_focal, fy=camera.fy * self.color_focal)
-            self._grids[camera] = Grid(color, camera)
+            self._grids[camera] = PixelGrid(color, camera)
         return self._grids[camera]

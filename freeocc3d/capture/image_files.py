@@ -56,7 +56,7 @@ def read_classes(path: Path, count: int) -> NDArray[np.uint8]:
     return image.astype(np.uint8, copy=False)
 
 
-def metres(raw: NDArray[np.uint16], units_per_metre: float, max_depth: float) -> NDArray[np.float32]:
+def convert_to_metres(raw: NDArray[np.uint16], units_per_metre: float, max_depth: float) -> NDArray[np.float32]:
     """Stored depth to float32 metres; saturated values and those beyond ``max_depth`` metres become 0."""
     depth_m = raw.astype(np.float32)
     depth_m *= np.float32(1.0 / units_per_metre)
@@ -74,7 +74,7 @@ def image_size(path: Path) -> Size:
     raise FrameError(f"{path} is not a PNG or JPEG image.")
 
 
-def numbered(folder: Path, pattern: str) -> dict[int, Path]:
+def list_numbered(folder: Path, pattern: str) -> dict[int, Path]:
     """Files of ``folder`` whose whole name matches ``pattern``, by the number in its first group.
 
     Raises CaptureError if two files have the same number.
@@ -90,7 +90,7 @@ def numbered(folder: Path, pattern: str) -> dict[int, Path]:
     return found
 
 
-def holds(folder: Path, pattern: str) -> bool:
+def has_file(folder: Path, pattern: str) -> bool:
     """Whether a file of ``folder`` has a name that matches ``pattern``."""
     expression = re.compile(pattern, re.IGNORECASE)
     return folder.is_dir() and any(expression.fullmatch(path.name) for path in folder.iterdir())

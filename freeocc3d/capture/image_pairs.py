@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ..core.errors import CaptureError, FrameError
 from ..core.types import Frame
 from .base import Capture, Options
-from .depth_registration import Grid
-from .image_files import Size, image_size, metres, read_classes, read_color, read_depth
+from .depth_registration import PixelGrid
+from .image_files import Size, convert_to_metres, image_size, read_classes, read_color, read_depth
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Pairs:
     depth_size: Size
 
 
-def pair(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Path, options: Options) -> Pairs:
+def pair_files(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Path, options: Options) -> Pairs:
     """Pair the files by their numbers, or take colour's alone if ``options.depth`` is false.
 
     Raises CaptureError: no colour, no depth, more than ``max_broken`` of the frames lack a file, no readable image.
@@ -74,7 +74,7 @@ def pair(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Path, opt
 class ImagePairs(Capture):
     """A capture of numbered colour and depth files; a reader finds the files and the cameras."""
 
-    def __init__(self, path: Path, options: Options, pairs: Pairs, grid: Grid, units_per_metre: float):
+    def __init__(self, path: Path, options: Options, pairs: Pairs, grid: PixelGrid, units_per_metre: float):
         """units_per_metre: of the stored depth, unless ``options.depth_scale`` says otherwise."""
         super().__init__(path, options)
         self._pairs = pairs
@@ -89,7 +89,7 @@ class ImagePairs(Capture):
         if depth_path is None:
             depth_m = np.zeros(color.shape[:2], np.float32)
         else:
-            stored = metres(self._stored_depth(depth_path), self._units_per_metre, self.options.max_depth)
+            stored = convert_to_metres(self._stored_depth(depth_path), self._units_per_metre, self.options.max_depth)
             depth_m = self._grid.depth(stored)
         return Frame(index, float(self.timestamps[index]), color, depth_m, self._grid.intrinsics)
 

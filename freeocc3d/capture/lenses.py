@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import CaptureError
 from ..core.types import Intrinsics
-from .camera_files import reduced
+from .camera_files import reduce_camera
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 BROWN_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -74,7 +74,7 @@ class Rectified:
     intrinsics: Intrinsics
 
     def __init__(self, lens: Lens, max_size: int | None):
-        camera = reduced(lens.camera, max_size)
+        camera = reduce_camera(lens.camera, max_size)
         self.size = camera.width, camera.height
         self.intrinsics = camera
         self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None

@@ -60,7 +60,7 @@ def open_capture(
         raise CaptureError(f"Cannot read {error.filename or folder}: {error.strerror}.") from error
 
 
-def used_frames(capture: Capture) -> range:
+def select_frames(capture: Capture) -> range:
     """Indices of the frames that ``start``, ``stop`` and ``stride`` select. Raises CaptureError if there are none."""
     options = capture.options
     frames = range(len(capture))[options.start : options.stop : options.stride]

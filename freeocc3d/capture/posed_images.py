@@ -15,8 +15,8 @@ from ..core.errors import CaptureError, FrameError
 from ..core.transforms import invert, project, transform
 from ..core.types import Frame
 from .base import NOMINAL_DEPTH, Capture, Options
-from .camera_files import given, seen_at
-from .image_files import metres, read_color, read_depth
+from .camera_files import read_given_calibration, rescale_camera
+from .image_files import convert_to_metres, read_color, read_depth
 from .lenses import Lens, Rectified
 
 UNITS_PER_METRE = 1000.0
@@ -49,7 +49,7 @@ class PosedImages(Capture):
         scale = 1.0 if units_in_metres is None else units_in_metres
         self._posed = [replace(view, T_world_cam=_scaled(view.T_world_cam, scale)) for view in posed]
         self._rectified = functools.lru_cache(maxsize=4)(lambda lens: Rectified(lens, options.max_size))
-        if stated := given(options):
+        if stated := read_given_calibration(options):
             cameras = {lens.camera for lens in (view.lens for view in posed)}
             lenses = {camera: Lens(stated.camera((camera.width, camera.height))) for camera in cameras}
             self._posed = [replace(view, lens=lenses[view.lens.camera]) for view in self._posed]
@@ -63,7 +63,7 @@ class PosedImages(Capture):
         size = color.shape[1], color.shape[0]
         if size != (lens.camera.width, lens.camera.height):  # the same images, stored smaller or larger
             try:
-                lens = replace(lens, camera=seen_at(lens.camera, size))
+                lens = replace(lens, camera=rescale_camera(lens.camera, size))
             except CaptureError as error:
                 raise FrameError(
                     f"{view.image} has {size[0]} x {size[1]} pixels, its camera {lens.camera.width} x "
@@ -73,7 +73,7 @@ class PosedImages(Capture):
         depth_m = np.zeros(rectified.size[::-1], np.float32)
         if self.has_depth and view.depth is not None:
             units = self.options.depth_scale or UNITS_PER_METRE
-            depth_m = rectified.depth(metres(read_depth(view.depth), units, self.options.max_depth))
+            depth_m = rectified.depth(convert_to_metres(read_depth(view.depth), units, self.options.max_depth))
         return Frame(index, float(self.timestamps[index]), rectified.color(color), depth_m, rectified.intrinsics)
 
     def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
@@ -89,7 +89,7 @@ class PosedImages(Capture):
         return self._posed[index].T_world_cam
 
 
-def nominal_scale(posed: Sequence[PosedImage], points: NDArray[np.float64]) -> float | None:
+def compute_nominal_scale(posed: Sequence[PosedImage], points: NDArray[np.float64]) -> float | None:
     """What brings the median depth of (P, 3) points, where images show them, to ``NOMINAL_DEPTH``; None without any."""
     points = points[:: max(1, len(points) // _SAMPLES)]
     depths = []
@@ -102,7 +102,7 @@ def nominal_scale(posed: Sequence[PosedImage], points: NDArray[np.float64]) -> f
     return NOMINAL_DEPTH / float(np.median(depths)) if depths else None
 
 
-def inside(folder: Path, name: str, stated_by: Path) -> Path:
+def resolve_inside(folder: Path, name: str, stated_by: Path) -> Path:
     """A file that another one names, within the folder. Raises CaptureError for one that is outside."""
     path = Path(os.path.normpath(folder / name))
     if not path.is_relative_to(os.path.normpath(folder)):

@@ -112,7 +112,7 @@ def refine(
             made = adaptive_voxels.refine_where_needed(scan_map, voxel, output, overwrite=overwrite, progress=progress)
         else:
             corners = refining.Box(np.array(box[:3]), np.array(box[3:]))
-            made = refining.refine(scan_map, corners, voxel, output, overwrite=overwrite, progress=progress)
+            made = refining.refine_box(scan_map, corners, voxel, output, overwrite=overwrite, progress=progress)
     finally:
         progress.close()
     print(summary.to_text(made))
@@ -148,13 +148,13 @@ def scale(
     loaded = load_map(map_path)
     by = "given"
     if length is not None:
-        factor, by = scaling.by_length(loaded, length[:2], length[2]), "length"
+        factor, by = scaling.scale_by_length(loaded, length[:2], length[2]), "length"
     elif camera_height is not None:
-        factor, by = scaling.by_camera_height(loaded, camera_height), "camera height"
+        factor, by = scaling.scale_by_camera_height(loaded, camera_height), "camera height"
     elif poses is not None:
-        factor, by = scaling.by_poses(loaded, poses), "poses"
+        factor, by = scaling.scale_by_poses(loaded, poses), "poses"
     assert factor is not None
-    print(summary.to_text(scaling.scaled(loaded, factor, by, output, overwrite=overwrite)))
+    print(summary.to_text(scaling.scale_map(loaded, factor, by, output, overwrite=overwrite)))
 
 
 @app.command()
@@ -261,7 +261,7 @@ def evaluate(
         raise typer.BadParameter("give maps, or one of --gaussians, --grid and --frames.")
     if html is not None:
         refuse_existing(html, overwrite)
-    asked = scoring.Asked(
+    asked = scoring.ScoringRequest(
         maps=maps or [],
         gaussians=gaussians,
         grid=grid,
@@ -274,7 +274,7 @@ def evaluate(
         split=split,
         overrides=overrides or [],
     )
-    result = scoring.evaluate(asked)
+    result = scoring.evaluate_scenes(asked)
     if html is not None:
         from ..evaluation.report_page import write_report
 
@@ -299,11 +299,11 @@ def ground_truth_command(
     refuse_existing(output, overwrite)
     progress = ConsoleProgress()
     try:
-        truth = replicaocc_truth.build(capture, overrides or [], progress)
+        truth = replicaocc_truth.build_truth(capture, overrides or [], progress)
     finally:
         progress.close()
     save_ground_truth(truth, output, overwrite)
-    print(replicaocc_truth.to_text(truth, output))
+    print(replicaocc_truth.describe_truth(truth, output))
 
 
 @app.command()
@@ -320,9 +320,9 @@ def view(
 
     loaded = load_map(map_path)
     if word is None:
-        map_pictures.map_picture(loaded, picture, by, overwrite)
+        map_pictures.write_map_picture(loaded, picture, by, overwrite)
     else:
-        map_pictures.query_picture(loaded, loaded.query_words([word]), picture, overwrite)
+        map_pictures.write_query_picture(loaded, loaded.query_words([word]), picture, overwrite)
     print(picture)
 
 
@@ -355,12 +355,12 @@ def demo(
         progress.close()
     print(summary.to_text(made))
     written = [output / "map.png"]
-    map_pictures.map_picture(made, written[0], overwrite=overwrite)
+    map_pictures.write_map_picture(made, written[0], overwrite=overwrite)
     results = made.query_words(["red cup", "blue chair", "green plant"], top_k=5)
     print(asking.to_text(results))
     for result in results:
         written.append(output / f"query_{result.word.replace(' ', '_')}.png")
-        map_pictures.query_picture(made, [result], written[-1], overwrite)
+        map_pictures.write_query_picture(made, [result], written[-1], overwrite)
     print("pictures: " + ", ".join(str(path) for path in written))
 
 

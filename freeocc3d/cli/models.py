@@ -28,7 +28,7 @@ def models_pull(
 
     progress = ConsoleProgress()
     try:
-        folder = model_hub.pull(name, revision, progress)
+        folder = model_hub.pull_package(name, revision, progress)
     finally:
         progress.close()
     if folder.parent.name == model_hub.CHECKPOINTS:
@@ -87,7 +87,7 @@ def models_list(as_json: Json = False) -> None:
     """List the models in the models folder."""
     from ..language import model_packages
 
-    found = model_packages.installed()
+    found = model_packages.list_installed()
     if as_json:
         facts = {
             name: {"error": str(p)}
@@ -96,7 +96,7 @@ def models_list(as_json: Json = False) -> None:
                   "licence": p.licence, "source": p.source}
             for name, p in found.items()
         }  # fmt: skip
-        print(json.dumps({"folder": str(model_packages.models_folder()), "models": facts}))
+        print(json.dumps({"folder": str(model_packages.find_models_folder()), "models": facts}))
         return
     for name, package in found.items():
         if isinstance(package, FreeOccError):
@@ -107,7 +107,7 @@ def models_list(as_json: Json = False) -> None:
                 f"{package.bytes / 1e6:8.1f} MB  licence {package.licence}, from {package.source}"
             )
     if not found:
-        print(f"There are no models in {model_packages.models_folder()}.")
+        print(f"There are no models in {model_packages.find_models_folder()}.")
 
 
 @app.command("verify")
@@ -117,12 +117,14 @@ def models_verify(
     """Compare the content of every file with the hash in its model's manifest."""
     from ..language import model_packages
 
-    folders = [path if (path := Path(name)).is_dir() else model_packages.models_folder() / name for name in names or []]
+    folders = [
+        path if (path := Path(name)).is_dir() else model_packages.find_models_folder() / name for name in names or []
+    ]
     damaged = []
-    for folder in folders or [model_packages.models_folder() / name for name in model_packages.installed()]:
+    for folder in folders or [model_packages.find_models_folder() / name for name in model_packages.list_installed()]:
         try:
-            package = model_packages.read(folder)
-            model_packages.verify(package)
+            package = model_packages.read_package(folder)
+            model_packages.verify_files(package)
         except ModelError as error:
             damaged.append(str(error))
         else:

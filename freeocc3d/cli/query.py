@@ -139,11 +139,11 @@ def query(
         if picture is not None:
             from ..viewer import map_pictures
 
-            map_pictures.query_picture(loaded, results, picture, overwrite)
+            map_pictures.write_query_picture(loaded, results, picture, overwrite)
         if html is not None:
-            from ..viewer.answer_page import query_page
+            from ..viewer.answer_page import write_query_page
 
-            query_page(loaded, results, html, overwrite)
+            write_query_page(loaded, results, html, overwrite)
         print(_answer(map_path, loaded, results, as_json, views))
 
 
@@ -185,8 +185,8 @@ def _refined(loaded: Any, region: Any, voxel_size: float, output: Path, overwrit
     from ..editing import box_refinement as refining
 
     progress = ConsoleProgress()
-    box = refining.around(region, loaded.manifest["voxel_size_m"])
+    box = refining.enclose_region(region, loaded.manifest["voxel_size_m"])
     try:
-        return refining.refine(loaded, box, voxel_size, output, overwrite=overwrite, progress=progress)
+        return refining.refine_box(loaded, box, voxel_size, output, overwrite=overwrite, progress=progress)
     finally:
         progress.close()

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True, nogil=True)
-def slot(table: NDArray[np.int64], key: int) -> int:
+def find_slot(table: NDArray[np.int64], key: int) -> int:
     """Where ``key`` stands, or would be put."""
     mask = len(table) - 1
     at = (((key * -7046029254386353131) & 0x7FFFFFFFFFFFFFFF) >> 20) & mask  # Fibonacci hashing
@@ -18,9 +18,9 @@ def slot(table: NDArray[np.int64], key: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def put(table: NDArray[np.int64], count: int, key: int) -> tuple[NDArray[np.int64], int]:
+def put_key(table: NDArray[np.int64], count: int, key: int) -> tuple[NDArray[np.int64], int]:
     """Add a key to a set, which may move: (table, number of keys)."""
-    at = slot(table, key)
+    at = find_slot(table, key)
     if table[at] == key:
         return table, count
     table[at] = key
@@ -28,7 +28,7 @@ def put(table: NDArray[np.int64], count: int, key: int) -> tuple[NDArray[np.int6
         grown = np.full(2 * len(table), -1, np.int64)
         for old in table:
             if old != -1:
-                grown[slot(grown, old)] = old
+                grown[find_slot(grown, old)] = old
         table = grown
     return table, count + 1
 
@@ -42,14 +42,14 @@ def build_table(keys: NDArray[np.int64], room: int) -> tuple[NDArray[np.int64], 
     table = np.full(size, -1, np.int64)
     rows = np.full(size, -1, np.int32)
     for row in range(len(keys)):
-        at = slot(table, keys[row])
+        at = find_slot(table, keys[row])
         table[at] = keys[row]
         rows[at] = row
     return table, rows
 
 
 @njit(cache=True, nogil=True)
-def find(table: NDArray[np.int64], rows: NDArray[np.int32], key: int) -> int:
+def find_row(table: NDArray[np.int64], rows: NDArray[np.int32], key: int) -> int:
     """Row of ``key``, -1 if it is not there."""
-    at = slot(table, key)
+    at = find_slot(table, key)
     return rows[at] if table[at] == key else -1

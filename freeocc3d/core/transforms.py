@@ -158,7 +158,7 @@ def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Arra
     return scale, R, mean_target - scale * R @ mean_source  # eq. 41
 
 
-def apart(T_a: Array, T_b: Array) -> tuple[float, float]:
+def measure_pose_difference(T_a: Array, T_b: Array) -> tuple[float, float]:
     """How far two poses of one thing are from each other: metres and degrees."""
     difference = invert(T_a) @ T_b
     cosine = np.clip(0.5 * (np.trace(difference[:3, :3]) - 1.0), -1.0, 1.0)

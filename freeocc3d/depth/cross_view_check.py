@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..core.transforms import invert
 from ..core.types import Intrinsics
-from .photo_consistency import rays
+from .photo_consistency import compute_rays
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class DepthImage:
 
 
 @dataclass(frozen=True)
-class Confirmed:
+class ConfirmedDepth:
     """Per pixel, (H, W): how many views agree and how many look through the point; the mean ``inverse`` depth of all
     that agree, weighted by their variances; its standard deviation ``sigma``, of which their spread is part."""
 
@@ -37,12 +37,14 @@ class Confirmed:
     sigma: Tensor
 
 
-def confirmed(view: DepthImage, others: Sequence[DepthImage], tolerance: float, device: str = "cpu") -> Confirmed:
+def confirm_depth(
+    view: DepthImage, others: Sequence[DepthImage], tolerance: float, device: str = "cpu"
+) -> ConfirmedDepth:
     """``view`` compared with ``others``: a view agrees where its depth, seen from the first one, differs by at most the
     ``tolerance`` (relative) or two standard deviations, whichever is more."""
     inverse, sigma = (torch.from_numpy(a).to(device) for a in (view.inverse, view.sigma))
     there = inverse > 0
-    points = rays(view.camera, device) / inverse.clamp_min(1e-6)
+    points = compute_rays(view.camera, device) / inverse.clamp_min(1e-6)
     variance = sigma.square().clamp_min(1e-12)
     weight, total = 1.0 / variance, inverse / variance
     square = inverse.square() / variance
@@ -65,7 +67,7 @@ def confirmed(view: DepthImage, others: Sequence[DepthImage], tolerance: float, 
     mean = total / weight
     scatter = (square / weight - mean.square()).clamp_min(0.0)
     # Neighbours share images, and with them their errors: the mean is not surer than a single one.
-    return Confirmed(agreeing, through, mean, torch.sqrt((agreeing + 1) / weight + scatter))
+    return ConfirmedDepth(agreeing, through, mean, torch.sqrt((agreeing + 1) / weight + scatter))
 
 
 def _moved(T: NDArray[np.float64], points: Tensor) -> Tensor:

@@ -66,12 +66,12 @@ class DepthNetwork:
         return (rows if isinstance(rows, int) else tall), (columns if isinstance(columns, int) else wide)
 
 
-def load(path: Path, device: str = "cpu") -> DepthNetwork:
+def load_depth_network(path: Path, device: str = "cpu") -> DepthNetwork:
     """The network in an ONNX file. Raises ModelError, ConfigError."""
     return DepthNetwork(load_session(path, device), path)
 
 
-def fused(
+def fuse_guess(
     inverse: NDArray[np.float32], sigma: NDArray[np.float32], guess: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Stereo's inverse depth and sigma with a network's guess, weighted by their variances; the guess alone where

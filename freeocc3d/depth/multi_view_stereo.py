@@ -27,15 +27,15 @@ from ..settings.registry import require_positive
 from . import depth_network
 from .building_planes import Layout
 from .cross_view_check import DepthImage
-from .photo_consistency import View
-from .plane_detection import layout
-from .scan_points import Points, confirmed_points, merged
-from .surface_depth import own_where_alike, surface_depth
-from .view_depth import measured
-from .view_selection import APART, Chosen, neighbours
-from .watertight_surface import Surface, watertight
+from .photo_consistency import StereoView
+from .plane_detection import detect_layout
+from .scan_points import ScanPoints, confirm_points, merge_points
+from .surface_depth import prefer_own_depth, render_surface_depth
+from .view_depth import measure_depth
+from .view_selection import APART, SelectedViews, select_partners
+from .watertight_surface import Surface, build_surface
 
-__all__ = ["Options", "Scan", "StereoDepth", "View", "depth_map"]
+__all__ = ["Options", "Scan", "StereoDepth", "StereoView", "depth_map"]
 
 _AT_ONCE = 16  # frames
 _FILES_KEPT = 64  # in memory: images and depths of the frames around the one in work
@@ -92,12 +92,12 @@ class Scan(Protocol):
 
 
 def depth_map(
-    view: View, others: Sequence[View], near: float, far: float, options: Options
+    view: StereoView, others: Sequence[StereoView], near: float, far: float, options: Options
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth of one view from ``others``, which nothing has confirmed yet: (H, W) metres, 0 = none, and its standard
     deviation. The depth lies between ``near`` and ``far``; H, W are those of a view of ``options.size``."""
     small, sources = _shrunk(view, options.size), [_shrunk(other, options.size) for other in others]
-    depth = measured(small, sources, sources, near, far, options.device)
+    depth = measure_depth(small, sources, sources, near, far, options.device)
     return _metres(depth.inverse, depth.sigma)
 
 
@@ -131,8 +131,8 @@ class StereoDepth:
         broken = self._decode(capture, posed, T, progress, prepared)
         T[broken] = np.nan
         seen, count = (T, scan.points, scan.seen_frame, scan.seen_point), self.options.neighbours
-        chosen = neighbours(*seen, 2 * count)
-        apart = neighbours(*seen, count + count // 2, APART).partners
+        chosen = select_partners(*seen, 2 * count)
+        apart = select_partners(*seen, count + count // 2, APART).partners
         able = [frame for frame, partners in enumerate(chosen.partners) if len(partners)]
         if len(able) < 2:
             raise TrackingError(
@@ -147,8 +147,8 @@ class StereoDepth:
                     f"No depth can be had from the images of {capture.path}: hardly anything in them was found to be "
                     "equally far away by several. They may be blurred, or show bare surfaces, or their poses be wrong."
                 )
-            surface = watertight(points, T[able, :3, 3])
-            self._save(surface, layout(points, T[able, :3, 3], surface.normals()))
+            surface = build_surface(points, T[able, :3, 3])
+            self._save(surface, detect_layout(points, T[able, :3, 3], surface.normals()))
         self._compute(
             "depth", able, functools.partial(self._render, surface=self._surface(), planes=self._layout()), progress
         )
@@ -196,7 +196,9 @@ class StereoDepth:
     ) -> list[int]:
         """Keep what is needed of each image; returns the frames that are broken."""
         path = self.options.network
-        network = None if path is None else depth_network.load(Path(path).expanduser(), self.options.device)
+        network = (
+            None if path is None else depth_network.load_depth_network(Path(path).expanduser(), self.options.device)
+        )
         broken = []
         missing = [frame for frame in frames if not self._path("view", frame).exists()]
         progress.stage("stereo: images", len(missing))
@@ -206,7 +208,7 @@ class StereoDepth:
                 continue
             frame = prepared(frame)
             camera = frame.intrinsics
-            small = _shrunk(View(frame.color, camera, T_world_cam[index]), self.options.size)
+            small = _shrunk(StereoView(frame.color, camera, T_world_cam[index]), self.options.size)
             if network is not None:
                 guess = network(frame.color, small.intrinsics.width, small.intrinsics.height)
                 self._write("guess", index, inverse=guess)
@@ -218,16 +220,18 @@ class StereoDepth:
             progress.advance(done)
         return broken
 
-    def _measure(self, frame: int, chosen: Chosen, apart: list[NDArray[np.int64]]) -> DepthImage:
+    def _measure(self, frame: int, chosen: SelectedViews, apart: list[NDArray[np.int64]]) -> DepthImage:
         others = [self._view(other) for other in chosen.partners[frame][: self.options.neighbours]]
         wide = [self._view(other) for other in apart[frame]] or others
-        return measured(self._view(frame), others, wide, chosen.near[frame], chosen.far[frame], self.options.device)
+        return measure_depth(
+            self._view(frame), others, wide, chosen.near[frame], chosen.far[frame], self.options.device
+        )
 
-    def _points(self, frames: Sequence[int], chosen: Chosen, progress: Progress) -> Points:
+    def _points(self, frames: Sequence[int], chosen: SelectedViews, progress: Progress) -> ScanPoints:
         def confirmed(frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             others = [self._depth("measured", i) for i in chosen.partners[frame] if len(chosen.partners[i])]
             agreeing = max(1, min(self.options.agreeing, len(others)))
-            return confirmed_points(self._depth("measured", frame), others, agreeing, self.options.device)
+            return confirm_points(self._depth("measured", frame), others, agreeing, self.options.device)
 
         def advancing() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
             for done, _, points in self._each(frames, confirmed):
@@ -237,16 +241,16 @@ class StereoDepth:
         progress.stage("stereo: surface", len(frames))
         some = [self._depth("measured", frame).inverse[::_EACH_WAY, ::_EACH_WAY] for frame in frames]
         inverse = np.concatenate([image[image > 0] for image in some])
-        return merged(advancing(), 1.0 / float(np.median(inverse)) if len(inverse) else 1.0)
+        return merge_points(advancing(), 1.0 / float(np.median(inverse)) if len(inverse) else 1.0)
 
     def _render(self, frame: int, surface: Surface, planes: Layout) -> DepthImage:
         view = self._view(frame)
-        depth = surface_depth(surface, planes, view.intrinsics, view.T_world_cam)
-        depth = own_where_alike(self._depth("measured", frame), depth)
+        depth = render_surface_depth(surface, planes, view.intrinsics, view.T_world_cam)
+        depth = prefer_own_depth(self._depth("measured", frame), depth)
         if self.options.network is None:
             return depth
         guess = self._load("guess", frame)["inverse"].astype(np.float32)
-        inverse, sigma = depth_network.fused(depth.inverse, depth.sigma, guess)
+        inverse, sigma = depth_network.fuse_guess(depth.inverse, depth.sigma, guess)
         return DepthImage(inverse, sigma, view.intrinsics, view.T_world_cam)
 
     @property
@@ -276,12 +280,12 @@ class StereoDepth:
         arrays = {name: getattr(surface, name) for name in ("vertices", "sigma_m", "triangles")}
         write_arrays(self._surface_path, {**arrays, "cell_m": np.array([surface.cell_m])})
 
-    def _view(self, frame: int) -> View:
+    def _view(self, frame: int) -> StereoView:
         stored = self._load("view", frame)
         height, width = stored["size"].tolist()
         grey = stored["grey"].astype(np.float32) / np.float32(65535.0)
         camera = Intrinsics(width, height, *stored["camera"].tolist()).resized(grey.shape[1], grey.shape[0])
-        return View(grey, camera, stored["T_world_cam"].astype(np.float64))
+        return StereoView(grey, camera, stored["T_world_cam"].astype(np.float64))
 
     def _depth(self, stage: str, frame: int) -> DepthImage:
         stored, view = self._load(stage, frame), self._view(frame)
@@ -305,7 +309,7 @@ class StereoDepth:
             return self._read[path]
 
 
-def _shrunk(view: View, size: int) -> View:
+def _shrunk(view: StereoView, size: int) -> StereoView:
     """The view with a longer side of ``size`` pixels, or of fewer if it has fewer; both sides even."""
     camera = view.intrinsics
     by = min(1.0, size / max(camera.width, camera.height))

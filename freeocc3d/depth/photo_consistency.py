@@ -26,7 +26,7 @@ _AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 24}  # pixels x hypotheses; on a CPU su
 
 
 @dataclass(frozen=True)
-class View:
+class StereoView:
     """An image whose camera is known.
 
     color: (H, W, 3) uint8 RGB, or (H, W) float32 grey in 0…1 for ``intrinsics`` of that size.
@@ -37,17 +37,17 @@ class View:
     intrinsics: Intrinsics
     T_world_cam: NDArray[np.float64]
 
-    def shrunk(self, width: int, height: int) -> View:
+    def shrunk(self, width: int, height: int) -> StereoView:
         """The same view in grey, of another size."""
         image = self.color
         if image.ndim == 3:
             image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255.0))
         if image.shape != (height, width):
             image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-        return View(image, self.intrinsics.resized(width, height), self.T_world_cam)
+        return StereoView(image, self.intrinsics.resized(width, height), self.T_world_cam)
 
 
-def rays(camera: Intrinsics, device: str | torch.device = "cpu") -> Tensor:
+def compute_rays(camera: Intrinsics, device: str | torch.device = "cpu") -> Tensor:
     """(3, H, W) points at depth 1 that the pixels see."""
     v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
@@ -61,12 +61,12 @@ class Matcher:
     that it has itself: where the hypotheses vary over a patch, it is slanted or curved as they are.
     """
 
-    def __init__(self, view: View, others: Sequence[View], radius: int, device: str = "cpu"):
+    def __init__(self, view: StereoView, others: Sequence[StereoView], radius: int, device: str = "cpu"):
         self.camera, self.radius, self.device = view.intrinsics, radius, torch.device(device)
         self.grey = self._image(view)
-        self.rays = rays(view.intrinsics, self.device)
-        self._mean = box_mean(self.grey[None], radius)[0]
-        self._variance = box_mean(self.grey[None] ** 2, radius)[0] - self._mean**2
+        self.rays = compute_rays(view.intrinsics, self.device)
+        self._mean = average_box(self.grey[None], radius)[0]
+        self._variance = average_box(self.grey[None] ** 2, radius)[0] - self._mean**2
         self._sources = [(self._image(other), *self._projection(view, other)) for other in others]
         baselines = [np.linalg.norm((invert(o.T_world_cam) @ view.T_world_cam)[:3, 3]) for o in others]
         self.pixel = 1.0 / (self.camera.fx * float(np.median(baselines)))
@@ -91,7 +91,7 @@ class Matcher:
         Source: S. B. Kang, R. Szeliski, J. Chai, Handling Occlusions in Dense Multi-view Stereo, CVPR 2001.
         """
         chunk = max(1, _AT_ONCE[self.device.type] // self.grey.numel())
-        parts = [best_half(self.scores(part)) for part in inverse_depth.split(chunk)]
+        parts = [average_best_half(self.scores(part)) for part in inverse_depth.split(chunk)]
         return torch.cat(parts)
 
     def _correlation(self, image: Tensor, turn: Tensor, shift: Tensor, inverse_depth: Tensor) -> Tensor:
@@ -103,16 +103,16 @@ class Matcher:
         flat = grid.view(1, depths * height, width, 2)
         warped = F.grid_sample(image[None, None], flat, padding_mode="border", align_corners=False)
         warped = warped.view(depths, height, width)
-        mean = box_mean(warped, self.radius)
-        variance = (box_mean(warped * warped, self.radius) - mean * mean).clamp_min(0.0)
-        shared = box_mean(warped * self.grey, self.radius) - mean * self._mean
+        mean = average_box(warped, self.radius)
+        variance = (average_box(warped * warped, self.radius) - mean * mean).clamp_min(0.0)
+        shared = average_box(warped * self.grey, self.radius) - mean * self._mean
         scores = shared * torch.rsqrt((variance + NOISE**2) * (self._variance.clamp_min(0.0) + NOISE**2))
         return scores * inside
 
-    def _image(self, view: View) -> Tensor:
+    def _image(self, view: StereoView) -> Tensor:
         return torch.from_numpy(view.color).to(self.device) - 0.5  # sums of squares keep more digits
 
-    def _projection(self, view: View, other: View) -> tuple[Tensor, Tensor]:
+    def _projection(self, view: StereoView, other: StereoView) -> tuple[Tensor, Tensor]:
         """(3, H, W) and (3, 1, 1, 1): their sum, the latter times the inverse depth, is the homogeneous place in the
         other image, whose borders are -1 and 1."""
         camera = other.intrinsics
@@ -125,16 +125,16 @@ class Matcher:
         return torch.einsum("ij,jhw->ihw", P[:, :3], self.rays), P[:, 3].reshape(3, 1, 1, 1)
 
 
-def best_half(scores: Tensor) -> Tensor:
+def average_best_half(scores: Tensor) -> Tensor:
     """(V, …) to (…): the mean of the better half of the views."""
     count = (len(scores) + 1) // 2
     return scores.mean(dim=0) if count == len(scores) else scores.topk(count, dim=0)[0].mean(dim=0)
 
 
-def box_mean(images: Tensor, radius: int) -> Tensor:
+def average_box(images: Tensor, radius: int) -> Tensor:
     """(D, H, W): means over the part of (2 radius + 1)² pixels around each that lies in the image."""
     if images.device.type != "cpu":
-        return pooled_mean(images, radius)
+        return average_box_reference(images, radius)
     size = (2 * radius + 1,) * 2  # OpenCV's sums run along rows and columns: four times as fast as pooling
     inside = np.ones(images.shape[1:], np.float32)
     share = 1.0 / cv2.boxFilter(inside, -1, size, borderType=cv2.BORDER_CONSTANT)
@@ -145,8 +145,8 @@ def box_mean(images: Tensor, radius: int) -> Tensor:
     return torch.from_numpy(means)
 
 
-def pooled_mean(images: Tensor, radius: int) -> Tensor:
-    """``box_mean`` by torch, on any device."""
+def average_box_reference(images: Tensor, radius: int) -> Tensor:
+    """``average_box`` by torch, on any device."""
     size = 2 * radius + 1
     rows = F.avg_pool2d(images[:, None], (1, size), 1, (0, radius), count_include_pad=False)
     return F.avg_pool2d(rows, (size, 1), 1, (radius, 0), count_include_pad=False)[:, 0]

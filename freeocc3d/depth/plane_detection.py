@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .building_planes import Layout, Plane
-from .scan_points import Points
+from .scan_points import ScanPoints
 
 _MOST_PLANES = 60
 _LEAST_POINTS = 60
@@ -57,7 +57,7 @@ class _Bounded:
     taken: NDArray[np.bool_]
 
 
-def layout(points: Points, centres: NDArray[np.float64], normals: NDArray[np.float64]) -> Layout:
+def detect_layout(points: ScanPoints, centres: NDArray[np.float64], normals: NDArray[np.float64]) -> Layout:
     """The planes of a scan.
 
     centres: (C, 3) of the cameras that ``points.ray_camera`` counts.  normals: (N, 3) of surfaces, of length 1 and any
@@ -65,11 +65,11 @@ def layout(points: Points, centres: NDArray[np.float64], normals: NDArray[np.flo
     """
     if len(points.points) < _LEAST_POINTS or not len(normals):
         return Layout(())
-    axes = directions(points, normals)
+    axes = find_directions(points, normals)
     return Layout(_outermost(points, centres, axes) + _layers(points, centres, axes))
 
 
-def directions(points: Points, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+def find_directions(points: ScanPoints, normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3): rows at right angles to each other, along which points lie in layers. The first is that of the layer with
     most points, and as exact as these say; it is the floor's more often than not."""
     X, cell = points.points - points.points.mean(axis=0), points.cell_m
@@ -147,7 +147,7 @@ def _fitted(X: NDArray[np.float64], normal: NDArray[np.float64], offset: float, 
     return normal
 
 
-def _layers(points: Points, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
+def _layers(points: ScanPoints, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
     """Planes, those that hold most points first; what one holds the next ones do without.
 
     Source: P. Hough, Method and Means for Recognizing Complex Patterns, 1962.
@@ -213,7 +213,7 @@ def _tilted(
 
 
 def _bounded(
-    points: Points, centres: NDArray[np.float64], normal: NDArray[np.float64], offset: float
+    points: ScanPoints, centres: NDArray[np.float64], normal: NDArray[np.float64], offset: float
 ) -> _Bounded | None:
     """The plane where its points support it; None if these are few or scattered."""
     X, cell = points.points, points.cell_m
@@ -293,7 +293,7 @@ def _disc(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
 
 
-def _outermost(points: Points, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
+def _outermost(points: ScanPoints, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
     """The floor, the ceiling and the walls that have hardly anything behind them: of the layers of which that is true,
     those that hold most. They go on wherever they are not seen through."""
     X, cell = points.points, points.cell_m

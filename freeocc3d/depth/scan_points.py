@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .cross_view_check import DepthImage, confirmed
-from .photo_consistency import rays
+from .cross_view_check import DepthImage, confirm_depth
+from .photo_consistency import compute_rays
 
 _SAME_DEPTH = 0.01  # relative: up to it views agree, whatever their standard deviations
 _LOOKING_THROUGH = 0.5  # views that contradict, over those that agree
@@ -22,7 +22,7 @@ _UNCONFIRMED = 4  # times as many are kept until it is known which ones other ca
 
 
 @dataclass(frozen=True)
-class Points:
+class ScanPoints:
     """points: (P, 3) float64 world.  sigma_m: (P,) metres.  ray_point, ray_camera: (R,) int32, the rays along which
     points were measured.  cell_m: edge of the cells that hold one point each."""
 
@@ -33,23 +33,23 @@ class Points:
     cell_m: float
 
 
-def confirmed_points(
+def confirm_points(
     view: DepthImage, others: Sequence[DepthImage], agreeing: int, device: str = "cpu"
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(N, 3) world points of a view that ``agreeing`` of the ``others`` see at the same depth, and few at a greater
     one; their (N,) standard deviations in metres."""
-    found = confirmed(view, others, _SAME_DEPTH, device)
+    found = confirm_depth(view, others, _SAME_DEPTH, device)
     keep = (found.agreeing >= agreeing) & (found.through <= _LOOKING_THROUGH * found.agreeing)
     there = keep.cpu().numpy() & (view.inverse > 0)
     z = 1.0 / found.inverse.cpu().numpy()[there].astype(np.float64)
     T = view.T_world_cam
-    points = (rays(view.camera).numpy()[:, there].T * z[:, None]) @ T[:3, :3].T + T[:3, 3]
+    points = (compute_rays(view.camera).numpy()[:, there].T * z[:, None]) @ T[:3, :3].T + T[:3, 3]
     return points, found.sigma.cpu().numpy()[there] * z**2
 
 
-def merged(
+def merge_points(
     measured: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], depth_m: float, most: int = _MOST
-) -> Points:
+) -> ScanPoints:
     """One point per cell of a hundredth of the scan's typical ``depth_m``: the mean of those in it, weighted by their
     variances. Points that one camera alone measured are left out; cells are larger where there would be more than
     ``most``.
@@ -74,7 +74,7 @@ def merged(
     weight, places, spread = np.split(cells.sums[keep], (1, 4), axis=1)
     seen = keep[row]
     ray_point = (np.cumsum(keep) - 1)[row[seen]].astype(np.int32)
-    return Points(places / weight, (spread / weight)[:, 0], ray_point, cells.ray_camera[seen], cells.edge)
+    return ScanPoints(places / weight, (spread / weight)[:, 0], ray_point, cells.ray_camera[seen], cells.edge)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 
-def aggregated(costs: Tensor, step: float, jump_down: Tensor, jump_right: Tensor) -> Tensor:
+def aggregate_costs(costs: Tensor, step: float, jump_down: Tensor, jump_right: Tensor) -> Tensor:
     """Sum of the least costs of paths that end in a pixel, over eight directions.
 
     costs: (H, W, L) of giving a pixel one of L ordered labels.  step: price of going on with the label beside.
@@ -22,7 +22,7 @@ def aggregated(costs: Tensor, step: float, jump_down: Tensor, jump_right: Tensor
     return total + turned.transpose(0, 1)
 
 
-def jumps(grey: Tensor, least: float, most: float, contrast: float) -> tuple[Tensor, Tensor]:
+def price_jumps(grey: Tensor, least: float, most: float, contrast: float) -> tuple[Tensor, Tensor]:
     """(H, W) prices between vertical and between horizontal neighbours: ``most`` where they look alike, down to
     ``least`` where they differ by much more than ``contrast``."""
     down = F.pad((grey[1:] - grey[:-1]).abs(), (0, 0, 1, 0))

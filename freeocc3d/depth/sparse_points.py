@@ -32,7 +32,7 @@ class PosedPoints:
     seen_point: NDArray[np.int32]
 
 
-def triangulated(
+def triangulate(
     capture: Capture,
     T_world_cam: NDArray[np.float64],
     frames: Sequence[int],
@@ -42,18 +42,18 @@ def triangulated(
     """Points that two of ``frames`` see each. T_world_cam: (N, 4, 4), NaN where unknown."""
     posed = [frame for frame in frames if np.isfinite(T_world_cam[frame]).all()]
     progress.stage("triangulation", len(posed))
-    found: dict[int, tuple[orb_features.Features, NDArray[np.float64]]] = {}
+    found: dict[int, tuple[orb_features.OrbFeatures, NDArray[np.float64]]] = {}
     for done, (index, frame) in enumerate(read_ahead(capture, posed), start=1):
         if not isinstance(frame, FrameError):
             frame = prepared(frame)
-            detected = orb_features.detect(frame)
+            detected = orb_features.detect_features(frame)
             rays = detected.rays(frame.intrinsics).astype(np.float64)
             directions = np.concatenate((rays, np.ones((len(rays), 1))), axis=1) @ T_world_cam[index, :3, :3].T
             found[index] = detected, directions / np.linalg.norm(directions, axis=1, keepdims=True)
         progress.advance(done)
     points, seen_frame, seen_point, count = [], [], [], 0
     for a, b in _pairs(T_world_cam, list(found)):
-        rows = orb_features.match(found[a][0], found[b][0])
+        rows = orb_features.match_binary(found[a][0], found[b][0])
         met = _meeting(T_world_cam[a, :3, 3], found[a][1][rows[:, 0]], T_world_cam[b, :3, 3], found[b][1][rows[:, 1]])
         points.append(met)
         seen_frame += [np.full(len(met), a), np.full(len(met), b)]

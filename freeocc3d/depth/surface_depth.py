@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..core.types import Intrinsics
 from .building_planes import Layout
 from .cross_view_check import DepthImage
-from .photo_consistency import rays
+from .photo_consistency import compute_rays
 from .watertight_surface import SIDE_BY_SIDE, Surface
 
 _SPANNED, _FACING = 40.0, 0.4  # cells: no gap is spanned by longer edges, nor by what is seen at a cosine below that
@@ -16,11 +16,13 @@ _ALIKE = 0.2  # relative
 _SUREST, _LAYOUT_SIGMA, _SPANNED_SIGMA = 0.005, 0.01, 0.04  # standard deviations over depth
 
 
-def surface_depth(surface: Surface, layout: Layout, camera: Intrinsics, T_world_cam: NDArray[np.float64]) -> DepthImage:
+def render_surface_depth(
+    surface: Surface, layout: Layout, camera: Intrinsics, T_world_cam: NDArray[np.float64]
+) -> DepthImage:
     """The surface as a camera sees it, where it was measured; where it only spans a gap, the layout's plane near it, or
     else what spans the gap, if that is small."""
     origin = T_world_cam[:3, 3]
-    directions = np.moveaxis(rays(camera).numpy().astype(np.float64), 0, -1) @ T_world_cam[:3, :3].T
+    directions = np.moveaxis(compute_rays(camera).numpy().astype(np.float64), 0, -1) @ T_world_cam[:3, :3].T
     met = surface.met(origin, directions)
     times = met.times.astype(np.float64)
     times[times < surface.cell_m] = 0.0  # a surface through the camera itself
@@ -36,7 +38,7 @@ def surface_depth(surface: Surface, layout: Layout, camera: Intrinsics, T_world_
     return DepthImage(inverse.astype(np.float32), sigma.astype(np.float32), camera, T_world_cam)
 
 
-def own_where_alike(own: DepthImage, surface: DepthImage) -> DepthImage:
+def prefer_own_depth(own: DepthImage, surface: DepthImage) -> DepthImage:
     """What a view measured itself where the ``surface`` does not contradict it, as this merges what is closer together
     than its cells and puts it where the poses of all views say, not this one's; elsewhere the surface."""
     use = (own.inverse > 0) & (np.abs(own.inverse - surface.inverse) < _ALIKE * surface.inverse)

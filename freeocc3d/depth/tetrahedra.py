@@ -26,7 +26,7 @@ class Tetrahedra:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class CellVotes:
     """What rays say of cells.
 
     free, full: (T + 1,) rays that say that a cell is.  facets: (T, 4) price of a surface between a free tetrahedron and
@@ -38,19 +38,19 @@ class Evidence:
     facets: NDArray[np.float64]
 
 
-def tetrahedra(vertices: NDArray[np.float64]) -> Tetrahedra:
+def tetrahedralize(vertices: NDArray[np.float64]) -> Tetrahedra:
     """The Delaunay tetrahedra of (V, 3) vertices, of which there must be five that do not lie in a plane."""
     found = Delaunay(vertices - vertices.mean(axis=0))
     beside = np.where(found.neighbors < 0, len(found.simplices), found.neighbors)
     return Tetrahedra(vertices, found.simplices.astype(np.int32), beside.astype(np.int32))
 
 
-def evidence(
+def collect_votes(
     space: Tetrahedra,
     ray_point: NDArray[np.int32],
     ray_camera: NDArray[np.int32],
     sigma_m: NDArray[np.float64],
-) -> Evidence:
+) -> CellVotes:
     """Each ray votes with one for the cell of its camera to be free, for the one ``BEHIND`` its point to be full, and
     against a surface on its way, less so the nearer to its point: 1 - exp(-d² / 2 sigma²) at the distance d.
 
@@ -60,17 +60,17 @@ def evidence(
     order = np.argsort(space.corners, axis=None, kind="stable")
     around = (order // 4).astype(np.int32)
     first = np.searchsorted(space.corners.reshape(-1)[order], np.arange(len(space.vertices) + 1))
-    found = Evidence(np.zeros(count + 1), np.zeros(count + 1), np.zeros((count, 4)))
+    found = CellVotes(np.zeros(count + 1), np.zeros(count + 1), np.zeros((count, 4)))
     vertices = space.vertices - space.vertices.mean(axis=0)
     _march(
-        vertices, space.corners, space.beside, planes(vertices, space.corners), first, around, ray_point, ray_camera,
-        sigma_m, found.free, found.full, found.facets,
+        vertices, space.corners, space.beside, compute_facet_planes(vertices, space.corners), first, around, ray_point,
+        ray_camera, sigma_m, found.free, found.full, found.facets,
     )  # fmt: skip
     return found
 
 
 @njit(cache=True, nogil=True)
-def planes(vertices, corners):  # type: ignore[no-untyped-def]
+def compute_facet_planes(vertices, corners):  # type: ignore[no-untyped-def]
     """(T, 4, 4) of each facet (opposite a corner) its unit normal, which points outwards, and its offset along it."""
     out = np.empty((*corners.shape, 4))
     for cell in range(len(corners)):

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .cross_view_check import DepthImage
-from .photo_consistency import Matcher, View
-from .semi_global import aggregated, jumps
+from .photo_consistency import Matcher, StereoView
+from .semi_global import aggregate_costs, price_jumps
 
 _FEWEST, _MOST_HYPOTHESES = 32, 160
 _CONTRAST = 4.0 / 255.0  # a change of grey beyond this may be the edge of something
@@ -26,21 +26,26 @@ _SUREST, _UNSURE = 0.25, 1.0  # pixels: what no match is better than, and what i
 _STEADY = 1.5  # pixels by which refinement may still move
 
 
-def swept(view: View, others: Sequence[View], near: float, far: float, device: str) -> Tensor:
+def sweep_planes(view: StereoView, others: Sequence[StereoView], near: float, far: float, device: str) -> Tensor:
     """(H, W) inverse depths of a small view, by plane sweep over near…far metres and semi-global aggregation."""
     matcher = Matcher(view, others, _RADIUS, device)
     least, most = 1.0 / far, 1.0 / near
     count = int(np.clip(np.ceil((most - least) / matcher.pixel), _FEWEST, _MOST_HYPOTHESES))
     hypotheses = torch.linspace(least, most, count, device=matcher.device)
     costs = (1.0 - matcher.agreement(hypotheses[:, None, None])).permute(1, 2, 0).contiguous()
-    totals = aggregated(costs, _STEP, *jumps(matcher.grey, *_JUMPS, _CONTRAST))
+    totals = aggregate_costs(costs, _STEP, *price_jumps(matcher.grey, *_JUMPS, _CONTRAST))
     best = totals.argmin(dim=-1, keepdim=True).clamp(1, count - 2)
     shift, _ = _vertex(*(-totals.gather(-1, best + k)[..., 0] for k in (-1, 0, 1)))
     return least + (best[..., 0] + shift.clamp(-0.5, 0.5)) * ((most - least) / (count - 1))
 
 
-def measured(
-    view: View, others: Sequence[View], apart: Sequence[View], near: float, far: float, device: str = "cpu"
+def measure_depth(
+    view: StereoView,
+    others: Sequence[StereoView],
+    apart: Sequence[StereoView],
+    near: float,
+    far: float,
+    device: str = "cpu",
 ) -> DepthImage:
     """What the photographs say: inverse depths where patches match well and in one place only, 0 elsewhere.
 
@@ -53,7 +58,7 @@ def measured(
     camera = view.intrinsics
     longer = max(camera.width, camera.height)
     first = min(longer / 2, max(longer / 4, _LEAST_SWEPT)) / longer
-    coarse = swept(_scaled(view, first), [_scaled(other, first) for other in others], near, far, device)
+    coarse = sweep_planes(_scaled(view, first), [_scaled(other, first) for other in others], near, far, device)
     second = 2.0 * first
     finder = Matcher(_scaled(view, second), [_scaled(other, second) for other in others], _RADIUS, device)
     inverse = _all_refined(finder, coarse)[0]
@@ -65,30 +70,30 @@ def measured(
     return DepthImage(_array(inverse * sure), _array(sigma), camera, view.T_world_cam)
 
 
-def median(image: Tensor) -> Tensor:
+def filter_median(image: Tensor) -> Tensor:
     """(H, W) median of 5 x 5 pixels."""
     if image.device.type == "cpu":
         return torch.from_numpy(cv2.medianBlur(image.numpy(), 5))
-    return unfolded_median(image)
+    return filter_median_reference(image)
 
 
-def unfolded_median(image: Tensor) -> Tensor:
-    """``median`` by torch, on any device."""
+def filter_median_reference(image: Tensor) -> Tensor:
+    """``filter_median`` by torch, on any device."""
     padded = F.pad(image[None, None], (2, 2, 2, 2), mode="replicate")
     return F.unfold(padded, 5).median(dim=1)[0].view(image.shape)
 
 
-def _scaled(view: View, by: float) -> View:
+def _scaled(view: StereoView, by: float) -> StereoView:
     camera = view.intrinsics
     return view.shrunk(round(camera.width * by), round(camera.height * by))
 
 
 def _all_refined(matcher: Matcher, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Inverse depths refined from those of a smaller image; those before the last step; scores; sigmas."""
-    inverse = F.interpolate(median(inverse)[None, None], matcher.grey.shape, mode="bilinear")[0, 0]
+    inverse = F.interpolate(filter_median(inverse)[None, None], matcher.grey.shape, mode="bilinear")[0, 0]
     before = score = sigma = inverse
     for pixels in _REFINED:
-        before = median(inverse)
+        before = filter_median(inverse)
         inverse, score, sigma = _refined(matcher, before, pixels * matcher.pixel)
     return inverse, before, score, sigma
 

@@ -14,7 +14,7 @@ _OUTLIERS = 2.0  # per cent of the points at either end
 _LEAST_POINTS = 20
 
 
-class Angles(NamedTuple):
+class ViewAngles(NamedTuple):
     """Degrees between the rays of a point: the best, and the standard deviations below and above it."""
 
     best: float
@@ -22,15 +22,15 @@ class Angles(NamedTuple):
     above: float
 
 
-ALIKE = Angles(8.0, 3.0, 8.0)
+ALIKE = ViewAngles(8.0, 3.0, 8.0)
 """Images are much alike still: for matches that have to be found."""
 
-APART = Angles(14.0, 6.0, 10.0)
+APART = ViewAngles(14.0, 6.0, 10.0)
 """Depth is surer: for matches that are known to a pixel or two."""
 
 
 @dataclass(frozen=True)
-class Chosen:
+class SelectedViews:
     """partners: per frame, indices of the views to compare it with, the best first; empty where it has none.
     near, far: (N,) metres between which its pixels' depths lie."""
 
@@ -39,14 +39,14 @@ class Chosen:
     far: NDArray[np.float64]
 
 
-def neighbours(
+def select_partners(
     T_world_cam: NDArray[np.float64],
     points: NDArray[np.float32],
     seen_frame: NDArray[np.int32],
     seen_point: NDArray[np.int32],
     count: int,
-    angles: Angles = ALIKE,
-) -> Chosen:
+    angles: ViewAngles = ALIKE,
+) -> SelectedViews:
     """Up to ``count`` partners of each frame.
 
     T_world_cam: (N, 4, 4), NaN where unknown.  points: (P, 3) world.  seen_frame, seen_point: (O,) a point is seen in a
@@ -86,4 +86,4 @@ def neighbours(
         score = np.bincount(other, weight, frames)
         ranked = np.argsort(-score, kind="stable")[:count]
         partners.append(ranked[score[ranked] >= _LEAST_WEIGHT])
-    return Chosen(partners, near * _MARGIN[0], far * _MARGIN[1])
+    return SelectedViews(partners, near * _MARGIN[0], far * _MARGIN[1])

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from .scan_points import Points
-from .tetrahedra import Evidence, Tetrahedra, evidence, tetrahedra
+from .scan_points import ScanPoints
+from .tetrahedra import CellVotes, Tetrahedra, collect_votes, tetrahedralize
 
 SIDE_BY_SIDE = 6.0
 """Cells: triangles with longer edges span what nothing was measured of."""
@@ -30,7 +30,7 @@ _LARGEST = (1 << 30) - 1  # the solver adds two capacities in 32 bits
 
 
 @dataclass(frozen=True)
-class Hits:
+class RayHits:
     """Per ray: how many times its direction reaches the surface (0 = never); of the triangle that is met there, the
     longest edge and the median of the corners' standard deviations, metres, and the cosine between normal and ray."""
 
@@ -50,7 +50,7 @@ class Surface:
     triangles: NDArray[np.int32]
     cell_m: float
 
-    def met(self, origin: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
+    def met(self, origin: NDArray[np.float64], directions: NDArray[np.float64]) -> RayHits:
         """What (H, W, 3) directions from ``origin`` meet first."""
         from open3d import core
 
@@ -60,12 +60,12 @@ class Surface:
         hit = np.isfinite(times)
         triangle = np.where(hit, found["primitive_ids"].numpy(), 0).astype(np.int64)
         if not hit.any():
-            return Hits(*(np.zeros_like(times) for _ in range(4)))
+            return RayHits(*(np.zeros_like(times) for _ in range(4)))
         edge_m, sigma_m = self._of_triangles
         normals = found["primitive_normals"].numpy()
         lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(directions, axis=-1)
         cosine = (np.abs((normals * directions).sum(axis=-1)) / np.maximum(lengths, 1e-12)).astype(np.float32)
-        return Hits(*(np.where(hit, a, 0.0) for a in (times, edge_m[triangle], sigma_m[triangle], cosine)))
+        return RayHits(*(np.where(hit, a, 0.0) for a in (times, edge_m[triangle], sigma_m[triangle], cosine)))
 
     def normals(self) -> NDArray[np.float64]:
         """(N, 3) of the triangles whose corners were measured side by side."""
@@ -91,23 +91,25 @@ class Surface:
         return edges, np.median(self.sigma_m[self.triangles], axis=1)
 
 
-def watertight(points: Points, centres: NDArray[np.float64]) -> Surface:
+def build_surface(points: ScanPoints, centres: NDArray[np.float64]) -> Surface:
     """The surface of points that cameras at (C, 3) ``centres`` measured; its triangles turn counterclockwise seen from
     the free side. There must be five points and centres that do not lie in a plane."""
     count = len(points.points)
-    space = tetrahedra(np.concatenate((points.points, centres)))
+    space = tetrahedralize(np.concatenate((points.points, centres)))
     soft = np.maximum(_SOFT * points.sigma_m, 0.5 * points.cell_m)
-    seen = evidence(space, points.ray_point, (points.ray_camera + count).astype(np.int32), soft)
-    free = cut(space, seen)
+    seen = collect_votes(space, points.ray_point, (points.ray_camera + count).astype(np.int32), soft)
+    free = cut_cells(space, seen)
     sigma_m = np.concatenate((points.sigma_m, np.zeros(len(centres))))
-    return Surface(space.vertices.astype(np.float32), sigma_m.astype(np.float32), boundary(space, free), points.cell_m)
+    return Surface(
+        space.vertices.astype(np.float32), sigma_m.astype(np.float32), extract_boundary(space, free), points.cell_m
+    )
 
 
-def cut(space: Tetrahedra, seen: Evidence) -> NDArray[np.bool_]:
+def cut_cells(space: Tetrahedra, seen: CellVotes) -> NDArray[np.bool_]:
     """(T + 1,) whether a cell is free, such that the facets between free and full ones, and the cells called what rays
     say that they are not, cost least."""
     outside = len(space.corners)
-    round_ = roundness(space.vertices - space.vertices.mean(axis=0), space.corners)
+    round_ = measure_roundness(space.vertices - space.vertices.mean(axis=0), space.corners)
     cell, facet = np.nonzero(space.beside < outside)
     after = space.beside[cell, facet]
     back = np.argmax(space.beside[after] == cell[:, None], axis=1)
@@ -133,7 +135,7 @@ def cut(space: Tetrahedra, seen: Evidence) -> NDArray[np.bool_]:
     return free[:-2]
 
 
-def boundary(space: Tetrahedra, free: NDArray[np.bool_]) -> NDArray[np.int32]:
+def extract_boundary(space: Tetrahedra, free: NDArray[np.bool_]) -> NDArray[np.int32]:
     """(F, 3) vertices of the facets between free and full cells, counterclockwise seen from the free side."""
     outside = len(space.corners)
     differ = free[:-1, None] != free[space.beside]
@@ -145,7 +147,7 @@ def boundary(space: Tetrahedra, free: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 @njit(cache=True, nogil=True)
-def roundness(vertices, corners):  # type: ignore[no-untyped-def]
+def measure_roundness(vertices, corners):  # type: ignore[no-untyped-def]
     """(T, 4) cosine between each facet (opposite a corner) and the sphere through the corners, -1…1: low where the
     tetrahedron is a needle or a sliver before that facet."""
     out = np.empty(corners.shape)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..core.errors import MapError
-from ..core.hash_table import build_table, find
+from ..core.hash_table import build_table, find_row
 from ..core.progress import Progress
 from ..core.transforms import depth_sigma
 from ..core.types import BLOCK, OCCUPIED, Gaussians, Occupancy, PosedFrame
@@ -34,7 +34,7 @@ from ..settings.config import Config
 from ..storage import store
 from ..storage.store import Map, load_map
 from ..storage.work_folder import WorkFolder
-from .box_refinement import SMALLEST_VOXEL_M, features_again, lifted, settings_of
+from .box_refinement import SMALLEST_VOXEL_M, lift_features_again, lift_gaussians, read_settings
 
 _CUBE = 2
 """Voxels along the edge of the cubes in which the surface is compared with a plane: 4 x 4 Gaussians on a flat one."""
@@ -47,7 +47,7 @@ _NEIGHBOURS, _ALIKE = 6, 0.8
 _ROWS = 16384
 
 
-def halvings(voxel_size: float, finest: float) -> int:
+def count_halvings(voxel_size: float, finest: float) -> int:
     """How often ``voxel_size`` is halved to reach ``finest``, metres. Raises MapError if it never is."""
     count = round(math.log2(voxel_size / finest)) if 0 < finest <= voxel_size else -1
     if count < 0 or finest < SMALLEST_VOXEL_M or abs(voxel_size / 2**count / finest - 1) > 1e-6:
@@ -60,7 +60,7 @@ def halvings(voxel_size: float, finest: float) -> int:
     return count
 
 
-def adaptive(
+def build_adaptive(
     base: Occupancy,
     gaussians: Gaussians,
     features: NDArray[np.float16],
@@ -77,7 +77,7 @@ def adaptive(
     each time that it is called.  T_world_keyframe: (K, 4, 4).  encode: layer 3 for further Gaussians.  settings: the
     map's configuration.  Raises MapError for a size that halving does not reach.
     """
-    count = halvings(base.voxel_size, finest)
+    count = count_halvings(base.voxel_size, finest)
     changing = _changing(gaussians.means, features)
     tree = cKDTree(gaussians.means) if len(gaussians) else None
     occupied = np.sort(pack(base.keys[(base.state == OCCUPIED).any(axis=1)]))
@@ -90,8 +90,8 @@ def adaptive(
             break
         size = base.voxel_size / 2**level
         region = Blocks(split, base.origin, 2 * BLOCK * size)
-        made = lifted(posed, region, size, settings, T_world_keyframe, progress)
-        parts = np.sort(pack(levels.children(unpack(split))))
+        made = lift_gaussians(posed, region, size, settings, T_world_keyframe, progress)
+        parts = np.sort(pack(levels.subdivide_keys(unpack(split))))
         split = parts[:0]
         if level < count and tree is not None and len(made):
             nearest = np.asarray(tree.query(made.means, workers=-1)[1])
@@ -104,20 +104,20 @@ def adaptive(
     ends = np.cumsum([0, *(len(made) for made in found)])
     carving: carve.Options = registry.build_options(carve, settings["carving"])
     sizes = [base.voxel_size / 2**level for level in range(1, len(found) + 1)]
-    seen = [carve.Evidence(base.origin, size, carving, own) for size, own in zip(sizes, leaves, strict=True)]
+    seen = [carve.DepthEvidence(base.origin, size, carving, own) for size, own in zip(sizes, leaves, strict=True)]
     progress.stage("occupancy", len(T_world_keyframe))
     for done, look in enumerate(posed(), 1):
         for evidence in seen:
             evidence.add(look.frame, look.T_world_cam)
         progress.advance(done)
-    levelled = [levels.chosen_blocks(base, whole)]
+    levelled = [levels.select_blocks(base, whole)]
     for n, (size, own, evidence) in enumerate(zip(sizes, leaves, seen, strict=True)):
         splatting: splat.Options = registry.build_options(splat, {**settings["occupancy"], "voxel_size": size})
         bins = splat.bin_gaussians(found[n], base.origin, splatting).only(own)
         mine = all_features[ends[n] : ends[n + 1]]
-        part = build.of_blocks(own, bins, found[n], mine, evidence, splatting, carving)
-        levelled.append(levels.chosen_blocks(part, levels.says_something(part)))
-    return levels.combined(levelled)
+        part = build.build_blocks(own, bins, found[n], mine, evidence, splatting, carving)
+        levelled.append(levels.select_blocks(part, levels.mask_known_blocks(part)))
+    return levels.combine_levels(levelled)
 
 
 def refine_where_needed(
@@ -130,10 +130,10 @@ def refine_where_needed(
     base = scan_map.occupancy
     if base.deepest:
         raise MapError(f"{scan_map.path} has voxels of several sizes already: refine the map that it was made of.")
-    if not halvings(base.voxel_size, finest):
+    if not count_halvings(base.voxel_size, finest):
         raise MapError(f"{scan_map.path} has voxels of {finest:g} m already: give a smaller size.")
     work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
-    settings, trajectory = settings_of(scan_map), scan_map.trajectory
+    settings, trajectory = read_settings(scan_map), scan_map.trajectory
     settings["occupancy"]["finest"] = finest
 
     def posed() -> Iterator[PosedFrame]:
@@ -141,9 +141,11 @@ def refine_where_needed(
             yield PosedFrame(frame, T, row)
 
     def encode(gaussians: Gaussians) -> NDArray[np.float16]:
-        return features_again(scan_map, scan_map.keyframes, trajectory.T_world_keyframe, gaussians, settings, progress)
+        return lift_features_again(
+            scan_map, scan_map.keyframes, trajectory.T_world_keyframe, gaussians, settings, progress
+        )
 
-    occupancy = adaptive(
+    occupancy = build_adaptive(
         base, scan_map.gaussians, scan_map.gaussian_features, posed, trajectory.T_world_keyframe, encode, settings,
         finest, progress,
     )  # fmt: skip
@@ -238,6 +240,6 @@ def _inside(
         for i in range(math.floor(x - margin), math.floor(x + margin) + 1):
             for j in range(math.floor(y - margin), math.floor(y + margin) + 1):
                 for k in range(math.floor(z - margin), math.floor(z + margin) + 1):
-                    if find(table, rows, packed_key(i, j, k)) >= 0:
+                    if find_row(table, rows, packed_key(i, j, k)) >= 0:
                         inside[p] = True
     return inside

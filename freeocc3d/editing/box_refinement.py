@@ -26,7 +26,7 @@ from ..core.transforms import back_project, transform
 from ..core.tum_files import write_tum
 from ..core.types import BLOCK, Frame, Gaussians, Occupancy, PosedFrame, Trajectory
 from ..gaussians import anchors
-from ..gaussians.point_cloud import write_ply
+from ..gaussians.point_cloud import write_gaussian_ply
 from ..language import lifting
 from ..language.feature_codec import Codec
 from ..occupancy import build, carve, splat
@@ -64,12 +64,12 @@ class Box:
         return np.asarray(((points >= self.low - margin) & (points <= self.high + margin)).all(axis=1))
 
 
-def around(region: Region, voxel_size: float) -> Box:
+def enclose_region(region: Region, voxel_size: float) -> Box:
     """The box of what a query found, and two of the map's voxels around it."""
     return Box(region.box_min - 2 * voxel_size, region.box_max + 2 * voxel_size)
 
 
-def refine(
+def refine_box(
     scan_map: Map,
     box: Box,
     voxel_size: float,
@@ -97,7 +97,7 @@ def refine(
             f"one of up to {edge:.1f} m an edge, or larger voxels."
         )
     work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
-    settings = settings_of(scan_map)
+    settings = read_settings(scan_map)
     settings["occupancy"]["voxel_size"] = voxel_size
     seeing, rows, trajectory = _seeing(scan_map, box, AROUND * voxel_size, progress)
     trajectory = trajectory.only_keyframes(trajectory.keyframes[rows])
@@ -107,10 +107,10 @@ def refine(
         for row, frame in enumerate(seeing):
             yield PosedFrame(frame, poses[row], row)
 
-    gaussians = lifted(posed, box, voxel_size, settings, poses, progress)
+    gaussians = lift_gaussians(posed, box, voxel_size, settings, poses, progress)
     if not len(gaussians):
         raise MapError(f"No keyframe of {scan_map.path} shows a surface in the box: nothing can be refined there.")
-    features = features_again(scan_map, seeing, poses, gaussians, settings, progress)
+    features = lift_features_again(scan_map, seeing, poses, gaussians, settings, progress)
     progress.stage("occupancy", len(seeing))
     occupancy = build.build_occupancy(
         gaussians,
@@ -130,7 +130,7 @@ def refine(
         for frame in seeing:
             keyframes.append(frame)
         keyframes.save_index()
-        write_ply(gaussians, folder / store.GAUSSIANS)
+        write_gaussian_ply(gaussians, folder / store.GAUSSIANS)
         store.write_occupancy(folder, occupancy, Codec.fit(features), features)
         write_tum(folder / store.TRAJECTORY, trajectory)
         (folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
@@ -138,7 +138,7 @@ def refine(
     return load_map(output)
 
 
-def settings_of(scan_map: Map) -> Config:
+def read_settings(scan_map: Map) -> Config:
     """The map's own; on the processor wherever the map was made."""
     settings = config.load(scan_map.path / store.CONFIG)
     settings["occupancy"]["device"] = "cpu"
@@ -195,7 +195,7 @@ class Space(Protocol):
         """(P,) whether each of (P, 3) points is inside, or no farther outside than the margin along any axis."""
 
 
-def lifted(
+def lift_gaussians(
     posed: Callable[[], Iterator[PosedFrame]],
     space: Space,
     voxel_size: float,
@@ -223,7 +223,7 @@ def lifted(
     return gaussians[space.contains(gaussians.means, margin)]
 
 
-def features_again(
+def lift_features_again(
     scan_map: Map,
     frames: Sequence[Frame],
     T_world_cam: NDArray[np.float64],
@@ -244,7 +244,7 @@ def features_again(
         nearest = cKDTree(scan_map.gaussians.means).query(gaussians.means)[1]
         return scan_map.gaussian_features[nearest]
     options: lifting.Options = registry.build_options(lifting, config.options(settings, "language"))
-    return lifting.lift(gaussians, frames, T_world_cam, encoder, options, progress)
+    return lifting.lift_features(gaussians, frames, T_world_cam, encoder, options, progress)
 
 
 def _capture(scan_map: Map, settings: Config) -> Capture:

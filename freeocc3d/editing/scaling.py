@@ -23,16 +23,16 @@ from ..core.errors import FreeOccError, MapError
 from ..core.transforms import back_project, transform
 from ..core.tum_files import write_tum
 from ..core.types import Gaussians, Submap, Trajectory
-from ..evaluation.scoring import capture_of
+from ..evaluation.scoring import reopen_capture
 from ..gaussians import rendered_views
-from ..gaussians.point_cloud import write_ply
-from ..occupancy.gravity_frame import floor_seen
+from ..gaussians.point_cloud import write_gaussian_ply
+from ..occupancy.gravity_frame import is_floor_seen
 from ..settings import config, registry
 from ..settings.config import Config
 from ..storage import store
 from ..storage.store import Map, load_map
 from ..storage.work_folder import WorkFolder
-from ..tracking.trajectory_alignment import Poses, align, estimated_poses, read_poses
+from ..tracking.trajectory_alignment import Poses, align_trajectories, read_poses, select_estimated_poses
 from ..viewer import render_pictures, trajectory_picture
 
 UNKNOWN = (
@@ -46,7 +46,7 @@ _LEAST_VOXEL_M = 0.001
 _FITS = 0.1  # of the spread of the cameras: poses that are farther off are another scan's
 
 
-def scaled(scan_map: Map, factor: float, by: str, output: str | Path, *, overwrite: bool = False) -> Map:
+def scale_map(scan_map: Map, factor: float, by: str, output: str | Path, *, overwrite: bool = False) -> Map:
     """Write the map with every length times ``factor``, after which lengths are metres, to the folder ``output``.
 
     by: where the factor is from, for the manifest. Raises MapError: no usable factor, or the folder exists.
@@ -69,7 +69,7 @@ def scaled(scan_map: Map, factor: float, by: str, output: str | Path, *, overwri
         for name in (store.OCCUPANCY, store.FEATURES):
             shutil.copyfile(scan_map.path / name, folder / name)
         scan_map.keyframes.write_scaled(folder / store.KEYFRAMES, factor)
-        write_ply(gaussians, folder / store.GAUSSIANS)
+        write_gaussian_ply(gaussians, folder / store.GAUSSIANS)
         write_tum(folder / store.TRAJECTORY, trajectory)
         (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
         _draw(scan_map, folder, trajectory, gaussians, factor)
@@ -77,7 +77,7 @@ def scaled(scan_map: Map, factor: float, by: str, output: str | Path, *, overwri
     return load_map(output)
 
 
-def by_length(scan_map: Map, ends: Sequence[str], metres: float) -> float:
+def scale_by_length(scan_map: Map, ends: Sequence[str], metres: float) -> float:
     """The factor by which two points are ``metres`` apart.
 
     ends: two of ``FRAME:X,Y``, a pixel of a keyframe, or of a word, for the middle of the best region that it matches.
@@ -91,23 +91,23 @@ def by_length(scan_map: Map, ends: Sequence[str], metres: float) -> float:
     return metres / length
 
 
-def by_camera_height(scan_map: Map, metres: float) -> float:
+def scale_by_camera_height(scan_map: Map, metres: float) -> float:
     """The factor by which the keyframes are ``metres`` above the floor, half of them more. Raises MapError where the
     map shows no floor below them."""
     _require_metres(metres, "camera height")
     T_gravity_map, poses = scan_map.T_gravity_map, scan_map.trajectory.T_world_keyframe
-    if not floor_seen(T_gravity_map, poses, scan_map.gaussians):
+    if not is_floor_seen(T_gravity_map, poses, scan_map.gaussians):
         raise MapError(f"{scan_map.path} shows no floor below the cameras: give a known length instead (--length).")
     height = float(np.median(transform(T_gravity_map, poses[:, :3, 3])[:, 2]))
     return metres / height
 
 
-def by_poses(scan_map: Map, path: str) -> float:
+def scale_by_poses(scan_map: Map, path: str) -> float:
     """The factor by which the cameras' way is that of metric poses: a capture's, or a file's in any form that
     ``capture.read_trajectory`` knows. Raises FreeOccError: too few that match, or another way altogether."""
-    own = estimated_poses(scan_map.trajectory)
+    own = select_estimated_poses(scan_map.trajectory)
     metric = _metric_poses(scan_map, path)
-    found = align(own, metric, "sim3")
+    found = align_trajectories(own, metric, "sim3")
     rows, rows_metric = associate(own.timestamps, metric.timestamps)
     centers = metric.centers[rows_metric]
     off = float(np.median(np.linalg.norm(found.to_true(own.centers[rows]) - centers, axis=1)))
@@ -123,7 +123,7 @@ def by_poses(scan_map: Map, path: str) -> float:
 def _metric_poses(scan_map: Map, path: str) -> Poses:
     """Those of a file that knows images by name are matched to the capture, if it is still there."""
     if Path(path).is_file() and (found := read_trajectory(path)).names:
-        T = found.of_frames(capture := capture_of(scan_map))
+        T = found.of_frames(capture := reopen_capture(scan_map))
         has_pose = np.isfinite(T).all(axis=(1, 2))
         return Poses(capture.timestamps[has_pose], T[has_pose])
     return read_poses(path)
@@ -228,7 +228,7 @@ def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussi
     ends = np.array([closure[:2] for closure in closures], np.int32).reshape(-1, 2)
     held = np.array([closure[2] for closure in closures], bool)
     submap = Submap(frames, trajectory.T_world_cam[frames], trajectory.keyframes, ends, held)
-    trajectory_picture.path_picture(
+    trajectory_picture.write_path_picture(
         folder / store.PATH_PICTURE, [submap], trajectory, gaussians, np.array(scan_map.manifest["up"]), capture
     )
     rasterizer = registry.load("gaussians.rasterizers", "cpu").load()
@@ -238,6 +238,6 @@ def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussi
     for row in np.unique(np.linspace(0, len(keyframes) - 1, render_pictures.SHOWN).astype(int)).tolist():
         frame = keyframes[row]
         frame = frame.scaled(factor)
-        view = rendered_views.view_of(frame, trajectory.T_world_keyframe[row], width, rasterizer.device)
+        view = rendered_views.prepare_captured_view(frame, trajectory.T_world_keyframe[row], width, rasterizer.device)
         shown.append((int(trajectory.keyframes[row]), view))
-    render_pictures.render_picture(folder / store.RENDER_PICTURE, gaussians, shown, rasterizer, capture)
+    render_pictures.write_render_picture(folder / store.RENDER_PICTURE, gaussians, shown, rasterizer, capture)

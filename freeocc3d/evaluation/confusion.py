@@ -30,7 +30,7 @@ class Prediction:
     labels: NDArray[np.uint8] | None = None
 
 
-def confusion(
+def count_confusion(
     labels_true: NDArray[np.uint8], predicted: Prediction, mask: NDArray[np.bool_], classes: int
 ) -> NDArray[np.int64]:
     """(C + 1, C + 2) voxels inside the mask by truth (rows: free, class 1 … C) and prediction (columns: not occupied,
@@ -60,7 +60,7 @@ def confusion(
 class Scores:
     """Fractions 0…1 from a pooled confusion matrix; one without a denominator is 0.
 
-    matrix: (C + 1, C + 2), see ``confusion``.  classes: names of class 1 … C.
+    matrix: (C + 1, C + 2), see ``count_confusion``.  classes: names of class 1 … C.
     """
 
     matrix: NDArray[np.int64]

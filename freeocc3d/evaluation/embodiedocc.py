@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError
 from ..core.types import UNKNOWN
-from .restricted_unpickler import load_pickle, short
+from .restricted_unpickler import load_pickle, shorten
 from .scored_classes import EMBODIEDOCC
 from .true_occupancy import GroundTruth
 
@@ -63,11 +63,11 @@ def load_global_package(path: Path, classes: tuple[str, ...] | None = None) -> G
             "names of all the data set's classes, in its order, with --classes."
         )
     folder = path.absolute().parent.parent / FRAMES_FOLDER
-    mask_of_frames = frames_mask(folder, path.stem, shape, _frame_names(package, path))
+    mask_of_frames = load_frames_mask(folder, path.stem, shape, _frame_names(package, path))
     return GroundTruth(labels, origin, voxel_size, names, mask_of_frames)
 
 
-def frames_mask(
+def load_frames_mask(
     folder: Path, scene: str, shape: tuple[int, int, int], frames: Sequence[str] | None = None
 ) -> NDArray[np.bool_] | None:
     """(X, Y, Z) bool, the union of ``mask_in_global`` over a scene's frames; None if the folder has none of them.
@@ -165,7 +165,7 @@ def _load_dict(path: Path) -> dict[Any, Any]:
 def _value(package: dict[Any, Any], key: str, path: Path) -> Any:
     if key not in package:
         there = ", ".join(name for name in package if isinstance(name, str)) or "nothing by name"
-        raise FreeOccError(f"{path} has no '{key}'; it holds {short(there)}.")
+        raise FreeOccError(f"{path} has no '{key}'; it holds {shorten(there)}.")
     return package[key]
 
 
@@ -282,5 +282,7 @@ def _scene_of(entry: str, path: Path) -> str:
     if match := re.search(r"(?<![A-Za-z0-9])scene\d{4}_\d{2}(?!\d)", entry):
         return match[0]
     if entry.startswith("scene") or not re.fullmatch(r"[A-Za-z]\w*(-\w+)*", entry):
-        raise FreeOccError(f"The split {path} has an entry '{short(entry)}' that names no scene, such as scene0000_00.")
+        raise FreeOccError(
+            f"The split {path} has an entry '{shorten(entry)}' that names no scene, such as scene0000_00."
+        )
     return entry

@@ -28,8 +28,8 @@ def load_ground_truth(path: str | Path, classes: tuple[str, ...] | None = None) 
     if path.suffix == ".pkl":
         return load_global_package(path, classes)
     arrays = read_grid_arrays(path)
-    labels = array(arrays, "labels", path)
-    names = array(arrays, "classes", path)
+    labels = require_array(arrays, "labels", path)
+    names = require_array(arrays, "classes", path)
     if labels.dtype != np.uint8 or labels.ndim != 3:
         raise FreeOccError(f"'labels' of {path} must be uint8 (X, Y, Z), got {labels.dtype} {labels.shape}.")
     if names.dtype.kind != "U" or names.ndim != 1:
@@ -40,7 +40,7 @@ def load_ground_truth(path: str | Path, classes: tuple[str, ...] | None = None) 
     mask = arrays.get("frames_mask")
     if mask is not None and (mask.dtype != np.bool_ or mask.shape != labels.shape):
         raise FreeOccError(f"'frames_mask' of {path} must be bool {labels.shape}, got {mask.dtype} {mask.shape}.")
-    return GroundTruth(labels, *placed(arrays, path), tuple(names.tolist()), mask)
+    return GroundTruth(labels, *read_lattice(arrays, path), tuple(names.tolist()), mask)
 
 
 def save_ground_truth(truth: GroundTruth, path: Path, overwrite: bool = False) -> None:
@@ -73,10 +73,10 @@ def read_grid_arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise FreeOccError(str(error)) from error
 
 
-def placed(arrays: dict[str, NDArray[Any]], path: Path) -> tuple[NDArray[np.float64], float]:
+def read_lattice(arrays: dict[str, NDArray[Any]], path: Path) -> tuple[NDArray[np.float64], float]:
     """Origin (3,) and voxel size of a grid, metres. Raises FreeOccError."""
-    origin = array(arrays, "origin", path)
-    size = array(arrays, "voxel_size", path)
+    origin = require_array(arrays, "origin", path)
+    size = require_array(arrays, "voxel_size", path)
     if origin.dtype.kind != "f" or origin.shape != (3,) or not np.isfinite(origin).all():
         raise FreeOccError(f"'origin' of {path} must be three finite numbers in metres.")
     if size.dtype.kind != "f" or size.shape != () or not 1e-3 <= size <= 10:
@@ -84,7 +84,7 @@ def placed(arrays: dict[str, NDArray[Any]], path: Path) -> tuple[NDArray[np.floa
     return origin.astype(np.float64), float(size)
 
 
-def array(arrays: dict[str, NDArray[Any]], name: str, path: Path) -> NDArray[Any]:
+def require_array(arrays: dict[str, NDArray[Any]], name: str, path: Path) -> NDArray[Any]:
     """One of them. Raises FreeOccError if it is not there."""
     if name not in arrays:
         raise FreeOccError(f"{path} has no '{name}'; it holds {', '.join(arrays) or 'nothing'}.")

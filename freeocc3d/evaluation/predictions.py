@@ -25,17 +25,17 @@ from ..query import word_query
 from ..settings import registry
 from ..settings.config import Config
 from ..storage.store import Map
-from ..tracking.trajectory_alignment import Alignment, Poses
+from ..tracking.trajectory_alignment import Poses, TrajectoryAlignment
 from .confusion import Prediction
-from .ground_truth import array, placed, read_grid_arrays
+from .ground_truth import read_grid_arrays, read_lattice, require_array
 from .scored_classes import ClassMap
 from .true_occupancy import GroundTruth
 
 _SAME_SIZE, _SAME_LATTICE = 1e-4, 1e-3
 
 
-def of_map(
-    scan_map: Map, settings: Config, alignment: Alignment, truth: GroundTruth, classes: ClassMap
+def predict_from_map(
+    scan_map: Map, settings: Config, alignment: TrajectoryAlignment, truth: GroundTruth, classes: ClassMap
 ) -> tuple[Prediction, str]:
     """A map's claim, and one sentence about its classes if there is something to say.
 
@@ -44,7 +44,7 @@ def of_map(
     for (paper, s(x, c) = f(x)^T t_c).
     """
     splatting = _splatting(settings, truth)
-    gaussians = anchors.aligned(scan_map.gaussians, alignment.scale, alignment.rotation, alignment.translation)
+    gaussians = anchors.align_gaussians(scan_map.gaussians, alignment.scale, alignment.rotation, alignment.translation)
     text, targets, note = _words(scan_map.text_encoder, classes, truth)
     features = scan_map.gaussian_features if text is not None else np.zeros((len(gaussians), 0), np.float16)
     occupancy = build.build_occupancy(
@@ -68,11 +68,11 @@ def of_map(
     return Prediction(occupied, labels), note
 
 
-def of_gaussians(
+def predict_from_gaussians(
     gaussians: Gaussians,
     semantics: NDArray[np.floating] | None,
     settings: Config,
-    alignment: Alignment,
+    alignment: TrajectoryAlignment,
     truth: GroundTruth,
 ) -> Prediction:
     """The claim of N Gaussians without keyframes: occupied where alpha reaches the threshold, nothing carved.
@@ -80,10 +80,10 @@ def of_gaussians(
     semantics: (N, C) weight of each class 1 … C; a voxel takes the class of the largest posterior mean.
     """
     splatting = _splatting(settings, truth)
-    moved = anchors.aligned(gaussians, alignment.scale, alignment.rotation, alignment.translation)
+    moved = anchors.align_gaussians(gaussians, alignment.scale, alignment.rotation, alignment.translation)
     bins = splat.bin_gaussians(moved, truth.origin, splatting, truth.shape)
     keys = unpack(bins.packed)
-    probability = splat.probability(bins, keys)
+    probability = splat.compute_probability(bins, keys)
     block, local = np.nonzero(probability >= splatting.threshold)
     voxels = keys[block] * BLOCK + np.stack((local // 64, local // 8 % 8, local % 8), axis=1)
     occupied = np.zeros(truth.shape, bool)
@@ -92,13 +92,13 @@ def of_gaussians(
         return Prediction(occupied)
     slots = np.full(probability.shape, -1, np.int32)
     slots[block, local] = np.arange(len(block))
-    mean = splat.posterior_mean(bins, keys, slots, semantics)
+    mean = splat.compute_posterior_mean(bins, keys, slots, semantics)
     labels = np.zeros(truth.shape, np.uint8)
     labels[tuple(voxels.T)] = np.where(mean.any(axis=1), mean.argmax(axis=1) + 1, 0)
     return Prediction(occupied, labels)
 
 
-def of_frames(
+def predict_from_frames(
     folder: Path, poses: Poses, settings: Config, truth: GroundTruth, classes: ClassMap
 ) -> tuple[Prediction, int]:
     """The claim of per-frame Gaussians fused by true poses, and the number of frames fused: the paper's protocol for
@@ -121,29 +121,31 @@ def of_frames(
     for time, T_world_cam in zip(times[rows], poses.T_world_cam[rows_true], strict=True):
         read = _read_frame if numbered[time].suffix == ".npz" else _read_labelled
         gaussians, weights = read(numbered[time], classes)
-        parts.append(anchors.aligned(gaussians, 1.0, T_world_cam[:3, :3], T_world_cam[:3, 3]))
+        parts.append(anchors.align_gaussians(gaussians, 1.0, T_world_cam[:3, :3], T_world_cam[:3, 3]))
         semantics.append(weights)
     fused = Gaussians(*(np.concatenate([getattr(p, name) for p in parts]) for name in Gaussians.__dataclass_fields__))
     known = [weights for weights in semantics if weights is not None]
     if known and len(known) < len(semantics):
         raise FreeOccError(f"Some files of {folder} hold classes and some do not: give all or none.")
     fused_semantics = np.concatenate(known) if known else None
-    return of_gaussians(fused, fused_semantics, settings, Alignment.identity(), truth), len(rows)
+    return predict_from_gaussians(fused, fused_semantics, settings, TrajectoryAlignment.identity(), truth), len(rows)
 
 
-def of_grid(path: Path, alignment: Alignment, truth: GroundTruth, classes: ClassMap) -> tuple[Prediction, str]:
+def predict_from_grid(
+    path: Path, alignment: TrajectoryAlignment, truth: GroundTruth, classes: ClassMap
+) -> tuple[Prediction, str]:
     """The claim of a finished voxel grid, read at the truth's voxel centres, and one sentence if the lattices differ.
 
     path: NPZ as ``export --format npz`` or a ground truth writes it. Raises FreeOccError: damaged, another voxel size.
     """
     arrays = read_grid_arrays(path)
-    origin, size = placed(arrays, path)
+    origin, size = read_lattice(arrays, path)
     if abs(size * alignment.scale / truth.voxel_size - 1) > _SAME_SIZE:
         raise FreeOccError(
             f"{path} has voxels of {size:g} m, the ground truth of {truth.voxel_size:g} m: make one with the other's, "
             "for a finished grid cannot be scored on another lattice."
         )
-    labels = array(arrays, "labels", path) if "occupancy" not in arrays else arrays.get("labels")
+    labels = require_array(arrays, "labels", path) if "occupancy" not in arrays else arrays.get("labels")
     grid = arrays.get("occupancy", labels)
     if (
         grid is None
@@ -181,7 +183,7 @@ def of_grid(path: Path, alignment: Alignment, truth: GroundTruth, classes: Class
     return Prediction(occupied, np.where(occupied, predicted, 0).astype(np.uint8)), note
 
 
-def _scaled(scan_map: Map, alignment: Alignment) -> Iterator[PosedFrame]:
+def _scaled(scan_map: Map, alignment: TrajectoryAlignment) -> Iterator[PosedFrame]:
     """Keyframes in the true frame, depth in its metres; a similarity scales the cameras' frames as well."""
     poses = alignment.poses(scan_map.trajectory.T_world_keyframe)
     for row, (frame, T) in enumerate(zip(scan_map.keyframes, poses, strict=True)):
@@ -195,11 +197,11 @@ def _splatting(settings: Config, truth: GroundTruth) -> splat.Options:
     return options
 
 
-def _least_scale(settings: Config, alignment: Alignment, truth: GroundTruth) -> float:
+def _least_scale(settings: Config, alignment: TrajectoryAlignment, truth: GroundTruth) -> float:
     """What the map's Gaussians are widened to on the truth's lattice, metres."""
     cell_size = settings["gaussians"]["cell_size"] or 0.5 * settings["occupancy"]["voxel_size"]
     options: anchors.Options = registry.build_options(anchors, settings["gaussians"])
-    return anchors.least_scale(options, alignment.scale * cell_size, truth.voxel_size)
+    return anchors.compute_least_scale(options, alignment.scale * cell_size, truth.voxel_size)
 
 
 def _words(
@@ -221,7 +223,7 @@ def _words(
     return chosen, np.array([*(classes.labels[words[row]] for row in rows), 0], np.uint8), note
 
 
-def one_hot(labels: NDArray[np.integer] | None, classes: ClassMap, path: Path) -> NDArray[np.float32] | None:
+def encode_one_hot(labels: NDArray[np.integer] | None, classes: ClassMap, path: Path) -> NDArray[np.float32] | None:
     """(N, C) from (N,) labels 1 … C, 0 or 255 for none. Raises FreeOccError for any other."""
     if labels is None:
         return None
@@ -236,16 +238,16 @@ def one_hot(labels: NDArray[np.integer] | None, classes: ClassMap, path: Path) -
 
 def _read_labelled(path: Path, classes: ClassMap) -> tuple[Gaussians, NDArray[np.float32] | None]:
     gaussians, labels = read_standard_ply(path)
-    return gaussians, one_hot(labels, classes, path)
+    return gaussians, encode_one_hot(labels, classes, path)
 
 
 def _read_frame(path: Path, classes: ClassMap) -> tuple[Gaussians, NDArray[np.float32] | None]:
     arrays = read_grid_arrays(path)
-    means = array(arrays, "means", path)
+    means = require_array(arrays, "means", path)
     n = len(means)
     shapes = {"means": (n, 3), "scales": (n, 3), "quats_wxyz": (n, 4), "opacities": (n,)}
     for name, shape in shapes.items():
-        values = array(arrays, name, path)
+        values = require_array(arrays, name, path)
         if values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
             raise FreeOccError(f"'{name}' of {path} must be finite numbers of shape {shape}, got {values.shape}.")
     fields = {name: arrays[name].astype(np.float32) for name in shapes}
@@ -256,7 +258,7 @@ def _read_frame(path: Path, classes: ClassMap) -> tuple[Gaussians, NDArray[np.fl
         anchor_cam=fields["means"],
     )
     if "labels" in arrays:
-        return gaussians, one_hot(arrays["labels"].astype(np.int64), classes, path)
+        return gaussians, encode_one_hot(arrays["labels"].astype(np.int64), classes, path)
     semantics = arrays.get("semantics")
     if semantics is not None and semantics.shape != (n, len(classes.classes)):
         raise FreeOccError(f"'semantics' of {path} must be {(n, len(classes.classes))}, got {semantics.shape}.")

@@ -23,7 +23,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from ..capture import base as capture_base
-from ..capture import open_capture, read_ahead, used_frames
+from ..capture import open_capture, read_ahead, select_frames
 from ..capture.base import Capture
 from ..core.errors import ConfigError, FrameError, FreeOccError
 from ..core.progress import Progress
@@ -74,7 +74,7 @@ class Options:
             raise ConfigError("'tolerance' and 'dilation' must not be negative.")
 
 
-def build(capture: str | Path, overrides: Sequence[str] = (), progress: Progress | None = None) -> GroundTruth:
+def build_truth(capture: str | Path, overrides: Sequence[str] = (), progress: Progress | None = None) -> GroundTruth:
     """The truth of the capture in a folder. overrides: "name=value" of ``Options``, or "capture.name=value".
 
     Raises FreeOccError: no poses, nothing measured, a grid too large for memory; ConfigError.
@@ -91,13 +91,13 @@ def build(capture: str | Path, overrides: Sequence[str] = (), progress: Progress
     options: Options = registry.build_options(_this_module(), own)
     settings = config.load(None, [f"capture.max_depth={options.max_range}", *of_capture])
     section = registry.build_options(capture_base, config.options(settings, "capture"))
-    return from_capture(open_capture(capture, section, settings["capture"]), options, progress)
+    return build_truth_from_capture(open_capture(capture, section, settings["capture"]), options, progress)
 
 
-def from_capture(capture: Capture, options: Options, progress: Progress | None = None) -> GroundTruth:
+def build_truth_from_capture(capture: Capture, options: Options, progress: Progress | None = None) -> GroundTruth:
     """The truth of an opened capture: poses and class images are its own. Frames without a pose are left out."""
     progress = progress or Progress()
-    frames = [index for index in used_frames(capture) if capture.pose(index) is not None]
+    frames = [index for index in select_frames(capture) if capture.pose(index) is not None]
     if not frames:
         raise FreeOccError(f"{capture.path} has no poses, from which alone a ground truth could be built.")
     names, labels_of = _classes(capture, frames)
@@ -115,7 +115,7 @@ def from_capture(capture: Capture, options: Options, progress: Progress | None =
         frames[:: options.frame_stride],
         "observed",
         progress,
-        lambda frame, T: observe(seen, frame, T, origin, options),
+        lambda frame, T: mark_observed(seen, frame, T, origin, options),
     )
     for _ in range(options.dilation):
         seen = _grown(seen)
@@ -180,7 +180,7 @@ class Votes:
             self._append(pairs[order], counts[order])
 
 
-def observe(
+def mark_observed(
     seen: NDArray[np.bool_],
     frame: Frame,
     T_world_cam: NDArray[np.float64],
@@ -230,7 +230,7 @@ def _observe(
                 seen[i, j, k] = measured > 0 and depth <= measured + tolerance
 
 
-def to_text(truth: GroundTruth, path: Path) -> str:
+def describe_truth(truth: GroundTruth, path: Path) -> str:
     """What was built, for people."""
     known = truth.labels != UNKNOWN
     occupied = known & (truth.labels != FREE)

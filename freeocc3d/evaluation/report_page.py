@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..core.atomic_files import write_whole
 from ..core.errors import DependencyError
-from ..viewer.grid_pictures import Grid, grid_pictures
-from ..viewer.palette import class_colors, ramp
-from ..viewer.scene_rendering import CUT, upright
-from .scoring import PRIMARY_MASK, TOP, Evaluation, Scene
+from ..viewer.grid_pictures import LabelGrid, draw_grids
+from ..viewer.palette import assign_class_colors, color_by_value
+from ..viewer.scene_rendering import CUT, turn_upright
+from .scoring import PRIMARY_MASK, TOP, Evaluation, ScoredScene
 
 MOST_SEGMENTS = 2000
 """Pieces that a drawn trajectory has at most."""
@@ -100,7 +100,7 @@ def _classes(evaluation: Evaluation) -> list[dict[str, Any]]:
     occupied as whatever, and what it was taken for."""
     scores = evaluation.scores
     matrix = scores.matrix
-    colors = class_colors(list(evaluation.classes))
+    colors = assign_class_colors(list(evaluation.classes))
     columns = [NOT_OCCUPIED, *evaluation.classes, NO_CLASS]
     rows = []
     for k in np.argsort(-scores.class_voxels, kind="stable"):
@@ -147,7 +147,7 @@ def _scene(own: Evaluation) -> dict[str, Any]:
     known = np.unique(scene.truth.labels[mask])
     if scene.predicted.labels is not None:
         known = np.union1d(known, scene.predicted.labels[mask])
-    colors = class_colors(list(own.classes))
+    colors = assign_class_colors(list(own.classes))
     return {
         "name": scene.name,
         "scores": own.scores,
@@ -168,19 +168,19 @@ def _pictures(own: Evaluation) -> tuple[dict[str, str], str]:
     truth, predicted, mask = scene.truth, scene.predicted, scene.truth.masks()[PRIMARY_MASK]
     true_way = np.zeros((0, 3)) if scene.errors is None else scene.errors.true
     way = np.zeros((0, 3)) if scene.errors is None else scene.errors.aligned
-    palette = np.vstack((class_colors(list(own.classes)), [_PLAIN])).astype(np.uint8)
+    palette = np.vstack((assign_class_colors(list(own.classes)), [_PLAIN])).astype(np.uint8)
     plain = len(palette) - 1
     true = np.where(mask, truth.labels, 0)
     occupied = predicted.occupied & mask
     labels = np.zeros(truth.shape, np.uint8) if predicted.labels is None else predicted.labels
     claimed = np.where(occupied, np.where(labels > 0, labels, plain), 0).astype(np.uint8)
     grids = {
-        "Truth": Grid(true.astype(np.uint8), palette, true_way),
-        "Prediction": Grid(claimed, palette, way),
-        "Difference": Grid(differences(true, occupied, predicted.labels), _difference_colors(), way),
+        "Truth": LabelGrid(true.astype(np.uint8), palette, true_way),
+        "Prediction": LabelGrid(claimed, palette, way),
+        "Difference": LabelGrid(compare_voxels(true, occupied, predicted.labels), _difference_colors(), way),
     }
     try:
-        pictures = grid_pictures(grids, truth.origin, truth.voxel_size, scene.up)
+        pictures = draw_grids(grids, truth.origin, truth.voxel_size, scene.up)
     except DependencyError as error:
         return {}, f"There are no pictures. {error}"
     if not pictures:
@@ -190,7 +190,7 @@ def _pictures(own: Evaluation) -> tuple[dict[str, str], str]:
     }, ""
 
 
-def differences(
+def compare_voxels(
     true: NDArray[np.integer], occupied: NDArray[np.bool_], labels: NDArray[np.integer] | None
 ) -> NDArray[np.uint8]:
     """(X, Y, Z) per voxel 0 where both say free, else 1 + the place in ``DIFFERENCES``.
@@ -209,12 +209,12 @@ def _difference_colors() -> NDArray[np.uint8]:
     return np.array([(0, 0, 0), *DIFFERENCES.values()], np.uint8)
 
 
-def _drawn_way(scene: Scene) -> dict[str, Any]:
+def _drawn_way(scene: ScoredScene) -> dict[str, Any]:
     """The trajectories from above, in centimetres, y downwards as on screens: points of the true one, and pieces of the
     estimated one with the colour of their error."""
     errors = scene.errors
     assert errors is not None
-    R = upright(scene.up, errors.true)
+    R = turn_upright(scene.up, errors.true)
     step = max(1, -(-len(errors.true) // MOST_SEGMENTS))
     true, way = (100 * (points @ R.T)[::step, :2] * (1, -1) for points in (errors.true, errors.aligned))
     low = np.minimum(true.min(axis=0), way.min(axis=0))
@@ -222,7 +222,7 @@ def _drawn_way(scene: Scene) -> dict[str, Any]:
     true, way = true - low, way - low
     off = errors.errors_m[::step]
     worst = max(float(errors.errors_m.max()), 1e-9)
-    colors = ramp(1 - 0.85 * off / worst)  # the palest of the colours would vanish on white
+    colors = color_by_value(1 - 0.85 * off / worst)  # the palest of the colours would vanish on white
     unit = max(float(extent.max()), 1.0)
     return {
         "box": (-0.04 * unit, -0.04 * unit, extent[0] + 0.08 * unit, extent[1] + 0.08 * unit),
@@ -231,7 +231,7 @@ def _drawn_way(scene: Scene) -> dict[str, Any]:
         "pieces": [(*a, *b, _rgb(color)) for a, b, color in zip(way[:-1], way[1:], colors[1:], strict=True)],
         "start": true[0],
         "worst": worst,
-        "key": [_rgb(color) for color in ramp(1 - 0.85 * np.linspace(0, 1, 24))],
+        "key": [_rgb(color) for color in color_by_value(1 - 0.85 * np.linspace(0, 1, 24))],
     }
 
 

@@ -66,7 +66,7 @@ class RestrictedUnpickler(pickle.Unpickler):
             admitted[builtins, "bytes"] = self._no_bytes
         if (module, name) not in admitted:
             raise FreeOccError(
-                f"{self.path} is refused: it asks for {short(f'{module}.{name}')}, and a package may hold only NumPy "
+                f"{self.path} is refused: it asks for {shorten(f'{module}.{name}')}, and a package may hold only NumPy "
                 "arrays and plain values, since a pickle can run any code; get it from its publisher again."
             )
         return admitted[module, name]
@@ -110,7 +110,7 @@ class RestrictedUnpickler(pickle.Unpickler):
 
     def refuse_dtype(self, code: str) -> NoReturn:
         """Raises FreeOccError."""
-        kind = "of Python objects" if code.startswith("O") else f"of type '{short(code)}'"
+        kind = "of Python objects" if code.startswith("O") else f"of type '{shorten(code)}'"
         raise FreeOccError(
             f"{self.path} is refused: it holds an array {kind}, and a package may hold only arrays of numbers and text."
         )
@@ -204,6 +204,6 @@ def _check_operations(data: bytes, path: Path) -> None:
         previous = name
 
 
-def short(text: str) -> str:
+def shorten(text: str) -> str:
     """A file's own words on one line of a message, without codes that a terminal would obey."""
     return "".join(letter for letter in " ".join(text[:200].split()) if letter.isprintable())[:100]

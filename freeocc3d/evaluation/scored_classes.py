@@ -72,7 +72,7 @@ class ClassMap:
         return replace(truth, labels=table[truth.labels], classes=(truth.classes[0], *self.classes))
 
 
-def identity(classes: tuple[str, ...]) -> ClassMap:
+def map_each_to_itself(classes: tuple[str, ...]) -> ClassMap:
     """Every class for itself. classes: as in ``GroundTruth``, the first is not used."""
     return ClassMap(classes[1:], {name.lower(): k for k, name in enumerate(classes) if k})
 

@@ -26,13 +26,20 @@ from ..occupancy.up_direction import estimate_up
 from ..settings import config, registry
 from ..settings.config import Config
 from ..storage.store import CONFIG, Map, load_map
-from ..tracking.trajectory_alignment import Alignment, Poses, align, estimated_poses, read_poses, true_poses
+from ..tracking.trajectory_alignment import (
+    Poses,
+    TrajectoryAlignment,
+    align_trajectories,
+    read_poses,
+    read_true_poses,
+    select_estimated_poses,
+)
 from . import predictions
-from .confusion import Prediction, Scores, confusion
+from .confusion import Prediction, Scores, count_confusion
 from .embodiedocc import find_package, read_split
 from .ground_truth import load_ground_truth
-from .scored_classes import EMBODIEDOCC, SHARED, ClassMap, identity, load_class_map
-from .trajectory_errors import TrajectoryErrors, trajectory_errors
+from .scored_classes import EMBODIEDOCC, SHARED, ClassMap, load_class_map, map_each_to_itself
+from .trajectory_errors import TrajectoryErrors, measure_trajectory_errors
 from .true_occupancy import GroundTruth
 
 PRIMARY_MASK = "label"
@@ -40,7 +47,7 @@ TOP = (10, 20, 30, 40)
 
 
 @dataclass(frozen=True)
-class Scene:
+class ScoredScene:
     """One scored scene.
 
     name: of the map, file or folder that was scored.  truth: in terms of the scored classes.
@@ -53,7 +60,7 @@ class Scene:
     name: str
     truth: GroundTruth
     predicted: Prediction
-    alignment: Alignment
+    alignment: TrajectoryAlignment
     errors: TrajectoryErrors | None
     frames: int | None
     frames_with_pose: int | None
@@ -68,31 +75,31 @@ def score_map(
     poses: Poses | None = None,
     how: str = "se3",
     overrides: Sequence[str] = (),
-) -> Scene:
+) -> ScoredScene:
     """Score a map. poses: the true ones, by default those of the capture that the map was made of.
 
     overrides: options of layer 4, ``occupancy.threshold=0.4``, in place of those that the map was made with.
     Raises FreeOccError: no true poses, an alignment that is not determined.
     """
     settings = config.load(scan_map.path / CONFIG, list(overrides))
-    estimated = estimated_poses(scan_map.trajectory)
+    estimated = select_estimated_poses(scan_map.trajectory)
     if poses is None:
         try:
-            poses = true_poses(capture_of(scan_map, settings))
+            poses = read_true_poses(reopen_capture(scan_map, settings))
         except FreeOccError:
             if how != "none":
                 raise
-    alignment = Alignment.identity() if poses is None else align(estimated, poses, how)
-    predicted, note = predictions.of_map(scan_map, settings, alignment, truth, classes)
+    alignment = TrajectoryAlignment.identity() if poses is None else align_trajectories(estimated, poses, how)
+    predicted, note = predictions.predict_from_map(scan_map, settings, alignment, truth, classes)
     notes = [note] if note else []
     if not scan_map.metric and how != "sim3":
         notes.append("The map's scale is unknown: --align sim3 compares it at the true one.")
-    return Scene(
+    return ScoredScene(
         name=str(scan_map.path),
         truth=truth,
         predicted=predicted,
         alignment=alignment,
-        errors=None if poses is None else trajectory_errors(estimated, poses, alignment),
+        errors=None if poses is None else measure_trajectory_errors(estimated, poses, alignment),
         frames=len(scan_map.trajectory),
         frames_with_pose=len(estimated),
         up=alignment.rotation @ scan_map.up,
@@ -108,7 +115,7 @@ def score_gaussians(
     poses: Poses | None,
     how: str = "se3",
     overrides: Sequence[str] = (),
-) -> Scene:
+) -> ScoredScene:
     """Score the Gaussians of another system: a 3DGS PLY and the trajectory that belongs to it.
 
     trajectory: the system's own, whose world the Gaussians are in; None if they are in the true frame (``how`` none).
@@ -116,19 +123,23 @@ def score_gaussians(
     """
     alignment, errors = _aligned(trajectory, poses, how, ply)
     gaussians, labels = read_standard_ply(ply)
-    semantics = predictions.one_hot(labels, classes, ply)
-    predicted = predictions.of_gaussians(gaussians, semantics, config.load(None, list(overrides)), alignment, truth)
+    semantics = predictions.encode_one_hot(labels, classes, ply)
+    predicted = predictions.predict_from_gaussians(
+        gaussians, semantics, config.load(None, list(overrides)), alignment, truth
+    )
     notes = [] if labels is not None else [f"The Gaussians of {ply.name} have no classes: mIoU is not available."]
     return _other(ply, truth, predicted, alignment, errors, trajectory, poses, notes)
 
 
 def score_frames(
     folder: Path, truth: GroundTruth, classes: ClassMap, poses: Poses, overrides: Sequence[str] = ()
-) -> Scene:
+) -> ScoredScene:
     """Score per-frame Gaussians fused by true poses (``project.of_frames``)."""
-    predicted, fused = predictions.of_frames(folder, poses, config.load(None, list(overrides)), truth, classes)
+    predicted, fused = predictions.predict_from_frames(
+        folder, poses, config.load(None, list(overrides)), truth, classes
+    )
     notes = [f"The Gaussians of {fused} frames were fused by true poses."]
-    scene = _other(folder, truth, predicted, Alignment.identity(), None, None, poses, notes)
+    scene = _other(folder, truth, predicted, TrajectoryAlignment.identity(), None, None, poses, notes)
     return scene
 
 
@@ -139,16 +150,16 @@ def score_grid(
     trajectory: Poses | None = None,
     poses: Poses | None = None,
     how: str = "se3",
-) -> Scene:
+) -> ScoredScene:
     """Score a finished voxel grid. Without a trajectory it is in the true frame already."""
     alignment, errors = _aligned(trajectory, poses, how if trajectory is not None else "none", path)
-    predicted, note = predictions.of_grid(path, alignment, truth, classes)
+    predicted, note = predictions.predict_from_grid(path, alignment, truth, classes)
     return _other(path, truth, predicted, alignment, errors, trajectory, poses, [note] if note else [])
 
 
 def _aligned(
     trajectory: Poses | None, poses: Poses | None, how: str, path: Path
-) -> tuple[Alignment, TrajectoryErrors | None]:
+) -> tuple[TrajectoryAlignment, TrajectoryErrors | None]:
     if trajectory is None or poses is None:
         if how != "none":
             lacking = (
@@ -158,23 +169,23 @@ def _aligned(
                 f"{path} is aligned by camera centres, for which {lacking} must be given; if it is in the frame of the "
                 "true poses already, use --align none."
             )
-        return Alignment.identity(), None
-    alignment = align(trajectory, poses, how)
-    return alignment, trajectory_errors(trajectory, poses, alignment)
+        return TrajectoryAlignment.identity(), None
+    alignment = align_trajectories(trajectory, poses, how)
+    return alignment, measure_trajectory_errors(trajectory, poses, alignment)
 
 
 def _other(
     path: Path,
     truth: GroundTruth,
     predicted: Prediction,
-    alignment: Alignment,
+    alignment: TrajectoryAlignment,
     errors: TrajectoryErrors | None,
     trajectory: Poses | None,
     poses: Poses | None,
     notes: Sequence[str],
-) -> Scene:
+) -> ScoredScene:
     """A scene of another system's."""
-    return Scene(
+    return ScoredScene(
         name=str(path),
         truth=truth,
         predicted=predicted,
@@ -195,7 +206,7 @@ def _up(truth: GroundTruth, poses: Poses | None) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class Asked:
+class ScoringRequest:
     """What is to be scored: maps, or one of ``gaussians``, ``grid`` and ``frames``, as on the command line.
 
     ground_truths: one for each map, or one folder of packages, or none: the captures' own ``ground_truth.npz``.
@@ -216,7 +227,7 @@ class Asked:
     overrides: Sequence[str] = ()
 
 
-def evaluate(asked: Asked) -> Evaluation:
+def evaluate_scenes(asked: ScoringRequest) -> Evaluation:
     """Read what is asked for, score each scene, pool. Raises FreeOccError with one sentence about what does not fit."""
     maps = [load_map(path) for path in asked.maps]
     how = asked.align or ("se3" if all(scan_map.metric for scan_map in maps) else "sim3")
@@ -231,7 +242,7 @@ def evaluate(asked: Asked) -> Evaluation:
             f"--poses is given {len(asked.poses)} times for {count} scenes: once for each, or not at all."
         )
     poses: list[Poses | None] = [read_poses(path) for path in asked.poses] or [None] * count
-    classes = listed or common_classes(truths)
+    classes = listed or collect_common_classes(truths)
     truths = [classes.apply(truth, str(asked.classes)) for truth in truths]
     trajectory = None if asked.trajectory is None else read_poses(asked.trajectory)
     for other in (asked.gaussians, asked.grid, asked.frames):
@@ -255,14 +266,14 @@ def evaluate(asked: Asked) -> Evaluation:
     return Evaluation(tuple(scenes), classes.classes, how, listed is not None)
 
 
-def scene_name(scan_map: Map) -> str:
+def name_scene(scan_map: Map) -> str:
     """A map's scene: the name of the capture's folder."""
     return Path(str(scan_map.manifest["capture"]["path"])).name
 
 
 def _in_split(maps: list[Map], split: Path) -> list[Map]:
     """The maps of the scenes that a split lists, in its order. Raises FreeOccError if one is missing."""
-    by_name = {scene_name(scan_map): scan_map for scan_map in maps}
+    by_name = {name_scene(scan_map): scan_map for scan_map in maps}
     scenes = read_split(split)
     missing = [name for name in scenes if name not in by_name]
     if missing:
@@ -291,7 +302,7 @@ def _truths(captures: Sequence[str], paths: Sequence[Path], count: int, classes:
     return [load_ground_truth(path, names) for path in paths]
 
 
-def capture_of(scan_map: Map, settings: Config | None = None) -> Capture:
+def reopen_capture(scan_map: Map, settings: Config | None = None) -> Capture:
     """The capture that a map was made of, opened as it was then. Raises FreeOccError if it is not there any more."""
     settings = settings or config.load(scan_map.path / CONFIG)
     path = scan_map.manifest["capture"]["path"]
@@ -303,10 +314,10 @@ def capture_of(scan_map: Map, settings: Config | None = None) -> Capture:
     return open_capture(path, options, settings["capture"])
 
 
-def common_classes(truths: Sequence[GroundTruth]) -> ClassMap:
+def collect_common_classes(truths: Sequence[GroundTruth]) -> ClassMap:
     """All classes that some truths name, each for itself."""
     names = dict.fromkeys(name for truth in truths for name in truth.classes[1:])
-    return identity(("", *names))
+    return map_each_to_itself(("", *names))
 
 
 @dataclass(frozen=True)
@@ -317,7 +328,7 @@ class Evaluation:
     lists, as EmbodiedOcc counts them, absent ones as 0.
     """
 
-    scenes: tuple[Scene, ...]
+    scenes: tuple[ScoredScene, ...]
     classes: tuple[str, ...]
     how: str
     listed: bool = False
@@ -330,7 +341,7 @@ class Evaluation:
             name: Scores(
                 np.sum(
                     [
-                        confusion(scene.truth.labels, scene.predicted, own[name], len(self.classes))
+                        count_confusion(scene.truth.labels, scene.predicted, own[name], len(self.classes))
                         for scene, own in zip(self.scenes, masks, strict=True)
                     ],
                     axis=0,
@@ -381,9 +392,9 @@ class Evaluation:
             f"{scene.name} claims no voxel inside the truth: if they are not in one frame, name true poses in the "
             "truth's frame with --poses."
             for scene in self.scenes
-            if not confusion(scene.truth.labels, scene.predicted, scene.truth.masks()[PRIMARY_MASK], len(self.classes))[
-                :, 1:
-            ].any()
+            if not count_confusion(
+                scene.truth.labels, scene.predicted, scene.truth.masks()[PRIMARY_MASK], len(self.classes)
+            )[:, 1:].any()
         ]
         return tuple(dict.fromkeys([*(note for scene in self.scenes for note in scene.notes), *apart]))
 
@@ -500,7 +511,7 @@ class Evaluation:
         return lines
 
 
-def _trajectory_lines(scene: Scene, how: str) -> list[str]:
+def _trajectory_lines(scene: ScoredScene, how: str) -> list[str]:
     errors = scene.errors
     assert errors is not None
     lines = [

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..capture import associate
 from ..core.errors import FreeOccError
 from ..core.transforms import invert
-from ..tracking.trajectory_alignment import Alignment, Poses
+from ..tracking.trajectory_alignment import Poses, TrajectoryAlignment
 
 DISTANCES_M = (0.1, 0.5, 1.0, 2.0)
 """Travelled distances of the relative errors."""
@@ -72,8 +72,8 @@ class TrajectoryErrors:
         }
 
 
-def trajectory_errors(
-    estimated: Poses, true: Poses, alignment: Alignment, distances_m: tuple[float, ...] = DISTANCES_M
+def measure_trajectory_errors(
+    estimated: Poses, true: Poses, alignment: TrajectoryAlignment, distances_m: tuple[float, ...] = DISTANCES_M
 ) -> TrajectoryErrors:
     """Raises FreeOccError if no frame has a pose in both."""
     rows_est, rows_true = associate(estimated.timestamps, true.timestamps)
@@ -84,13 +84,15 @@ def trajectory_errors(
         )
     T_est = alignment.poses(estimated.T_world_cam[rows_est])
     T_true = true.T_world_cam[rows_true]
-    relative = tuple(error for d in distances_m if (error := relative_error(T_est, T_true, d)) is not None)
+    relative = tuple(error for d in distances_m if (error := measure_relative_error(T_est, T_true, d)) is not None)
     return TrajectoryErrors(estimated.timestamps[rows_est], T_true[:, :3, 3], T_est[:, :3, 3], relative)
 
 
-def relative_error(T_est: NDArray[np.float64], T_true: NDArray[np.float64], distance_m: float) -> RelativeError | None:
+def measure_relative_error(
+    T_est: NDArray[np.float64], T_true: NDArray[np.float64], distance_m: float
+) -> RelativeError | None:
     """Of (M, 4, 4) matched poses; None if no two frames are that far apart."""
-    first, second = pairs_by_path(T_true[:, :3, 3], distance_m)
+    first, second = pair_by_path(T_true[:, :3, 3], distance_m)
     if not len(first):
         return None
     moved_true = invert(T_true[first]) @ T_true[second]
@@ -111,7 +113,7 @@ def relative_error(T_est: NDArray[np.float64], T_true: NDArray[np.float64], dist
     )
 
 
-def pairs_by_path(centers: NDArray[np.float64], distance_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def pair_by_path(centers: NDArray[np.float64], distance_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows (P,), (P,) of the (M, 3) centres between which the path is ``distance_m`` long, within a tenth of it."""
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(centers, axis=0), axis=1))))
     first = np.arange(len(path) - 1)

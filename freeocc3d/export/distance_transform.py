@@ -17,7 +17,7 @@ LONGEST = 26_000
 """Voxels along an edge up to which squared distances fit into 32 bits."""
 
 
-def signed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+def transform_signed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     """(X, Y, Z) distance, in voxels, from each voxel's centre to that of the nearest one of the other kind, negative
     inside; infinite where there is none. No edge may be longer than LONGEST."""
     inside = np.ascontiguousarray(inside)
@@ -30,7 +30,7 @@ def signed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     return distance
 
 
-def signed_reference(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+def transform_signed_reference(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     """The same by SciPy, in ten times the memory."""
     from scipy import ndimage
 

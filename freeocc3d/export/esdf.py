@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from ..core.errors import ConfigError, ExportError
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
 from ..storage.store import Map
-from .distance_transform import LONGEST, signed
-from .export_frames import Placed, check_box, check_frame, placed, world_of
+from .distance_transform import LONGEST, transform_signed
+from .export_frames import PlacedVoxels, check_box, check_frame, find_world, place_voxels
 from .openvdb_files import write_vdb
 
 REQUIRES: tuple[str, ...] = ()
@@ -58,7 +58,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     fit into 2 GiB."""
     if path.suffix not in (".npz", ".vdb"):
         raise ConfigError(f"Distances are written to .npz or .vdb, got '{path.name}'.")
-    there = placed(scan_map, options.frame, one_size=True, box=options.box)
+    there = place_voxels(scan_map, options.frame, one_size=True, box=options.box)
     distance, state, origin = signed_distances(there.occupancy, options.unknown)
     if path.suffix == ".vdb":
         _write_grid(path, there, distance)
@@ -72,11 +72,11 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
             voxel_size=np.float64(there.occupancy.voxel_size),
             frame=np.array(options.frame),
             T_frame_map=there.T_frame_map,
-            T_world_map=world_of(scan_map, there.T_frame_map),
+            T_world_map=find_world(scan_map, there.T_frame_map),
         )
 
 
-def _write_grid(path: Path, there: Placed, distance: NDArray[np.float32]) -> None:
+def _write_grid(path: Path, there: PlacedVoxels, distance: NDArray[np.float32]) -> None:
     """The distances of the known voxels, block by block."""
     occupancy = there.occupancy
     known = occupancy.state != UNKNOWN
@@ -100,7 +100,7 @@ def signed_distances(
     obstacle = state != FREE if unknown == "obstacle" else state == OCCUPIED
     if not obstacle.any():
         raise ExportError("The map has no obstacle, so that there is no distance to one.")
-    distance = signed(obstacle)
+    distance = transform_signed(obstacle)
     distance[obstacle] += np.float32(0.5)
     np.subtract(distance, np.float32(0.5), out=distance, where=~obstacle)
     distance *= np.float32(occupancy.voxel_size)

@@ -43,7 +43,7 @@ def check_upright(frame: str) -> None:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedVoxels:
     """Voxels in a frame.
 
     occupancy: in coordinates of the frame, without features where it is not the map's own.  rows: (V,) row of the map's
@@ -79,22 +79,22 @@ def to_frame(scan_map: Map, frame: str) -> NDArray[np.float64]:
         return np.eye(4)
     if frame == "gravity":
         return scan_map.T_gravity_map
-    from ..occupancy.gravity_frame import first_camera_frame
+    from ..occupancy.gravity_frame import compute_first_camera_frame
 
     trajectory = scan_map.trajectory
     posed = np.flatnonzero(trajectory.has_pose)
     if not len(posed):
         raise ExportError("The map has no camera pose, so that there is no first camera: use --frame gravity.")
-    return first_camera_frame(scan_map.T_gravity_map, trajectory.T_world_cam[posed[0]])
+    return compute_first_camera_frame(scan_map.T_gravity_map, trajectory.T_world_cam[posed[0]])
 
 
-def placed(
+def place_voxels(
     scan_map: Map,
     frame: str,
     origin: ArrayLike | None = None,
     one_size: bool = False,
     box: tuple[float, ...] = (),
-) -> Placed:
+) -> PlacedVoxels:
     """The map's voxels in a frame. In the map's own they are what they are; in another they are sampled anew on a
     lattice of the map's voxel size (the largest, of a map of several), and so they are where ``one_size`` asks for it
     or where ``origin``, a place of the new lattice, does not lie on the old one.
@@ -107,26 +107,26 @@ def placed(
     return _within(there, np.array(box).reshape(2, 3)) if box else there
 
 
-def _placed(scan_map: Map, frame: str, origin: ArrayLike | None, one_size: bool) -> Placed:
-    from ..occupancy.levels import uniform
-    from ..occupancy.resampling import resampled
+def _placed(scan_map: Map, frame: str, origin: ArrayLike | None, one_size: bool) -> PlacedVoxels:
+    from ..occupancy.levels import make_uniform
+    from ..occupancy.resampling import resample_occupancy
 
     occupancy, T = scan_map.occupancy, to_frame(scan_map, frame)
     if not len(occupancy.keys):
         raise ExportError("The map has no voxel to write.")
     own = frame == "map" and _on_lattice(occupancy, origin)
     if own and not (one_size and occupancy.deepest):
-        return Placed(occupancy, np.arange(len(occupancy.colors)), frame, T, scan_map.metric)
+        return PlacedVoxels(occupancy, np.arange(len(occupancy.colors)), frame, T, scan_map.metric)
     plain = occupancy.replace(features=np.zeros((len(occupancy.colors), 0), np.float16))
-    one = uniform(plain) if occupancy.deepest else plain
+    one = make_uniform(plain) if occupancy.deepest else plain
     if own:
-        return Placed(one, _nearest(plain, one), frame, T, scan_map.metric)
+        return PlacedVoxels(one, _nearest(plain, one), frame, T, scan_map.metric)
     at = (0.0, 0.0, -0.5 * one.voxel_size) if origin is None else origin
-    new, rows = resampled(one, T, np.asarray(at, np.float64))
-    return Placed(new, _nearest(plain, one)[rows] if occupancy.deepest else rows, frame, T, scan_map.metric)
+    new, rows = resample_occupancy(one, T, np.asarray(at, np.float64))
+    return PlacedVoxels(new, _nearest(plain, one)[rows] if occupancy.deepest else rows, frame, T, scan_map.metric)
 
 
-def _within(there: Placed, corners: NDArray[np.float64]) -> Placed:
+def _within(there: PlacedVoxels, corners: NDArray[np.float64]) -> PlacedVoxels:
     occupancy = there.occupancy
     edge = occupancy.voxel_size / 2.0 ** occupancy.levels[:, None, None]
     centers = occupancy.origin[:, None] + (BLOCK * occupancy.keys[:, :, None] + np.arange(BLOCK) + 0.5) * edge
@@ -147,10 +147,10 @@ def _within(there: Placed, corners: NDArray[np.float64]) -> Placed:
         state=state[blocks],
         **{name: getattr(occupancy, name)[blocks] for name in ("keys", "probability", "free", "hits")},
     )
-    return Placed(part, there.rows[kept], there.frame, there.T_frame_map, there.metric)
+    return PlacedVoxels(part, there.rows[kept], there.frame, there.T_frame_map, there.metric)
 
 
-def floor_z(scan_map: Map, T_frame_map: NDArray[np.float64]) -> float:
+def find_floor_z(scan_map: Map, T_frame_map: NDArray[np.float64]) -> float:
     """Height of the floor in a frame whose z points up, metres."""
     return float((T_frame_map @ invert(scan_map.T_gravity_map))[2, 3])
 
@@ -162,7 +162,7 @@ def write_description(path: Path, described: dict[str, Any]) -> None:
     path.with_name(f"{path.name}.json").write_text(text + "\n", encoding="utf-8")
 
 
-def world_of(scan_map: Map, T_frame_map: NDArray[np.float64]) -> NDArray[np.float64]:
+def find_world(scan_map: Map, T_frame_map: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) from the frame to the world that the map's ``T_world_map`` leads to."""
     return np.asarray(np.array(scan_map.manifest["T_world_map"], np.float64) @ invert(T_frame_map))
 

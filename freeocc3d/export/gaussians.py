@@ -31,7 +31,7 @@ class Options:
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the Gaussians. Raises ExportError for a map without any."""
-    from ..gaussians.anchors import aligned
+    from ..gaussians.anchors import align_gaussians
     from ..gaussians.splat_ply import write_standard_ply
 
     gaussians = scan_map.gaussians
@@ -44,7 +44,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         turn[:3, :3] = _to_minus_y(up)
         T_file_map = turn @ T_file_map
     if not np.array_equal(T_file_map, np.eye(4)):
-        gaussians = aligned(gaussians, 1.0, T_file_map[:3, :3], T_file_map[:3, 3])
+        gaussians = align_gaussians(gaussians, 1.0, T_file_map[:3, :3], T_file_map[:3, 3])
     write_standard_ply(gaussians, path)
     told = {"frame": options.frame, "up": "-y" if options.upright else "the frame's"}
     write_description(path, {**told, "metric": scan_map.metric, "T_file_map": T_file_map.tolist()})

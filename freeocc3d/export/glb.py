@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..core.errors import ConfigError, ExportError
 from ..core.transforms import invert
-from ..occupancy.surface_faces import exposed_faces
+from ..occupancy.surface_faces import find_exposed_faces
 from ..storage.store import Map
-from .export_frames import Placed, check_box, check_frame, placed
-from .ply import COLORS, colors_of
+from .export_frames import PlacedVoxels, check_box, check_frame, place_voxels
+from .ply import COLORS, choose_colors
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -52,13 +52,13 @@ class Options:
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the mesh. Raises ExportError for a map without an occupied voxel."""
-    there = placed(scan_map, options.frame, box=options.box)
+    there = place_voxels(scan_map, options.frame, box=options.box)
     if not len(there.occupancy.colors):
         raise ExportError("There is no occupied voxel to write.")
-    positions, quads, rows = exposed_faces(there.occupancy)
+    positions, quads, rows = find_exposed_faces(there.occupancy)
     triangles = quads[:, (0, 1, 2, 0, 2, 3)].astype(np.uint32)
     colors = np.full((len(positions), 4), 255, np.uint8)  # with alpha, for attributes begin at multiples of 4 bytes
-    colors[:, :3] = np.repeat(_linear(colors_of(scan_map, there, options.color))[rows], 4, axis=0)
+    colors[:, :3] = np.repeat(_linear(choose_colors(scan_map, there, options.color))[rows], 4, axis=0)
     turned = np.eye(4)
     turned[:3, :3] = (_Z_UP_TO_Y_UP @ scan_map.T_gravity_map @ invert(there.T_frame_map))[:3, :3]
     to_y_up = turned if options.frame == "map" else _Z_UP_TO_Y_UP
@@ -73,7 +73,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 
 
 def _described(
-    there: Placed,
+    there: PlacedVoxels,
     positions: NDArray[np.float32],
     colors: NDArray[np.uint8],
     triangles: NDArray[np.uint32],

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from ..core.errors import ConfigError, ExportError
 from ..storage.store import Map
-from .export_frames import Placed
-from .map_server_files import COSTS, Grid, cost_pixels, write_map
+from .export_frames import PlacedVoxels
+from .map_server_files import COSTS, CellGrid, encode_costs, write_map
 
 TOGETHER = "avoid"
 """What the mask of all words together is called."""
@@ -43,7 +43,7 @@ class Avoided:
         return re.sub(r"\W+", "_", self.word) or "_"
 
 
-def parsed(entries: Sequence[str]) -> list[Avoided]:
+def parse_avoided(entries: Sequence[str]) -> list[Avoided]:
     """``WORD``, ``WORD:METRES``, ``WORD:COST%`` or ``WORD:METRES:COST%``. Raises ConfigError."""
     found = [_parsed(entry) for entry in entries]
     parts = [TOGETHER, *(avoided.file_part for avoided in found)]
@@ -68,7 +68,7 @@ def _parsed(entry: str) -> Avoided:
 
 
 def write_layers(
-    scan_map: Map, path: Path, there: Placed, avoided: Sequence[Avoided], grid: Grid, highest: float
+    scan_map: Map, path: Path, there: PlacedVoxels, avoided: Sequence[Avoided], grid: CellGrid, highest: float
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Write a mask for each word and one of all, NAME.WORD.yaml and NAME.avoid.yaml for a plan NAME.yaml. Returns
     what was written, and a sentence for each word that is nowhere, so that its mask is empty, or half understood.
@@ -89,7 +89,7 @@ def write_layers(
             raise ExportError(result.note)
         rows = np.concatenate([region.rows for region in result.regions] or [np.zeros(0, np.int64)])
         inside = np.isin(there.rows, rows) & low
-        costs = cost_map(voxels[inside, :2] - offset, grid.shape, grid.size, one)
+        costs = compute_cost_map(voxels[inside, :2] - offset, grid.shape, grid.size, one)
         if not inside.any():
             why = result.note if not len(rows) else f"All of '{one.word}' lies above the robot's height."
             notes.append(f"{why} Its mask {path.stem}.{one.file_part}.yaml is empty.")
@@ -97,17 +97,19 @@ def write_layers(
             notes.append(result.note)
         layer = path.with_name(f"{path.stem}.{one.file_part}.yaml")
         about = f"costs of {json.dumps(one.word)}: {_about(one)}"
-        write_map(layer, cost_pixels(costs), grid, COSTS, f"{about}; for Nav2's KeepoutFilter")
+        write_map(layer, encode_costs(costs), grid, COSTS, f"{about}; for Nav2's KeepoutFilter")
         told = {"word": one.word, "distance_m": one.metres, "cost": one.cost}
         layers.append({**told, "matched": bool(inside.any()), "file": layer.name})
         together = np.maximum(together, costs)
     everything = path.with_name(f"{path.stem}.{TOGETHER}.yaml")
     about = f"costs of {', '.join(json.dumps(one.word) for one in avoided)} together; for Nav2's KeepoutFilter"
-    write_map(everything, cost_pixels(together), grid, COSTS, about)
+    write_map(everything, encode_costs(together), grid, COSTS, about)
     return layers, notes
 
 
-def cost_map(cells: NDArray[np.int64], shape: tuple[int, int], size: float, avoided: Avoided) -> NDArray[np.uint8]:
+def compute_cost_map(
+    cells: NDArray[np.int64], shape: tuple[int, int], size: float, avoided: Avoided
+) -> NDArray[np.uint8]:
     """(X, Y) costs 0…100 around (N, 2) cells, which may lie outside of the plan: the cost on them, and 100 within the
     distance, or a lower one that falls off evenly over it. Distances are Euclidean, between the cells' centres."""
     from scipy import ndimage

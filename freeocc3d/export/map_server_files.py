@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
-class Grid:
+class CellGrid:
     """Where cells are: x of cell (i, j) is origin[0] + [i, i + 1) * size, metres; y likewise of j.
 
     origin: (2,) lower corner of cell (0, 0).  frame: name of the frame that this is in.
@@ -40,15 +40,15 @@ class Reading:
 PLAN = Reading("trinary", 0.65, 0.196)
 """An unknown pixel, 205, is 0.19608, which 0.196 does not take for free."""
 COSTS = Reading("scale", 0.999, 0.001)
-"""White is 0 and black 100; ``cost_pixels`` are read as what they were."""
+"""White is 0 and black 100; ``encode_costs`` are read as what they were."""
 
 
-def cost_pixels(costs: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def encode_costs(costs: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Pixels that are read as costs 0…100 with COSTS."""
     return np.rint(255 - 2.55 * costs.astype(np.float64)).astype(np.uint8)
 
 
-def write_map(path: Path, pixels: NDArray[np.uint8], grid: Grid, reading: Reading, about: str) -> None:
+def write_map(path: Path, pixels: NDArray[np.uint8], grid: CellGrid, reading: Reading, about: str) -> None:
     """Write ``path``, a .yaml, and the image beside it of (X, Y) pixels: x to the right, y upwards. Raises OSError."""
     image = path.with_suffix(".pgm")
     rows = np.ascontiguousarray(pixels.T[::-1])

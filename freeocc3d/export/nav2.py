@@ -19,9 +19,9 @@ from ..core.errors import ConfigError, ExportError
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
 from ..settings.registry import require_positive
 from ..storage.store import Map
-from .export_frames import check_box, check_upright, floor_z, placed, write_description
-from .keepout_masks import parsed, write_layers
-from .map_server_files import PLAN, Grid, write_map
+from .export_frames import check_box, check_upright, find_floor_z, place_voxels, write_description
+from .keepout_masks import parse_avoided, write_layers
+from .map_server_files import PLAN, CellGrid, write_map
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -61,7 +61,7 @@ class Options:
             raise ConfigError(f"'min_free' must be 0 to 1, got {self.min_free}.")
         if self.inflation < 0:
             raise ConfigError(f"'inflation' must not be negative, got {self.inflation}.")
-        parsed(self.avoid)
+        parse_avoided(self.avoid)
 
 
 def write(scan_map: Map, path: Path, options: Options) -> list[str]:
@@ -69,17 +69,17 @@ def write(scan_map: Map, path: Path, options: Options) -> list[str]:
     named .yaml, ExportError if nothing is known between the heights, or of a word."""
     if path.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"A map_server map is named by its .yaml, got '{path.name}'.")
-    there = placed(scan_map, options.frame, box=options.box)
-    floor, size = floor_z(scan_map, there.T_frame_map), there.occupancy.voxel_size
+    there = place_voxels(scan_map, options.frame, box=options.box)
+    floor, size = find_floor_z(scan_map, there.T_frame_map), there.occupancy.voxel_size
     cells, origin = plan(there.occupancy, floor + options.min_height, floor + options.max_height, options.min_free)
     if options.inflation > 0:
-        cells = inflated(cells, options.inflation / size)
-    grid = Grid(origin, size, (cells.shape[0], cells.shape[1]), there.frame)
+        cells = inflate(cells, options.inflation / size)
+    grid = CellGrid(origin, size, (cells.shape[0], cells.shape[1]), there.frame)
     pixels = np.zeros(256, np.uint8)
     pixels[list(_PIXEL)] = list(_PIXEL.values())
     about = f"obstacles {options.min_height:g} to {options.max_height:g} m above the floor"
     write_map(path, pixels[cells], grid, PLAN, about)
-    layers, notes = write_layers(scan_map, path, there, parsed(options.avoid), grid, floor + options.max_height)
+    layers, notes = write_layers(scan_map, path, there, parse_avoided(options.avoid), grid, floor + options.max_height)
     described = {"floor_z_m": floor, "min_height_m": options.min_height, "max_height_m": options.max_height}
     write_description(path, {**there.described(), **described, **({"avoid": layers} if layers else {})})
     return notes
@@ -113,7 +113,7 @@ def plan(
     return cells, np.array((x0, y0)) + corner * size
 
 
-def inflated(cells: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
+def inflate(cells: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
     """The plan with every cell within ``radius`` cells of an occupied one occupied."""
     from scipy import ndimage
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..core.errors import ConfigError, ExportError
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
 from ..storage.store import Map
-from .export_frames import check_box, check_frame, placed, world_of
+from .export_frames import check_box, check_frame, find_world, place_voxels
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -57,12 +57,12 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the arrays. Raises ExportError if the dense grid would not fit into memory."""
     form = dense if options.form == "dense" else sparse
     classes = scan_map.vocabulary[:_MOST_CLASSES]
-    there = placed(scan_map, options.frame, box=options.box)
+    there = place_voxels(scan_map, options.frame, box=options.box)
     arrays = form(there.occupancy, scan_map.labels()[there.rows], len(classes))
     arrays |= {
         "voxel_size": np.float64(there.occupancy.finest),
         "frame": np.array(options.frame),
-        "T_world_map": world_of(scan_map, there.T_frame_map),
+        "T_world_map": find_world(scan_map, there.T_frame_map),
         "classes": np.array(classes, np.str_),
     }
     with path.open("wb") as stream:

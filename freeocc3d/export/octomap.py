@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ..core.errors import ConfigError, ExportError
 from ..core.types import FREE, OCCUPIED, Occupancy
 from ..storage.store import Map
-from .export_frames import check_box, check_frame, placed, write_description
-from .octree import KEY_ORIGIN, Leaves, Octree, octree
+from .export_frames import check_box, check_frame, place_voxels, write_description
+from .octree import KEY_ORIGIN, Leaves, Octree, build_octree
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -54,8 +54,8 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         raise ConfigError(f"An OctoMap file is named .bt (free or occupied) or .ot (log-odds), got '{path.name}'.")
     if binary and options.color:
         raise ConfigError("A .bt holds no colours: name the file .ot.")
-    there = placed(scan_map, options.frame, origin=(0.0, 0.0, 0.0), box=options.box)
-    tree = octree(leaves(there.occupancy, log_odds=not binary, color=options.color))
+    there = place_voxels(scan_map, options.frame, origin=(0.0, 0.0, 0.0), box=options.box)
+    tree = build_octree(collect_leaves(there.occupancy, log_odds=not binary, color=options.color))
     with path.open("wb") as stream:
         kind = "OcTree binary" if binary else "OcTree"
         name = "ColorOcTree" if options.color else "OcTree"
@@ -65,7 +65,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     write_description(path, there.described())
 
 
-def leaves(occupancy: Occupancy, log_odds: bool, color: bool) -> list[Leaves]:
+def collect_leaves(occupancy: Occupancy, log_odds: bool, color: bool) -> list[Leaves]:
     """The known voxels by size, the smallest first. log_odds: values from the voxels' probabilities, which keep each
     voxel on its side; else all occupied and all free ones have one. Raises ExportError as ``write`` does."""
     shift = np.rint(occupancy.origin / occupancy.finest).astype(np.int64)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from ..core.atomic_files import write_whole
 from ..core.errors import ConfigError, ExportError
 from ..core.types import OCCUPIED, Occupancy
-from ..occupancy.surface_faces import exposed_faces
+from ..occupancy.surface_faces import find_exposed_faces
 from ..query.word_query import QueryResult
 from ..storage.store import Map
-from ..viewer.palette import class_colors, height_colors, highlighted, ramp
-from .export_frames import Placed, check_box, check_frame, placed
+from ..viewer.palette import assign_class_colors, color_by_height, color_by_value, highlight_regions
+from .export_frames import PlacedVoxels, check_box, check_frame, place_voxels
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -53,16 +53,16 @@ class Options:
 def write(scan_map: Map, path: Path, options: Options) -> None:
     """Write the occupied voxels. Raises ExportError for a map without any."""
     _refuse_empty(scan_map.occupancy)
-    there = placed(scan_map, options.frame, box=options.box)
+    there = place_voxels(scan_map, options.frame, box=options.box)
     _refuse_empty(there.occupancy)
-    _write(there.occupancy, colors_of(scan_map, there, options.color), path, options.form, there.described())
+    _write(there.occupancy, choose_colors(scan_map, there, options.color), path, options.form, there.described())
 
 
 def write_query_ply(occupancy: Occupancy, results: list[QueryResult], path: Path, overwrite: bool = False) -> None:
     """Write all occupied voxels as cubes, those of the results' regions in one strong colour a word, the others pale.
     Raises ExportError."""
     _refuse_empty(occupancy)
-    colors = highlighted(occupancy.colors, [result.regions for result in results])
+    colors = highlight_regions(occupancy.colors, [result.regions for result in results])
     write_whole(path, lambda target: _write(occupancy, colors, target, "cubes"), overwrite)
 
 
@@ -71,15 +71,15 @@ def _refuse_empty(occupancy: Occupancy) -> None:
         raise ExportError("There is no occupied voxel to write.")
 
 
-def colors_of(scan_map: Map, there: Placed, by: str) -> NDArray[np.uint8]:
+def choose_colors(scan_map: Map, there: PlacedVoxels, by: str) -> NDArray[np.uint8]:
     """(V, 3) colour of each occupied voxel of a placed map, by one of COLORS."""
     occupancy = there.occupancy
     if by == "class":
-        return class_colors(scan_map.vocabulary)[scan_map.labels()[there.rows]]
+        return assign_class_colors(scan_map.vocabulary)[scan_map.labels()[there.rows]]
     if by == "height":
-        return height_colors(occupancy, there.T_frame_map[:3, :3] @ scan_map.up)
+        return color_by_height(occupancy, there.T_frame_map[:3, :3] @ scan_map.up)
     if by == "probability":
-        return ramp(occupancy.probability[occupancy.state == OCCUPIED])
+        return color_by_value(occupancy.probability[occupancy.state == OCCUPIED])
     return occupancy.colors
 
 
@@ -88,13 +88,13 @@ def _write(
 ) -> None:
     if form == "points":
         points = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges()).astype(np.float32)
-        write_ply(path, points, colors, None, described)
+        write_colored_ply(path, points, colors, None, described)
     else:
-        vertices, quads, rows = exposed_faces(occupancy)
-        write_ply(path, vertices, np.repeat(colors[rows], 4, axis=0), quads, described)
+        vertices, quads, rows = find_exposed_faces(occupancy)
+        write_colored_ply(path, vertices, np.repeat(colors[rows], 4, axis=0), quads, described)
 
 
-def write_ply(
+def write_colored_ply(
     path: Path,
     points: NDArray[np.float32],
     colors: NDArray[np.uint8],

@@ -22,7 +22,7 @@ from ..core.transforms import invert, rotations_to_quats, transform
 from ..core.types import Gaussians, Intrinsics
 from ..storage.store import Map
 from .export_frames import check_frame, to_frame, write_description
-from .ply import write_ply
+from .ply import write_colored_ply
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -103,7 +103,7 @@ def _write_nerfstudio(
                 "fl_y": camera.fy, "cx": camera.cx + 0.5, "cy": camera.cy + 0.5, "transform_matrix": T.tolist(),
             }
         )  # fmt: skip
-    write_ply(path / "sparse_pc.ply", points.astype(np.float32), gaussians.colors)
+    write_colored_ply(path / "sparse_pc.ply", points.astype(np.float32), gaussians.colors)
     told = {"camera_model": "OPENCV", "ply_file_path": "sparse_pc.ply", "frames": frames}
     (path / "transforms.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
 

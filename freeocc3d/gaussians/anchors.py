@@ -73,7 +73,7 @@ class Options:
             raise ConfigError(f"'initialisation' must be ray_aligned or isotropic, got '{self.initialisation}'.")
 
 
-def least_scale(options: Options, cell_size: float, voxel_size: float) -> float:
+def compute_least_scale(options: Options, cell_size: float, voxel_size: float) -> float:
     """Standard deviation in metres that Gaussians of cells of ``cell_size`` must at least have to be shown by voxels of
     ``voxel_size``: that of cells of half a voxel, if theirs are smaller; 0 where they are not."""
     usual = 0.5 * voxel_size
@@ -113,13 +113,13 @@ class AnchoredCells:
         )
         colors = np.rint(cells.colors).astype(np.uint8)
         s_perp = (self.options.coverage * spacing).astype(np.float32)
-        made = ray_aligned(anchor_cam, cells.keyframe, T_world_keyframe, s_perp, colors, self.options)
-        return isotropic(made) if self.options.initialisation == "isotropic" else made
+        made = align_to_rays(anchor_cam, cells.keyframe, T_world_keyframe, s_perp, colors, self.options)
+        return make_isotropic(made) if self.options.initialisation == "isotropic" else made
 
     def _denoised(self, cells: Cells, frames: Iterable[PosedFrame]) -> Cells:
         """The cells' points where all depth images have the surface, averaged by the cells that they are in now."""
         directions = cells.points - self._T_world_keyframe[cells.keyframe, :3, 3]
-        found = denoising.denoised(cells.points, directions, frames, self.options.edge)
+        found = denoising.denoise(cells.points, directions, frames, self.options.edge)
         seen = found.weights > 0  # what no image shows, because its pixel is another point's, stays as it was measured
         moved = replace(
             cells,
@@ -146,7 +146,7 @@ class AnchoredCells:
         return max(1, min(frame.intrinsics.width // 320, fine))
 
 
-def ray_aligned(
+def align_to_rays(
     anchor_cam: NDArray[np.float32],
     anchor_keyframe: NDArray[np.int32],
     T_world_keyframe: NDArray[np.float64],
@@ -174,7 +174,7 @@ def ray_aligned(
     )
 
 
-def isotropic(gaussians: Gaussians) -> Gaussians:
+def make_isotropic(gaussians: Gaussians) -> Gaussians:
     """The Gaussians as spheres whose standard deviation is the mean distance to the three nearest others.
 
     Source: B. Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023, Sec. 5.1.
@@ -188,13 +188,13 @@ def isotropic(gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, scales=np.repeat(radius[:, None], 3, axis=1), quats_wxyz=quats)
 
 
-def anchored_where_they_are(gaussians: Gaussians, T_world_keyframe: NDArray[np.float64]) -> Gaussians:
+def anchor_in_place(gaussians: Gaussians, T_world_keyframe: NDArray[np.float64]) -> Gaussians:
     """The Gaussians with anchors that say where their means are now, for means that something else has moved."""
     anchor_cam = _move_each(invert(T_world_keyframe), gaussians.anchor_keyframe, gaussians.means)
     return replace(gaussians, anchor_cam=anchor_cam)
 
 
-def reanchored(
+def reanchor(
     gaussians: Gaussians, T_world_keyframe_old: NDArray[np.float64], T_world_keyframe_new: NDArray[np.float64]
 ) -> Gaussians:
     """Means and rotations recomputed after the keyframes moved from the (K, 4, 4) old to the new poses."""
@@ -211,7 +211,7 @@ def reanchored(
     )
 
 
-def aligned(gaussians: Gaussians, scale: float, R: NDArray[np.float64], t: NDArray[np.float64]) -> Gaussians:
+def align_gaussians(gaussians: Gaussians, scale: float, R: NDArray[np.float64], t: NDArray[np.float64]) -> Gaussians:
     """The Gaussians in another world frame: x' = s R x + t, sigma' = s sigma, R_g' = R R_g (paper, "Coordinate System
     Alignment"). Anchors scale with the camera frames that they live in."""
     means = scale * gaussians.means.astype(np.float64) @ R.T + t

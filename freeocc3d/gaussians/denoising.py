@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..core.transforms import invert
 from ..core.types import PosedFrame
-from .depth_edges import at_edge, away_from_edges
+from .depth_edges import is_at_edge, mask_away_from_edges
 from .depth_noise import said, sigma_at, sigma_image
 
 _REACH_M, _REACH_PER_M = 0.03, 0.01
@@ -34,7 +34,7 @@ errors. Twice or half of either moves IoU by less than one point on the shipped 
 
 
 @dataclass
-class Denoised:
+class DenoisedPoints:
     """What depth images say of N points.
 
     points: (N, 3) float64 world, metres.  weights: (N,) sums of 1 / sigma^2, 0 where no image shows the point.
@@ -49,9 +49,9 @@ class Denoised:
     kept: NDArray[np.bool_]
 
 
-def denoised(
+def denoise(
     points: NDArray[np.float64], directions: NDArray[np.float64], frames: Iterable[PosedFrame], edge: float
-) -> Denoised:
+) -> DenoisedPoints:
     """(N, 3) world points moved to the mean of what depth images say.
 
     directions: (N, 3) of the rays along which the points were measured, world, of any length.  frames: read once; a
@@ -68,7 +68,7 @@ def denoised(
             (camera.fx, camera.fy, camera.cx, camera.cy), row, moved, weights, shown, through, best, keyframe,
         )  # fmt: skip
     points = points + moved / np.where(weights > 0, weights, 1.0)[:, None]
-    return Denoised(points, weights, best, keyframe, through <= np.maximum(shown, 1))
+    return DenoisedPoints(points, weights, best, keyframe, through <= np.maximum(shown, 1))
 
 
 @njit(parallel=True, cache=True)
@@ -102,7 +102,7 @@ def _look(
         if column < 0 or line < 0 or column >= width or line >= height:
             continue
         depth = np.float64(depth_m[line, column])
-        if depth <= 0 or at_edge(depth_m, line, column, edge):
+        if depth <= 0 or is_at_edge(depth_m, line, column, edge):
             continue
         reach = _REACH_M + _REACH_PER_M * z * z
         beyond = depth - z
@@ -133,7 +133,7 @@ def look_reference(
     """What one depth image says of (N, 3) points, in plain NumPy: (N, 3) weighted offset, (N,) weight, and whether it
     sees through each."""
     camera, depth_m = posed.frame.intrinsics, posed.frame.depth_m
-    depth_m = np.where(away_from_edges(depth_m, edge), depth_m, 0)
+    depth_m = np.where(mask_away_from_edges(depth_m, edge), depth_m, 0)
     T = invert(posed.T_world_cam)
     p = points @ T[:3, :3].T + T[:3, 3]
     z = np.where(p[:, 2] < 1e-3, np.nan, p[:, 2])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True, nogil=True)
-def at_edge(depth_m: NDArray[np.float32], row: int, column: int, edge: float) -> bool:
+def is_at_edge(depth_m: NDArray[np.float32], row: int, column: int, edge: float) -> bool:
     """Whether the depth of one of a pixel's four neighbours differs by more than ``edge`` times the nearer of both."""
     depth = depth_m[row, column]
     for i, j in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
@@ -20,8 +20,8 @@ def at_edge(depth_m: NDArray[np.float32], row: int, column: int, edge: float) ->
     return False
 
 
-def away_from_edges(depth_m: NDArray[np.float32], edge: float) -> NDArray[np.bool_]:
-    """(H, W) pixels with a depth that are not ``at_edge``, in plain NumPy."""
+def mask_away_from_edges(depth_m: NDArray[np.float32], edge: float) -> NDArray[np.bool_]:
+    """(H, W) pixels with a depth that are not ``is_at_edge``, in plain NumPy."""
     good = depth_m > 0
     for axis in (0, 1):
         near, far = np.take(depth_m, range(depth_m.shape[axis] - 1), axis), np.delete(depth_m, 0, axis)

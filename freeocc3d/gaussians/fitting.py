@@ -27,7 +27,7 @@ from ..core.errors import ConfigError
 from ..core.types import Gaussians
 from ..settings.registry import require_positive
 from .rasterizers.base import ALPHA_MIN, Rasterizer, Rendered
-from .rendered_views import View
+from .rendered_views import CapturedView
 from .surface_cells import cell_keys
 
 _RATES = {"outline": 1e-2, "turn": 1e-2, "shape": 1e-2, "quats": 5e-3, "means": 2e-4, "logits": 5e-2, "colors": 1e-2}
@@ -70,9 +70,9 @@ class Options:
             raise ConfigError(f"'means' must be anchored or free, got '{self.means}'.")
 
 
-def fitted(
+def fit_gaussians(
     gaussians: Gaussians,
-    views: Sequence[View],
+    views: Sequence[CapturedView],
     rasterizer: Rasterizer,
     options: Options,
     passes: int,
@@ -100,7 +100,7 @@ def _one_torch_thread() -> Iterator[None]:
 
 def _fitted(
     gaussians: Gaussians,
-    views: Sequence[View],
+    views: Sequence[CapturedView],
     rasterizer: Rasterizer,
     options: Options,
     passes: int,
@@ -127,7 +127,7 @@ def _fitted(
     return parameters.gaussians(gaussians)
 
 
-def _loss(rendered: Rendered, view: View, depth_weight: float) -> Tensor:
+def _loss(rendered: Rendered, view: CapturedView, depth_weight: float) -> Tensor:
     """Mean over the image's pixels of the squared errors, none where there is no depth."""
     color = ((rendered.image - view.image) ** 2).sum(dim=2)
     depth = (rendered.depth - view.depth_m) ** 2

@@ -49,7 +49,7 @@ def from_point_cloud(cloud: o3d.t.geometry.PointCloud) -> Gaussians:
     return Gaussians(**fields)
 
 
-def write_ply(gaussians: Gaussians, path: Path) -> None:
+def write_gaussian_ply(gaussians: Gaussians, path: Path) -> None:
     """Write the point cloud as binary PLY. Raises OSError, or MapError if it could not be written whole."""
     import open3d as o3d
 
@@ -62,8 +62,8 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
         raise MapError(f"Cannot write {path}: there are no Gaussians, or the disk is full.")
 
 
-def read_ply(path: Path) -> Gaussians:
-    """Read what ``write_ply`` wrote. Raises MapError."""
+def read_gaussian_ply(path: Path) -> Gaussians:
+    """Read what ``write_gaussian_ply`` wrote. Raises MapError."""
     import open3d as o3d
 
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):

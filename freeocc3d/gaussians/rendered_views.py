@@ -17,7 +17,7 @@ from .rasterizers.base import Rasterizer, Rendered
 
 
 @dataclass(frozen=True)
-class View:
+class CapturedView:
     """A keyframe: color (H, W, 3) uint8 RGB, depth_m (H, W) float32 (0: none), T_cam_world (4, 4) float32, camera."""
 
     color: Tensor
@@ -36,7 +36,9 @@ class View:
         return self.depth_m > 0
 
 
-def view_of(frame: Frame, T_world_cam: NDArray[np.float64], width: int, device: torch.device) -> View:
+def prepare_captured_view(
+    frame: Frame, T_world_cam: NDArray[np.float64], width: int, device: torch.device
+) -> CapturedView:
     """A frame at ``width`` columns, or its own if it has fewer. Colour is averaged; depth is picked, for an average
     across an edge lies on no surface."""
     camera, color, depth_m = frame.intrinsics, frame.color, frame.depth_m
@@ -46,7 +48,7 @@ def view_of(frame: Frame, T_world_cam: NDArray[np.float64], width: int, device: 
         color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
         depth_m = cv2.resize(depth_m, size, interpolation=cv2.INTER_NEAREST_EXACT)
     T_cam_world = torch.from_numpy(invert(T_world_cam).astype(np.float32))
-    return View(
+    return CapturedView(
         torch.from_numpy(np.ascontiguousarray(color)).to(device),
         torch.from_numpy(np.ascontiguousarray(depth_m)).to(device),
         T_cam_world.to(device),
@@ -54,7 +56,7 @@ def view_of(frame: Frame, T_world_cam: NDArray[np.float64], width: int, device: 
     )
 
 
-def render(gaussians: Gaussians, view: View, rasterizer: Rasterizer) -> Rendered:
+def render_gaussians(gaussians: Gaussians, view: CapturedView, rasterizer: Rasterizer) -> Rendered:
     """The Gaussians as the view's camera sees them; not differentiable."""
     arrays = gaussians.means, gaussians.scales, gaussians.quats_wxyz, gaussians.opacities, gaussians.colors / 255.0
     means, scales, quats, opacities, colors = (
@@ -79,16 +81,16 @@ class Fidelity:
     covered: float | None
 
 
-def fidelity(gaussians: Gaussians, views: Sequence[View], rasterizer: Rasterizer) -> Fidelity:
+def measure_fidelity(gaussians: Gaussians, views: Sequence[CapturedView], rasterizer: Rasterizer) -> Fidelity:
     """Render each view and compare."""
-    rows = [_fidelity(render(gaussians, view, rasterizer), view) for view in views]
+    rows = [_fidelity(render_gaussians(gaussians, view, rasterizer), view) for view in views]
     if not rows:
         return Fidelity(None, None, None, None)
     columns = np.array(rows, np.float64).T
     return Fidelity(*(float(np.nanmean(column)) if np.isfinite(column).any() else None for column in columns))
 
 
-def _fidelity(rendered: Rendered, view: View) -> tuple[float, float, float, float]:
+def _fidelity(rendered: Rendered, view: CapturedView) -> tuple[float, float, float, float]:
     squared = ((rendered.image.clamp(0, 1) - view.image) ** 2).mean(dim=2)
     measured = view.measured
     solid = measured & (rendered.alpha >= 0.5)

@@ -10,10 +10,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..core.hash_table import build_table, slot
+from ..core.hash_table import build_table, find_slot
 from ..core.transforms import back_project, transform
 from ..core.types import PosedFrame
-from .depth_edges import at_edge, away_from_edges
+from .depth_edges import is_at_edge, mask_away_from_edges
 from .depth_noise import said, sigma_at, sigma_image
 
 _PER_AXIS = 1 << 20
@@ -118,7 +118,7 @@ def cell_keys(points_world: NDArray[np.float64], cell_size: float) -> NDArray[np
 def cells_reference(posed: PosedFrame, step: int, edge: float, cell_size: float) -> Cells:
     """What ``CellSums`` makes of one frame, in plain NumPy."""
     frame, T, row = posed
-    v, u = (step * index for index in np.nonzero(away_from_edges(frame.depth_m, edge)[::step, ::step]))
+    v, u = (step * index for index in np.nonzero(mask_away_from_edges(frame.depth_m, edge)[::step, ::step]))
     depth = frame.depth_m[v, u]
     points = transform(T, back_project(np.stack((u, v), axis=1), depth, frame.intrinsics).astype(np.float64))
     key, cell = np.unique(cell_keys(points, cell_size), return_inverse=True)
@@ -141,7 +141,7 @@ def cells_reference(posed: PosedFrame, step: int, edge: float, cell_size: float)
 @njit(cache=True, nogil=True)
 def _row_of(key, used, table, rows, keys):  # type: ignore[no-untyped-def]
     """Row of a cell, a new one if there is none yet, and the number of rows."""
-    at = slot(table, key)
+    at = find_slot(table, key)
     if table[at] == -1:
         table[at] = key
         rows[at] = used
@@ -159,7 +159,7 @@ def _add_frame(  # type: ignore[no-untyped-def]
     for v in range(0, depth_m.shape[0], step):
         for u in range(0, depth_m.shape[1], step):
             depth = np.float64(depth_m[v, u])
-            if depth <= 0 or at_edge(depth_m, v, u, edge):
+            if depth <= 0 or is_at_edge(depth_m, v, u, edge):
                 continue
             x, y = (u - cx) / fx * depth, (v - cy) / fy * depth
             wx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * depth + T[0, 3]

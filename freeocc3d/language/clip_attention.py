@@ -24,7 +24,7 @@ NEIGHBOURHOOD = 5.0
 """Standard deviation in patches of naclip's window."""
 
 
-def mixed(
+def mix_values(
     attention: str,
     queries: NDArray[np.float32],
     keys: NDArray[np.float32],
@@ -34,20 +34,20 @@ def mixed(
     """(B, N, heads d) mixed values of (B, heads, N, d) queries, keys and values, of which the last h w = N - prefix are
     those of a grid of (h, w) patches."""
     if attention == "maskclip":
-        return joined(values)
+        return join_heads(values)
     if attention == "plain":
-        weights = softmax(_products(queries, keys))
+        weights = apply_softmax(_products(queries, keys))
     elif attention == "sclip":
-        weights = softmax(_products(queries, queries))
-        weights += softmax(_products(keys, keys))
+        weights = apply_softmax(_products(queries, queries))
+        weights += apply_softmax(_products(keys, keys))
     elif attention == "clearclip":
-        weights = softmax(_products(queries, queries))
+        weights = apply_softmax(_products(queries, queries))
     else:
         logits = _products(keys, keys)
         prefix = keys.shape[2] - grid[0] * grid[1]
-        logits[..., prefix:, prefix:] += neighbourhood(*grid)
-        weights = softmax(logits)
-    return joined(weights @ values)
+        logits[..., prefix:, prefix:] += weigh_neighbors(*grid)
+        weights = apply_softmax(logits)
+    return join_heads(weights @ values)
 
 
 def _products(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -55,7 +55,7 @@ def _products(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.floa
     return np.asarray(np.float32(a.shape[-1] ** -0.5) * a @ b.swapaxes(-1, -2), np.float32)
 
 
-def neighbourhood(height: int, width: int) -> NDArray[np.float32]:
+def weigh_neighbors(height: int, width: int) -> NDArray[np.float32]:
     """(h w, h w) naclip's w: near patches attend to each other."""
     rows, columns = (
         np.exp(-0.5 * ((np.arange(n)[:, None] - np.arange(n)) / NEIGHBOURHOOD) ** 2) for n in (height, width)
@@ -63,7 +63,7 @@ def neighbourhood(height: int, width: int) -> NDArray[np.float32]:
     return np.kron(rows, columns).astype(np.float32)
 
 
-def softmax(logits: NDArray[np.float32]) -> NDArray[np.float32]:
+def apply_softmax(logits: NDArray[np.float32]) -> NDArray[np.float32]:
     """Over the last axis; the argument is overwritten."""
     logits -= logits.max(axis=-1, keepdims=True)
     np.exp(logits, out=logits)
@@ -71,7 +71,7 @@ def softmax(logits: NDArray[np.float32]) -> NDArray[np.float32]:
     return logits
 
 
-def joined(heads: NDArray[np.float32]) -> NDArray[np.float32]:
+def join_heads(heads: NDArray[np.float32]) -> NDArray[np.float32]:
     """(B, heads, N, d) to (B, N, heads d)."""
     batch, _, tokens, _ = heads.shape
     return np.ascontiguousarray(heads.transpose(0, 2, 1, 3)).reshape(batch, tokens, -1)

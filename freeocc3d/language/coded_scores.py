@@ -12,7 +12,7 @@ _TILE = 64
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def cosines(
+def compute_coded_cosines(
     codes: NDArray[np.uint8],
     fours: int,
     twos: int,
@@ -67,10 +67,10 @@ def cosines(
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def beside(
+def compare_coded_competitors(
     scores: NDArray[np.float32], others: NDArray[np.float32], inverse_temperature: np.float32
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """``matching.beside`` with (C, V) others."""
+    """``word_matching.compare_competitors`` with (C, V) others."""
     largest, odds = np.empty(len(scores), np.float32), np.empty(len(scores), np.float32)
     for tile in prange((len(scores) + _TILE - 1) // _TILE):
         start, end = tile * _TILE, min((tile + 1) * _TILE, len(scores))
@@ -85,14 +85,15 @@ def beside(
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def confidences(
+def compute_coded_confidences(
     scores: NDArray[np.float32],
     others: NDArray[np.float32],
     candidates: NDArray[np.bool_],
     competes: NDArray[np.bool_],
     inverse_temperature: np.float32,
 ) -> NDArray[np.float32]:
-    """``matching.confidences``. The other word that fits a voxel best is asked first: it beats most words."""
+    """``word_matching.compute_confidences``. The other word that fits a voxel best is asked first, which beats most
+    words."""
     words, rivals = competes.shape
     out = np.zeros((len(scores), words), np.float32)
     for tile in prange((len(scores) + _TILE - 1) // _TILE):

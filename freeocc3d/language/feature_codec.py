@@ -135,7 +135,7 @@ class Codec:
             from . import coded_scores
 
             fours, twos = (int(np.count_nonzero(self.bits == bits)) * bits // 8 for bits in _BITS[1:])
-            return np.asarray(coded_scores.cosines(codes, fours, twos, self.scale, self.offset, t))
+            return np.asarray(coded_scores.compute_coded_cosines(codes, fours, twos, self.scale, self.offset, t))
         linear, constant = (t * self.scale).T, t @ self.offset
         inverse = self.inverse_norms(codes) if inverse is None else inverse
         scores = np.empty((len(text), len(codes)), np.float32).T  # a word's scores lie together
@@ -203,7 +203,7 @@ class CodedFeatures:
 Features: TypeAlias = NDArray[np.floating] | CodedFeatures
 
 
-def cosines(features: Features, text: NDArray[np.floating]) -> NDArray[np.float32]:
+def compute_cosines(features: Features, text: NDArray[np.floating]) -> NDArray[np.float32]:
     """(V, W) cosines of unit features, coded or not, with (W, D) unit text features; zero features give zero."""
     if isinstance(features, CodedFeatures):
         inverse = None if _compiled(len(features)) else features.inverse_norms
@@ -215,7 +215,7 @@ def cosines(features: Features, text: NDArray[np.floating]) -> NDArray[np.float3
     return found
 
 
-def known(features: Features) -> NDArray[np.bool_]:
+def mask_known(features: Features) -> NDArray[np.bool_]:
     """(V,) whether anything is known of each feature: whether it is not zero."""
     rows = features.codes[:, :1] if isinstance(features, CodedFeatures) else features  # its first level says it
     return np.asarray(rows.any(axis=1))

@@ -25,7 +25,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from .visibility import Seen
+from .visibility import VisibleGaussians
 
 _ALIKE = 0.9
 """Least cosine of neighbouring cells' features that belong to one region."""
@@ -80,7 +80,7 @@ class FeatureFusion:
         self._in_memory = 0
         self._file: Any = None
 
-    def add(self, seen: Seen, features: NDArray[np.float16]) -> None:
+    def add(self, seen: VisibleGaussians, features: NDArray[np.float16]) -> None:
         """Fuse the (h, w, D) features of a frame that shows ``seen``; their lengths are weights, zeros say nothing."""
         h, w, dimension = features.shape
         cells = _widened(np.ascontiguousarray(features, np.float16).view(np.uint16))

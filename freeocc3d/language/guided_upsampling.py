@@ -27,7 +27,7 @@ _MOST = 12.0
 """Of the colours' part of the exponent: where no patch is alike, the nearest decides."""
 
 
-def upsample(
+def upsample_features(
     features: NDArray[np.floating], rgb: NDArray[np.uint8], stride: int, spatial: float = SPATIAL, range_: float = RANGE
 ) -> NDArray[np.float16]:
     """(ceil(H / stride), ceil(W / stride), D) unit features of a frame's (H, W, 3) pixels, from (h, w, D) of patches
@@ -39,10 +39,10 @@ def upsample(
     return out.astype(np.float16)
 
 
-def upsample_reference(
+def upsample_features_reference(
     features: NDArray[np.floating], rgb: NDArray[np.uint8], stride: int, spatial: float = SPATIAL, range_: float = RANGE
 ) -> NDArray[np.float64]:
-    """``upsample`` in plain NumPy, a patch offset at a time."""
+    """``upsample_features`` in plain NumPy, a patch offset at a time."""
     fine, coarse = _guides(features, rgb, stride)
     (rows, columns), (h, w) = fine.shape[:2], features.shape[:2]
     y = (np.arange(rows) + 0.5)[:, None] * h / rows - 0.5

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .visibility import Seen
+from .visibility import VisibleGaussians
 
 _STEEP = 100.0
 """c: a view a hundred times worse than the best one is worth a seventh of it, for what nothing else shows."""
@@ -29,7 +29,7 @@ _WIDTH = 320
 """Columns at which sharpness is measured, where the sensor's noise is averaged out."""
 
 
-def sharpness(color: NDArray[np.uint8]) -> float:
+def measure_detail(color: NDArray[np.uint8]) -> float:
     """Variance of the Laplacian over the variance of (H, W, 3) RGB: the share of fine detail, which motion and a lens
     out of focus take away, and which brightness does not change. Without the division it is the measure of J.
     Pech-Pacheco et al., Diatom autofocusing in brightfield microscopy, ICPR 2000."""
@@ -40,7 +40,9 @@ def sharpness(color: NDArray[np.uint8]) -> float:
     return float(cv2.Laplacian(grey, cv2.CV_32F).var() / max(float(grey.var()), 1.0))
 
 
-def choose(views: Sequence[Seen], sharp: Sequence[float], n_gaussians: int, most: int) -> list[int]:
+def choose_keyframes(
+    views: Sequence[VisibleGaussians], sharp: Sequence[float], n_gaussians: int, most: int
+) -> list[int]:
     """At most ``most`` of some views, ascending; those that add nothing are left out. sharp: how sharp each is."""
     best = np.zeros(n_gaussians, np.float32)
     for view in views:

@@ -20,8 +20,8 @@ from ..core.types import Frame, Gaussians
 from ..settings.registry import require_positive
 from .encoders.base import Encoder
 from .feature_fusion import FeatureFusion
-from .keyframe_choice import choose, sharpness
-from .visibility import seen
+from .keyframe_choice import choose_keyframes, measure_detail
+from .visibility import find_visible
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Options:
             raise ConfigError(f"'border' must be from 0 to 0.5, got {self.border}.")
 
 
-def lift(
+def lift_features(
     gaussians: Gaussians,
     frames: Sequence[Frame],
     T_world_cam: NDArray[np.float64],
@@ -69,7 +69,7 @@ def lift(
     """
     options, progress = options or Options(), progress or Progress()
     fusion = FeatureFusion(len(gaussians), encoder.dimension, options.disagreement)
-    chosen = chosen_keyframes(gaussians, frames, T_world_cam, options)
+    chosen = choose_encoded_keyframes(gaussians, frames, T_world_cam, options)
     progress.stage("language", len(chosen))
     for done, row in enumerate(chosen, start=1):
         frame = frames[row]
@@ -78,7 +78,7 @@ def lift(
         except FrameError as error:
             progress.warn(str(error))
         else:
-            fusion.add(seen(gaussians, frame, T_world_cam[row], options), features)
+            fusion.add(find_visible(gaussians, frame, T_world_cam[row], options), features)
         progress.advance(done)
     return fusion.features()
 
@@ -91,7 +91,7 @@ def _encoded(encoder: Encoder, frame: Frame) -> NDArray[np.float16]:
     return features
 
 
-def chosen_keyframes(
+def choose_encoded_keyframes(
     gaussians: Gaussians, frames: Sequence[Frame], T_world_cam: NDArray[np.float64], options: Options
 ) -> list[int]:
     """Rows of the keyframes that are encoded, ascending: as many as ``options.keyframes`` allows."""
@@ -101,6 +101,6 @@ def chosen_keyframes(
         return list(range(count))
     views, sharp = [], []
     for frame, T in zip(frames, T_world_cam, strict=True):
-        views.append(seen(gaussians, frame, T, options))
-        sharp.append(sharpness(frame.color))
-    return choose(views, sharp, len(gaussians), most)
+        views.append(find_visible(gaussians, frame, T, options))
+        sharp.append(measure_detail(frame.color))
+    return choose_keyframes(views, sharp, len(gaussians), most)

@@ -52,12 +52,12 @@ class _Remote:
 
     def is_content_of(self, path: Path) -> bool:
         if self.sha256:
-            return model_packages.sha256(path) == self.sha256
+            return model_packages.hash_file(path) == self.sha256
         content = path.read_bytes()
         return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest() == self.blob
 
 
-def pull(name: str, revision: str = "main", progress: Progress | None = None) -> Path:
+def pull_package(name: str, revision: str = "main", progress: Progress | None = None) -> Path:
     """Fetch the repository OWNER/NAME, or one of NAMES, and return the folder that it is in: a package by its name in
     the models folder, a checkpoint in its sub-folder CHECKPOINTS. What is there already, and whole, is not fetched.
 
@@ -73,18 +73,18 @@ def pull(name: str, revision: str = "main", progress: Progress | None = None) ->
     local = name if name in NAMES else repository.split("/")[1]
     remote = _listed(repository, revision)
     manifest = next((remote[n] for n in model_packages.MANIFESTS if n in remote), None)
-    root = model_packages.models_folder() if manifest else model_packages.models_folder() / CHECKPOINTS
+    root = model_packages.find_models_folder() if manifest else model_packages.find_models_folder() / CHECKPOINTS
     target, partial = root / local, root / f"{local}.partial"
     if target.exists():
         if manifest:
-            model_packages.verify(model_packages.read(target))
+            model_packages.verify_files(model_packages.read_package(target))
         return target
     try:
         partial.mkdir(parents=True, exist_ok=True)
         if manifest:
             _fetch(repository, revision, manifest, partial, progress)
             own = partial / manifest.name
-            package = model_packages.parse(model_packages.load_manifest(own), partial, own)
+            package = model_packages.parse_manifest(model_packages.load_manifest(own), partial, own)
             wanted = list(package.files)
         else:
             wanted = _checkpoint_files(repository, remote)
@@ -93,7 +93,7 @@ def pull(name: str, revision: str = "main", progress: Progress | None = None) ->
         for file in wanted:
             _fetch(repository, revision, remote[file], partial, progress)
         if manifest:
-            model_packages.verify(model_packages.read(partial))
+            model_packages.verify_files(model_packages.read_package(partial))
         for rest in partial.glob("*.incomplete"):  # of another revision
             rest.unlink()
         partial.rename(target)
@@ -195,5 +195,5 @@ def _told(error: Exception, repository: str, revision: str) -> ModelError:
     said = " ".join(str(error).split())[:120] or type(error).__name__
     return ModelError(
         f"{repository} could not be fetched from {_endpoint()}: {said}. What is there already is kept: pull again once "
-        f"the network is back, or copy the model's folder to {model_packages.models_folder()}."
+        f"the network is back, or copy the model's folder to {model_packages.find_models_folder()}."
     )

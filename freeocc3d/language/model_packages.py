@@ -116,7 +116,7 @@ class Package:
     def file(self, part: str) -> Path:
         """The part's file, its content checked. Raises ModelError."""
         path = self.folder / self.parts[part]
-        found = sha256(path)
+        found = hash_file(path)
         if found != self.files[self.parts[part]]:
             raise ModelError(
                 f"{path} is damaged: its sha256 is {found[:12]}…, the manifest says "
@@ -149,13 +149,13 @@ class Package:
         return session
 
 
-def models_folder() -> Path:
+def find_models_folder() -> Path:
     """Where packages are looked for by name."""
     given = os.environ.get("FREEOCC3D_MODELS")
     return Path(given) if given else Path.home() / ".cache" / "freeocc3d" / "models"
 
 
-def find(model: str, kinds: tuple[str, ...], option: str) -> Package:
+def find_model(model: str, kinds: tuple[str, ...], option: str) -> Package:
     """The package of one of ``kinds`` in the folder ``model``, or of that name in the models folder; ``option`` is the
     key that named it. Raises ModelError."""
     if not model:
@@ -165,50 +165,50 @@ def find(model: str, kinds: tuple[str, ...], option: str) -> Package:
         )
     folder = Path(model).expanduser()
     if not folder.is_dir():
-        if folder.name != model or not (models_folder() / model).is_dir():
+        if folder.name != model or not (find_models_folder() / model).is_dir():
             close = nearest(model, (path.name for path in _folders()))
             raise ModelError(f"There is no model '{model}'{close}, neither as a folder nor by name ({_known()}).")
-        folder = models_folder() / model
-    package = read(folder)
+        folder = find_models_folder() / model
+    package = read_package(folder)
     if package.kind not in kinds:
         raise ModelError(f"{option} needs a model of kind {' or '.join(kinds)}; {folder} is of kind {package.kind}.")
     return package
 
 
-def find_text(name: str, folder: str, text_sha256: str) -> Package:
+def find_text_model(name: str, folder: str, text_sha256: str) -> Package:
     """The package with that text side: in ``folder``, by its name, or by any other. Raises ModelError."""
-    for candidate in (Path(folder), models_folder() / Path(name).name, *_folders()):
+    for candidate in (Path(folder), find_models_folder() / Path(name).name, *_folders()):
         try:
-            package = read(candidate)
+            package = read_package(candidate)
         except ModelError:
             continue
         if "text" in package.parts and package.text_sha256 == text_sha256:
             return package
     raise ModelError(
         f"The words of this map need the text side of the model '{name}' ({text_sha256[:12]}…), which is neither in "
-        f"{folder} nor in {models_folder()}: copy its folder there, or map again with a model that is there."
+        f"{folder} nor in {find_models_folder()}: copy its folder there, or map again with a model that is there."
     )
 
 
-def installed() -> dict[str, Package | ModelError]:
+def list_installed() -> dict[str, Package | ModelError]:
     """Name -> package in the models folder, or what is wrong with it."""
     found: dict[str, Package | ModelError] = {}
     for folder in _folders():
         try:
-            found[folder.name] = read(folder)
+            found[folder.name] = read_package(folder)
         except ModelError as error:
             found[folder.name] = error
     return found
 
 
-def verify(package: Package) -> None:
+def verify_files(package: Package) -> None:
     """Compare every file's content with the manifest's hash. Raises ModelError for the first that differs."""
     by_file = {name: part for part, name in package.parts.items()}
     for name in package.files:
         package.file(by_file[name])
 
 
-def read(folder: Path) -> Package:
+def read_package(folder: Path) -> Package:
     """The package in a folder: its manifest is checked, and that its files are there; not yet what is in them.
 
     Raises ModelError.
@@ -220,7 +220,7 @@ def read(folder: Path) -> Package:
         raise ModelError(
             f"{folder} is no model package: it lacks a {MANIFESTS[0]}; 'freeocc3d models export' writes one."
         )
-    package = parse(load_manifest(path), folder, path)
+    package = parse_manifest(load_manifest(path), folder, path)
     for name in package.files:
         if not (folder / name).is_file():
             raise ModelError(f"The model {folder} lacks its {name}: pull or export it again.")
@@ -238,7 +238,7 @@ def load_manifest(path: Path) -> Any:
         raise ModelError(f"{path} cannot be read: {' '.join(str(error).split())}.") from error
 
 
-def parse(manifest: Any, folder: Path, path: Path) -> Package:
+def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:
     """The package that a manifest describes; ``path`` is named in errors. Raises ModelError."""
 
     def refuse(why: str) -> ModelError:
@@ -299,7 +299,7 @@ def parse(manifest: Any, folder: Path, path: Path) -> Package:
     )
 
 
-def sha256(path: Path) -> str:
+def hash_file(path: Path) -> str:
     """Hexadecimal digest of a file's content. Raises ModelError."""
     digest = hashlib.sha256()
     try:
@@ -312,7 +312,7 @@ def sha256(path: Path) -> str:
 
 
 def _folders() -> list[Path]:
-    root = models_folder()
+    root = find_models_folder()
     if not root.is_dir():
         return []
     return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith(".") and p.suffix != ".partial")
@@ -320,4 +320,4 @@ def _folders() -> list[Path]:
 
 def _known() -> str:
     names = ", ".join(path.name for path in _folders())
-    return f"in {models_folder()} there are: {names}" if names else f"there are none in {models_folder()} yet"
+    return f"in {find_models_folder()} there are: {names}" if names else f"there are none in {find_models_folder()} yet"

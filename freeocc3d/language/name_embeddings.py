@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import read_arrays
 from ..core.errors import ConfigError, MapError
-from .synonyms import key_of, synonyms
+from .synonyms import find_synonyms, make_key
 
 _NEIGHBOURS = 10
 _ROWS = 1024
@@ -63,11 +63,15 @@ class NameEmbeddings:
 
         A class that is not among the names is known by a synonym that is; one without any is reached by no name.
         """
-        row = {key_of(name): n for n, name in reversed(list(enumerate(self.names)))}
+        row = {make_key(name): n for n, name in reversed(list(enumerate(self.names)))}
         known = [
             (c, row[key])
             for c, name in enumerate(classes)
-            if (key := next((k for k in (key_of(name), *sorted(map(key_of, synonyms(name)))) if k in row), None))
+            if (
+                key := next(
+                    (k for k in (make_key(name), *sorted(map(make_key, find_synonyms(name)))) if k in row), None
+                )
+            )
         ]
         if not known:
             return {}

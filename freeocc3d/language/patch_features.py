@@ -78,17 +78,17 @@ class Splice:
         return self._sum / self._count[..., None]
 
 
-def finished(patches: NDArray[np.float32], rgb: NDArray[np.uint8], stride: int) -> NDArray[np.float16]:
+def finish_patches(patches: NDArray[np.float32], rgb: NDArray[np.uint8], stride: int) -> NDArray[np.float16]:
     """Unit features (rows, columns, D) of patches as an encoder gives them: upsampled along the edges of the frame's
     (H, W, 3) pixels, one feature every ``stride`` of them; 0 = as they are."""
     if stride == 0:
         return patches.astype(np.float16)
-    from .guided_upsampling import upsample
+    from .guided_upsampling import upsample_features
 
-    return upsample(patches, rgb, stride)
+    return upsample_features(patches, rgb, stride)
 
 
-def resampled(features: NDArray[np.float32], grid: tuple[int, int]) -> NDArray[np.float32]:
+def resample_patches(features: NDArray[np.float32], grid: tuple[int, int]) -> NDArray[np.float32]:
     """(h, w, C) features at the cells of another grid that covers the same, linearly in between."""
     rows, columns = (_linear(own, wanted) for own, wanted in zip(features.shape[:2], grid, strict=True))
     return np.asarray(np.einsum("ri,cj,ijk->rck", rows, columns, features, optimize=True), np.float32)
@@ -100,7 +100,7 @@ def _linear(own: int, wanted: int) -> NDArray[np.float32]:
     return np.maximum(1 - np.abs(at[:, None] - np.arange(own)), 0).astype(np.float32)
 
 
-def unit(features: NDArray[np.float32]) -> NDArray[np.float32]:
+def normalize_patches(features: NDArray[np.float32]) -> NDArray[np.float32]:
     """(..., D) of unit length; zeros stay."""
     norms = np.linalg.norm(features, axis=-1, keepdims=True)
     return np.asarray(features / np.where(norms > 0, norms, 1), np.float32)

@@ -25,8 +25,8 @@ from ..core.atomic_files import replace_text
 from ..core.errors import ConfigError
 from ..core.types import Frame
 from ..settings.registry import require_positive
-from .synonyms import normal
-from .vision_server import ServerError, VisionServer, address, one_line
+from .synonyms import normalize_phrase
+from .vision_server import ServerError, VisionServer, resolve_address, shorten_to_line
 
 QUESTION = (
     "Name every kind of object, furniture and surface that is clearly visible in this picture of a room, walls and "
@@ -71,7 +71,7 @@ class Options:
         if self.retries < 0:
             raise ConfigError(f"'retries' must not be negative, got {self.retries}.")
         if self.endpoint is not None:
-            address(self.endpoint)
+            resolve_address(self.endpoint)
             if not self.model:
                 raise ConfigError("'vocabulary.endpoint' is given, so 'vocabulary.model' must say what to ask there.")
 
@@ -105,7 +105,7 @@ class Namer:
                 failed, failures = str(error), _MOST_FAILURES if error.final else failures + 1
                 continue
             failures = 0
-            answers[keyframe.index] = parse(said) or []
+            answers[keyframe.index] = parse_names(said) or []
             if not answers[keyframe.index]:
                 nothing.append(said)
             self._keep(path, answers)
@@ -116,11 +116,11 @@ class Namer:
             lacking = len(asked) - len(answered)
             warnings.append(f"The scene's vocabulary lacks {lacking} of {len(asked)} keyframes: {failed.rstrip('.')}.")
         if nothing:
-            shown = one_line(nothing[0], 60) or "nothing"
+            shown = shorten_to_line(nothing[0], 60) or "nothing"
             warnings.append(
                 f"{len(nothing)} of {len(answered)} answers of {self.options.model} name nothing, the first: '{shown}'."
             )
-        return aggregated(answered, self.options.model), warnings
+        return aggregate_names(answered, self.options.model), warnings
 
     def _marks(self) -> str:
         """Of what answers depend on."""
@@ -141,7 +141,7 @@ class Namer:
             return {}
 
 
-def load(options: Options) -> Namer | None:
+def load_namer(options: Options) -> Namer | None:
     """What asks, None if no endpoint is given. Raises ConfigError if the key's environment variable is not set."""
     if options.endpoint is None:
         return None
@@ -157,7 +157,7 @@ def load(options: Options) -> Namer | None:
     return Namer(options, server)
 
 
-def aggregated(answers: dict[int, list[str]], model: str) -> dict[str, Any]:
+def aggregate_names(answers: dict[int, list[str]], model: str) -> dict[str, Any]:
     """Names over frames, as a map keeps them: plain numbers and strings."""
     frames: dict[str, list[int]] = {}
     for frame, names in answers.items():
@@ -168,7 +168,7 @@ def aggregated(answers: dict[int, list[str]], model: str) -> dict[str, Any]:
     return {"model": model, "keyframes": list(answers), "names": counted}
 
 
-def parse(text: str) -> list[str] | None:
+def parse_names(text: str) -> list[str] | None:
     """The names in an answer in normal form, each once; None for an answer that is no list of names.
 
     Taken are a JSON list, alone or with words around it, a JSON object that holds one, lines with bullets or numbers,
@@ -208,7 +208,7 @@ def _name(entry: Any) -> str:
         entry = next((entry[key] for key in ("name", "object", "label") if key in entry), None)
     if not isinstance(entry, str) or len(entry) > 4 * _LONGEST_NAME:
         return ""
-    name = normal(re.sub(r"\(.*?\)|[*_`\"]", " ", entry))
+    name = normalize_phrase(re.sub(r"\(.*?\)|[*_`\"]", " ", entry))
     words = name.split()
     long_enough = len(name) > 1 or not name.isascii()
     fits = long_enough and len(name) <= _LONGEST_NAME and len(words) <= _MOST_WORDS and not _SENTENCE & set(words)

@@ -93,13 +93,13 @@ _LONGEST_PHRASE = 16
 
 
 @functools.lru_cache(maxsize=4096)
-def normal(phrase: str) -> str:
+def normalize_phrase(phrase: str) -> str:
     """Lower case, no articles or punctuation, each word in the singular: "The Coffee-Tables" to "coffee table"."""
     words = re.findall(r"[^\W_]+", phrase.lower())
     return " ".join(_singular(word) for word in words if word not in _ARTICLES)
 
 
-def matching_names(phrase: str, names: list[str]) -> tuple[list[int], str]:
+def match_names(phrase: str, names: list[str]) -> tuple[list[int], str]:
     """Which of some class names a phrase means, and the part of the phrase that was used; no match: ([], "").
 
     The whole phrase is tried first, then the ends of what stands before a preposition ("red chair by the window":
@@ -107,75 +107,77 @@ def matching_names(phrase: str, names: list[str]) -> tuple[list[int], str]:
     that are equal to it or a kind of it ("table": "coffee table" and "side table"), failing those its synonyms', and
     failing all that, the names of a wider word that includes it ("mug": "tableware").
     """
-    known = [key_of(name) for name in names]
+    known = [make_key(name) for name in names]
     kinds = [_tail_keys(name) for name in names]
-    parts = parts_of(phrase)
+    parts = split_phrase(phrase)
     for part in parts:
-        for words in (frozenset((part,)), synonyms(part)):
+        for words in (frozenset((part,)), find_synonyms(part)):
             if found := _named(words, known, kinds):
                 return found, part
     for part in parts:
-        if found := _exactly({wide for word in synonyms(part) for wide in wider(word)}, known):
+        if found := _exactly({wide for word in find_synonyms(part) for wide in find_wider(word)}, known):
             return found, part
     return [], ""
 
 
 @functools.cache
-def synonyms(word: str) -> frozenset[str]:
+def find_synonyms(word: str) -> frozenset[str]:
     """The normal forms that mean the same as ``word``, itself included."""
-    same = {normal(word)}
+    same = {normalize_phrase(word)}
     for group in SYNONYMS:
-        if key_of(word) in {key_of(member) for member in group}:
-            same |= {normal(member) for member in group}
+        if make_key(word) in {make_key(member) for member in group}:
+            same |= {normalize_phrase(member) for member in group}
     return frozenset(same)
 
 
 @functools.cache
-def narrower(word: str) -> frozenset[str]:
+def find_narrower(word: str) -> frozenset[str]:
     """The normal forms of what ``word`` includes, at any remove, with their synonyms."""
     found: set[str] = set()
-    for inner in INCLUDES.get(normal(word), ()):
-        found |= synonyms(inner) | narrower(inner)
+    for inner in INCLUDES.get(normalize_phrase(word), ()):
+        found |= find_synonyms(inner) | find_narrower(inner)
     return frozenset(found)
 
 
 @functools.cache
-def wider(word: str) -> frozenset[str]:
+def find_wider(word: str) -> frozenset[str]:
     """The normal forms of what includes ``word``."""
-    key = key_of(word)
-    return frozenset(normal(wide) for wide in INCLUDES if key in {key_of(inner) for inner in INCLUDES[wide]})
+    key = make_key(word)
+    return frozenset(
+        normalize_phrase(wide) for wide in INCLUDES if key in {make_key(inner) for inner in INCLUDES[wide]}
+    )
 
 
-def parts_of(phrase: str) -> list[str]:
+def split_phrase(phrase: str) -> list[str]:
     """Normal forms to look up, most specific first."""
     tokens = re.findall(r"[^\W_]+", phrase.lower())[:_LONGEST_PHRASE]
     cut = next((at for at, token in enumerate(tokens) if at > 0 and token in _PREPOSITIONS), len(tokens))
-    head = normal(" ".join(tokens[:cut])).split()
+    head = normalize_phrase(" ".join(tokens[:cut])).split()
     ends = [" ".join(head[start:]) for start in range(len(head))]
-    return list(dict.fromkeys(part for part in (normal(" ".join(tokens)), *ends) if part))
+    return list(dict.fromkeys(part for part in (normalize_phrase(" ".join(tokens)), *ends) if part))
 
 
 def _named(words: frozenset[str], known: list[str], kinds: list[frozenset[str]]) -> list[int]:
     """Rows of the names that are one of ``words``, or a kind of one."""
-    keys = {key_of(word) for word in words}
-    keys |= {key_of(name) for word in words for name in narrower(word)}
+    keys = {make_key(word) for word in words}
+    keys |= {make_key(name) for word in words for name in find_narrower(word)}
     return [row for row, name in enumerate(known) if name in keys or kinds[row] & keys]
 
 
 def _exactly(words: set[str], known: list[str]) -> list[int]:
-    keys = {key_of(word) for word in words}
+    keys = {make_key(word) for word in words}
     return [row for row, name in enumerate(known) if name in keys]
 
 
-def key_of(name: str) -> str:
+def make_key(name: str) -> str:
     """Equal for "night stand", "Nightstand" and "nightstands"."""
-    return normal(name).replace(" ", "")
+    return normalize_phrase(name).replace(" ", "")
 
 
 @functools.lru_cache(maxsize=4096)
 def _tail_keys(name: str) -> frozenset[str]:
     """Keys of what a name of several words is a kind of: of "small office chair", "office chair" and "chair"."""
-    words = normal(name).split()
+    words = normalize_phrase(name).split()
     return frozenset("".join(words[start:]) for start in range(1, len(words)))
 
 

@@ -82,7 +82,7 @@ class ModelWords(TextEncoder):
         except (KeyError, TypeError, ValueError) as error:
             raise MapError(f"The map's encoder is damaged: its state lacks a usable {error}.") from error
         key = hashlib.sha256("\n".join((self._sha256, *self._templates)).encode()).hexdigest()[:32]
-        self._cache = model_packages.models_folder() / ".embeddings" / f"{key}.npz"
+        self._cache = model_packages.find_models_folder() / ".embeddings" / f"{key}.npz"
         self._known: dict[str, NDArray[np.float32]] | None = None
         self._text: TextNetwork | None = None
 
@@ -97,7 +97,7 @@ class ModelWords(TextEncoder):
         new = [word for word in dict.fromkeys(plain) if word and word not in self._known]
         if new:
             if self._text is None:
-                package = model_packages.find_text(self._model, self._folder, self._sha256)
+                package = model_packages.find_text_model(self._model, self._folder, self._sha256)
                 self._text = TextNetwork(package)
                 if package.dimension != self._dimension:
                     raise ModelError(

@@ -53,7 +53,7 @@ class SightLimits(Protocol):
 
 
 @dataclass(frozen=True)
-class Seen:
+class VisibleGaussians:
     """The M Gaussians that a frame shows.
 
     rows: (M,) int32, ascending.  pixels: (M,) int32, row * width + column of each one's pixel.
@@ -72,7 +72,9 @@ class Seen:
         return np.asarray(row * h // height * w + column * w // width, np.int32)
 
 
-def seen(gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: SightLimits) -> Seen:
+def find_visible(
+    gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: SightLimits
+) -> VisibleGaussians:
     """What a frame shows of N Gaussians."""
     camera, depth_m = frame.intrinsics, frame.depth_m
     pinhole = np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32)
@@ -85,10 +87,10 @@ def seen(gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], o
         np.float32(max(options.border * min(depth_m.shape), 1e-6)), pixels, weights,
     )  # fmt: skip
     rows = np.flatnonzero(weights).astype(np.int32)
-    return Seen(rows, pixels[rows], weights[rows], depth_m.shape)
+    return VisibleGaussians(rows, pixels[rows], weights[rows], depth_m.shape)
 
 
-def seen_reference(
+def find_visible_reference(
     gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: SightLimits
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(N,) pixels and (N,) weights, 0 for what is not seen: plain NumPy, all Gaussians at once."""

@@ -72,7 +72,7 @@ class VisionServer:
         headers = {"Content-Type": "application/json", "Accept": "application/json", "User-Agent": "freeocc3d"}
         if self.key:
             headers["Authorization"] = f"Bearer {self.key}"
-        url = address(self.endpoint)
+        url = resolve_address(self.endpoint)
         request = urllib.request.Request(url, body, headers, method="POST")
         no_proxy = [urllib.request.ProxyHandler({})] if urlsplit(url).hostname in _LOCAL else []
         opener = urllib.request.build_opener(_NoRedirects, *no_proxy)
@@ -102,7 +102,9 @@ class VisionServer:
         while chunk := response.read1(65536):  # type: ignore[attr-defined]
             body += chunk
             if len(body) > _MOST_BYTES:
-                raise ServerError(f"{address(self.endpoint)} sends more than {_MOST_BYTES:,} bytes", final=False)
+                raise ServerError(
+                    f"{resolve_address(self.endpoint)} sends more than {_MOST_BYTES:,} bytes", final=False
+                )
             if time.monotonic() > deadline:
                 raise TimeoutError
         return bytes(body)
@@ -114,7 +116,9 @@ class VisionServer:
             content = message.get("content")
         except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
             said = self._cleaned(body[:80].decode(errors="replace"))
-            raise ServerError(f"{address(self.endpoint)} does not answer as a chat does: '{said}'", False) from error
+            raise ServerError(
+                f"{resolve_address(self.endpoint)} does not answer as a chat does: '{said}'", False
+            ) from error
         if isinstance(content, list):  # parts, as some servers send them
             texts = [part.get("text") for part in content if isinstance(part, dict)]
             content = "\n".join(text for text in texts if isinstance(text, str))
@@ -122,15 +126,15 @@ class VisionServer:
 
     def _cleaned(self, text: str) -> str:
         """One short line without the key, which some servers quote."""
-        return one_line(text.replace(self.key, "(key)") if self.key else text, 120)
+        return shorten_to_line(text.replace(self.key, "(key)") if self.key else text, 120)
 
 
-def one_line(text: str, length: int) -> str:
+def shorten_to_line(text: str, length: int) -> str:
     """The start of a text that came from elsewhere, fit to be shown."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:length]
 
 
-def address(endpoint: str) -> str:
+def resolve_address(endpoint: str) -> str:
     """Where chats are completed. Raises ConfigError for what is no http or https address, or holds a password."""
     try:
         parts = urlsplit(endpoint)

@@ -21,26 +21,28 @@ MANY = 200_000
 """Voxels from which numba is loaded for them: that takes longer than fewer take without it."""
 
 
-def compiled(count: int) -> bool:
+def is_worth_compiling(count: int) -> bool:
     """Whether so many voxels are worth compiled code."""
     return count >= MANY or "numba" in sys.modules
 
 
-def beside(
+def compare_competitors(
     scores: NDArray[np.float32], others: NDArray[np.float32], temperature: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(V,) largest c_i - s, and (V,) sum of exp((c_i - s) / T), of (V,) scores and (V, C) others'. Without any others:
     -1 and 0."""
-    if compiled(len(scores)):
+    if is_worth_compiling(len(scores)):
         from . import coded_scores
 
-        largest, odds = coded_scores.beside(scores, np.asfortranarray(others).T, np.float32(1 / temperature))
+        largest, odds = coded_scores.compare_coded_competitors(
+            scores, np.asfortranarray(others).T, np.float32(1 / temperature)
+        )
         return np.asarray(largest), np.asarray(odds)
     margin = others - scores[:, None]
     return margin.max(axis=1, initial=-1.0), np.exp(margin / np.float32(temperature)).sum(axis=1)
 
 
-def confidences(
+def compute_confidences(
     scores: NDArray[np.float32],
     others: NDArray[np.float32],
     candidates: NDArray[np.bool_],
@@ -52,31 +54,33 @@ def confidences(
 
     scores: (V, W) of the words, others: (V, C) of the others.
     """
-    if compiled(len(scores)):
+    if is_worth_compiling(len(scores)):
         from . import coded_scores
 
-        return np.asarray(coded_scores.confidences(scores, others, candidates, competes, np.float32(1 / temperature)))
+        return np.asarray(
+            coded_scores.compute_coded_confidences(scores, others, candidates, competes, np.float32(1 / temperature))
+        )
     out = np.zeros(scores.shape, np.float32)
     by_word = np.ascontiguousarray(others.T)  # as they mostly lie in memory
     for w, rivals in enumerate(competes):
         rows = np.flatnonzero(candidates[:, w])
         margin = by_word[np.ix_(rivals, rows)] - scores[rows, w]
         best = margin.max(axis=0, initial=-1.0) <= 0
-        out[rows[best], w] = softmax(np.exp(margin[:, best] / np.float32(temperature)).sum(axis=0))
+        out[rows[best], w] = compare_with_all(np.exp(margin[:, best] / np.float32(temperature)).sum(axis=0))
     return out
 
 
-def softmax(odds: NDArray[np.float32]) -> NDArray[np.float32]:
+def compare_with_all(odds: NDArray[np.float32]) -> NDArray[np.float32]:
     """(V,) probability of the word against all others together."""
     return np.asarray(1 / (1 + odds), np.float32)
 
 
-def relevancy(largest: NDArray[np.float32], temperature: float) -> NDArray[np.float32]:
+def compare_with_best(largest: NDArray[np.float32], temperature: float) -> NDArray[np.float32]:
     """(V,) probability of the word against the best of the others."""
     return np.asarray(1 / (1 + np.exp(np.minimum(largest / np.float32(temperature), 80))), np.float32)
 
 
-def grown(seeds: NDArray[np.bool_], component: NDArray[np.int32]) -> NDArray[np.bool_]:
+def grow_regions(seeds: NDArray[np.bool_], component: NDArray[np.int32]) -> NDArray[np.bool_]:
     """(V,) which voxels hang together with a seed, given the component of each: regions begin where a word fits well,
     and end where it fits no more (hysteresis; J. Canny, A Computational Approach to Edge Detection, PAMI 1986)."""
     return np.asarray(np.bincount(component, seeds)[component] > 0)

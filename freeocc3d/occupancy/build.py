@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, PosedFrame
 from . import carve, splat
-from .voxel_blocks import pack, union, unpack
+from .voxel_blocks import pack, unite_keys, unpack
 
 
 def build_occupancy(
@@ -37,19 +37,21 @@ def build_occupancy(
         within = pack(np.stack(np.unravel_index(np.arange(np.prod(blocks)), blocks), axis=1))
     bins = splat.bin_gaussians(gaussians, origin, splatting, shape, least_scale)
 
-    evidence = carve.Evidence(origin, size, carving, within)
+    evidence = carve.DepthEvidence(origin, size, carving, within)
     for done, posed in enumerate(frames, start=1):
         evidence.add(posed.frame, posed.T_world_cam)
         progress(done)
-    return of_blocks(union(bins.packed, evidence.packed), bins, gaussians, features, evidence, splatting, carving)
+    return build_blocks(
+        unite_keys(bins.packed, evidence.packed), bins, gaussians, features, evidence, splatting, carving
+    )
 
 
-def of_blocks(
+def build_blocks(
     packed: NDArray[np.int64],
     bins: splat.Bins,
     gaussians: Gaussians,
     features: NDArray[np.float16],
-    evidence: carve.Evidence,
+    evidence: carve.DepthEvidence,
     splatting: splat.Options,
     carving: carve.Options,
 ) -> Occupancy:
@@ -57,14 +59,14 @@ def of_blocks(
     free, hits = evidence.at(packed)
     probability = np.zeros((len(packed), BLOCK**3), np.float32)
     splatted = np.searchsorted(packed, bins.packed)
-    probability[splatted] = splat.probability(bins, unpack(bins.packed))
+    probability[splatted] = splat.compute_probability(bins, unpack(bins.packed))
     state = classify(probability, free, hits, splatting, carving)
 
     slots = np.full(state.shape, -1, np.int32)
     occupied = state == OCCUPIED
     slots[occupied] = np.arange(np.count_nonzero(occupied))
     values = np.concatenate((gaussians.colors.astype(np.float16), features), axis=1)  # 0…255 are exact
-    means = splat.posterior_mean(bins, unpack(bins.packed), slots[splatted], values)
+    means = splat.compute_posterior_mean(bins, unpack(bins.packed), slots[splatted], values)
     return Occupancy(
         voxel_size=splatting.voxel_size,
         origin=evidence.origin,
@@ -73,7 +75,7 @@ def of_blocks(
         free=free,
         hits=hits,
         state=state,
-        features=normalized(means[:, 3:]),
+        features=normalize_rows(means[:, 3:]),
         colors=np.rint(means[:, :3]).astype(np.uint8),
     )
 
@@ -87,14 +89,14 @@ def classify(
 ) -> NDArray[np.uint8]:
     """State of each voxel: occupied by alpha unless the log-odds of the depth images contradict it, free where they saw
     through, else unknown. Unknown is never taken for free."""
-    contradicted = carve.log_odds(free, hits, carving) <= -splatting.contradiction
+    contradicted = carve.compute_log_odds(free, hits, carving) <= -splatting.contradiction
     occupied = (probability >= splatting.threshold) & ~contradicted
     state = np.where(free >= carving.min_free, FREE, UNKNOWN).astype(np.uint8)
     state[occupied] = OCCUPIED
     return state
 
 
-def normalized(features: NDArray[np.float32]) -> NDArray[np.float16]:
+def normalize_rows(features: NDArray[np.float32]) -> NDArray[np.float16]:
     """(V, D) rows to unit length; zero rows, of which nothing is known, stay zero."""
     norms = np.linalg.norm(features, axis=1, keepdims=True)
     return (features / np.where(norms > 1e-6, norms, 1.0)).astype(np.float16)

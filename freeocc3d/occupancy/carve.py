@@ -13,7 +13,7 @@ from ..core.errors import ConfigError
 from ..core.transforms import back_project, invert, transform
 from ..core.types import BLOCK, Frame
 from ..settings.registry import require_positive
-from .voxel_blocks import blocks_along_rays, unpack
+from .voxel_blocks import find_blocks_along_rays, unpack
 
 _NARROW = 64
 """Of the image's width: where no depth is measured within one such part of a pixel, the pixel is amid a wide patch, and
@@ -51,7 +51,7 @@ class Options:
             raise ConfigError("'noise', 'every' and 'no_return' must not be negative.")
 
 
-def log_odds(free: NDArray[np.uint16], hits: NDArray[np.uint16], options: Options) -> NDArray[np.float32]:
+def compute_log_odds(free: NDArray[np.uint16], hits: NDArray[np.uint16], options: Options) -> NDArray[np.float32]:
     """Log-odds of occupancy that depth images alone give, by the numbers that saw through and ended in each voxel: the
     inverse sensor model says ``hit`` within half a voxel and the depth's uncertainty, which grows with its square, of
     what is measured, ``-miss`` in front of that with a margin, and nothing behind.
@@ -61,7 +61,7 @@ def log_odds(free: NDArray[np.uint16], hits: NDArray[np.uint16], options: Option
     return np.float32(options.hit) * hits - np.float32(options.miss) * free
 
 
-class Evidence:
+class DepthEvidence:
     """Counts, for every voxel, the depth images that saw through it and those that ended in it.
 
     A voxel's centre and the four points half a voxel beside it (along the image's axes) are looked up in the depth
@@ -135,7 +135,7 @@ class Evidence:
             spread = 3 * frame.depth_sigma_m[rows[v], columns[u]]
         z = measured[v, u] + 0.5 * self.voxel_size + spread
         points = transform(T_world_cam, back_project(pixels, z.astype(np.float32), camera).astype(np.float64))
-        return blocks_along_rays(points, T_world_cam[:3, 3], self.origin, self.voxel_size)
+        return find_blocks_along_rays(points, T_world_cam[:3, 3], self.origin, self.voxel_size)
 
     def _told(self, frame: Frame) -> Frame:
         """The frame with the depth of pixels amid a wide patch of none at minus ``no_return``: nothing up to there."""

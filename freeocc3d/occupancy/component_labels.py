@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..core.hash_table import build_table, find
+from ..core.hash_table import build_table, find_row
 from ..core.types import BLOCK
 from .voxel_blocks import pack, packed_key, unpack
 
@@ -15,7 +15,7 @@ SPARSEST = 16
 """Voxels in a block on average, at least: fewer would waste memory, 2 KB a block."""
 
 
-def connected(voxels: NDArray[np.int32]) -> NDArray[np.int32] | None:
+def label_lattice(voxels: NDArray[np.int32]) -> NDArray[np.int32] | None:
     """(V,) component number of each of (V, 3) distinct voxels, in the order in which the components come first; voxels
     that share a face, edge or corner are connected. None for voxels that lie too far apart for this way."""
     packed = pack(voxels >> 3)
@@ -47,14 +47,14 @@ def _connected(
     block, last = 0, np.int64(-1)
     for n in range(len(voxels)):
         if packed[n] != last:
-            block, last = find(table, rows, packed[n]), packed[n]
+            block, last = find_row(table, rows, packed[n]), packed[n]
         at[block, ((voxels[n, 0] & 7) * BLOCK + (voxels[n, 1] & 7)) * BLOCK + (voxels[n, 2] & 7)] = n
     parent = np.arange(len(voxels)).astype(np.int32)
     near = np.empty(27, np.int32)  # rows of the block's neighbours, itself in the middle
     for b in range(len(keys)):
         for side in range(27):
             i, j, k = side // 9 - 1, side // 3 % 3 - 1, side % 3 - 1
-            near[side] = find(table, rows, packed_key(keys[b, 0] + i, keys[b, 1] + j, keys[b, 2] + k))
+            near[side] = find_row(table, rows, packed_key(keys[b, 0] + i, keys[b, 1] + j, keys[b, 2] + k))
         for i in range(BLOCK):
             for j in range(BLOCK):
                 for k in range(BLOCK):

@@ -9,7 +9,7 @@ from ..core.voxel_keys import AXIS_BITS, contains, packed_voxels
 from ..language import word_matching
 
 
-def connected(voxels: NDArray[np.int32], edges: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
+def label_components(voxels: NDArray[np.int32], edges: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
     """(V,) component number of each of (V, 3) distinct voxels; voxels that share a face, edge or corner are connected.
 
     edges: (V,) powers of two that divide their voxel's lower corner; 1 by default. The dense box is never made.
@@ -19,10 +19,10 @@ def connected(voxels: NDArray[np.int32], edges: NDArray[np.int32] | None = None)
         return np.zeros(0, np.int32)
     edges = np.ones(n, np.int32) if edges is None else edges
     sizes = np.unique(edges)
-    if len(sizes) == 1 and word_matching.compiled(n):
+    if len(sizes) == 1 and word_matching.is_worth_compiling(n):
         from . import component_labels
 
-        found = component_labels.connected(voxels // sizes[0])
+        found = component_labels.label_lattice(voxels // sizes[0])
         if found is not None:
             return found
     from scipy.sparse import coo_array

@@ -28,7 +28,7 @@ _MOST_PANELS = 12  # enough down to deviations of a twentieth of a voxel
 
 
 @njit(cache=True)
-def box_masses(
+def integrate_boxes(
     mean: NDArray[np.float32],
     covariance: NDArray[np.float32],
     key: NDArray[np.int32],

@@ -22,7 +22,7 @@ _LARGEST_TURN = np.deg2rad(3.0)
 _EXTENT = 0.5  # metres: standard deviation of a floor's points along its narrow side; a smaller one says no tilt
 
 
-def gravity_frame(T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> NDArray[np.float64]:
+def estimate_gravity_frame(T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> NDArray[np.float64]:
     """(4, 4) rigid ``T_gravity_map``: z up, z = 0 on the floor, x along the walls in the direction that is nearest to
     where the first camera looked, x = y = 0 below that camera.
 
@@ -35,7 +35,7 @@ def gravity_frame(T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> NDArr
     points, normals = _planes(gaussians.means)
     cameras = T_map_cam[:, :3, 3]
     level = points[np.abs(normals @ up) > _LEVEL]
-    height = floor_height(level @ up, float(np.median(cameras @ up)))
+    height = estimate_floor_height(level @ up, float(np.median(cameras @ up)))
     if height is None:
         lowest = gaussians.means @ up.astype(np.float32) if len(gaussians) else cameras @ up
         height = float(np.percentile(lowest, 1))
@@ -49,17 +49,19 @@ def gravity_frame(T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> NDArr
     return T_gravity_map
 
 
-def floor_seen(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> bool:
-    """Whether z = 0 of ``gravity_frame`` is a floor, and not just the lowest that there is."""
+def is_floor_seen(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> bool:
+    """Whether z = 0 of ``estimate_gravity_frame`` is a floor, and not just the lowest that there is."""
     points, normals = _planes(gaussians.means)
     up = T_gravity_map[2, :3]
     level = (points @ up + T_gravity_map[2, 3])[np.abs(normals @ up) > _LEVEL]
     cameras = T_map_cam[:, :3, 3] @ up + T_gravity_map[2, 3]
-    height = floor_height(level, float(np.median(cameras))) if len(cameras) else None
+    height = estimate_floor_height(level, float(np.median(cameras))) if len(cameras) else None
     return height is not None and abs(height) < 2 * _BAND[0]
 
 
-def first_camera_frame(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+def compute_first_camera_frame(
+    T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """(4, 4) rigid ``T_first_map``: z up, the origin at the centre of the camera ``T_map_cam`` (4, 4), x where it
     looked, as robots take the place that they start from."""
     T_gravity_cam = T_gravity_map @ T_map_cam
@@ -70,7 +72,7 @@ def first_camera_frame(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np
     return np.asarray(invert(T_gravity_first) @ T_gravity_map)
 
 
-def floor_height(heights: NDArray[np.float64], camera_height: float) -> float | None:
+def estimate_floor_height(heights: NDArray[np.float64], camera_height: float) -> float | None:
     """The height of the floor from (N,) heights of points on level surfaces: of the peaks of their histogram below the
     cameras, the lowest that has a quarter of the largest one's points; None without points there."""
     below = heights[heights < camera_height - 0.2]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ..core.types import OCCUPIED, Frame, Gaussians, Occupancy
 from . import build, carve, splat
-from .levels import chosen_blocks, says_something
-from .voxel_blocks import pack, union, unpack
+from .levels import mask_known_blocks, select_blocks
+from .voxel_blocks import pack, unite_keys, unpack
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class IncrementalOccupancy:
         self, splatting: splat.Options, carving: carve.Options, origin: NDArray[np.float64] | None = None
     ) -> None:
         self.splatting, self.carving = splatting, carving
-        self.evidence = carve.Evidence(np.zeros(3) if origin is None else origin, splatting.voxel_size, carving)
+        self.evidence = carve.DepthEvidence(np.zeros(3) if origin is None else origin, splatting.voxel_size, carving)
         self.stale = np.zeros(0, np.int64)
         """Packed keys of the blocks that the next update makes again."""
         self._keyframes: dict[int, _Kept] = {}
@@ -56,15 +56,15 @@ class IncrementalOccupancy:
         touched = splat.bin_gaussians(gaussians, self.evidence.origin, self.splatting).packed
         self._keyframes[number] = _Kept(gaussians, features, T_world_cam, touched)
         self._none = gaussians[:0], features[:0]
-        self.stale = union(self.stale, touched, self.evidence.add(frame, T_world_cam))
+        self.stale = unite_keys(self.stale, touched, self.evidence.add(frame, T_world_cam))
 
     def remove(self, number: int, frame: Frame) -> None:
         """Take a keyframe out again; ``frame`` is what was added. Raises KeyError for a number that is not there."""
         kept = self._keyframes.pop(number)
-        self.stale = union(self.stale, kept.touched, self.evidence.remove(frame, kept.T_world_cam))
+        self.stale = unite_keys(self.stale, kept.touched, self.evidence.remove(frame, kept.T_world_cam))
 
     def move(self, number: int, frame: Frame, T_world_cam: NDArray[np.float64], gaussians: Gaussians) -> None:
-        """Put a keyframe elsewhere, and its Gaussians, as ``anchors.reanchored`` moved them."""
+        """Put a keyframe elsewhere, and its Gaussians, as ``anchors.reanchor`` moved them."""
         features = self._keyframes[number].features
         self.remove(number, frame)
         self.add(number, frame, T_world_cam, gaussians, features)
@@ -82,7 +82,7 @@ class IncrementalOccupancy:
         gaussians = Gaussians.concatenated([self._none[0], *(kept.gaussians for kept in reaching)])
         features = np.concatenate([self._none[1], *(kept.features for kept in reaching)])
         bins = splat.bin_gaussians(gaussians, self.evidence.origin, self.splatting).only(stale)
-        made = build.of_blocks(stale, bins, gaussians, features, self.evidence, self.splatting, self.carving)
+        made = build.build_blocks(stale, bins, gaussians, features, self.evidence, self.splatting, self.carving)
         self._now = _merged(self._now, made)
         self.stale = np.zeros(0, np.int64)
         return self._now
@@ -90,8 +90,8 @@ class IncrementalOccupancy:
 
 def _merged(old: Occupancy | None, new: Occupancy) -> Occupancy:
     """The new blocks in place of the old ones of the same keys, those that say nothing left out, keys ascending."""
-    parts = [new] if old is None else [chosen_blocks(old, ~np.isin(pack(old.keys), pack(new.keys))), new]
-    parts = [chosen_blocks(part, says_something(part)) for part in parts]
+    parts = [new] if old is None else [select_blocks(old, ~np.isin(pack(old.keys), pack(new.keys))), new]
+    parts = [select_blocks(part, mask_known_blocks(part)) for part in parts]
     packed = np.concatenate([pack(part.keys) for part in parts])
     order = np.argsort(packed)
     arrays = {

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
-from .build import normalized
+from .build import normalize_rows
 from .voxel_blocks import pack, unpack
 
 PER_BLOCK = "keys", "probability", "free", "hits", "state"
@@ -18,12 +18,12 @@ _OCTANTS = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1)
 """(8, 3) places of the halves of a block."""
 
 
-def children(keys: NDArray[np.integer]) -> NDArray[np.int32]:
+def subdivide_keys(keys: NDArray[np.integer]) -> NDArray[np.int32]:
     """(8 B, 3) keys of the blocks of the next level that cover (B, 3) blocks, eight after another."""
     return np.asarray((2 * keys[:, None] + _OCTANTS).reshape(-1, 3), np.int32)
 
 
-def combined(parts: Sequence[Occupancy]) -> Occupancy:
+def combine_levels(parts: Sequence[Occupancy]) -> Occupancy:
     """One map of parts whose blocks do not cover each other, part n being of voxels of 1 / 2^n of the first one's."""
     first = parts[0]
     return first.replace(
@@ -34,7 +34,7 @@ def combined(parts: Sequence[Occupancy]) -> Occupancy:
     )
 
 
-def chosen_blocks(occupancy: Occupancy, chosen: NDArray[np.bool_]) -> Occupancy:
+def select_blocks(occupancy: Occupancy, chosen: NDArray[np.bool_]) -> Occupancy:
     """Some of the blocks, given by a mask (B,)."""
     kept = chosen[np.nonzero(occupancy.state == OCCUPIED)[0]]
     return occupancy.replace(
@@ -45,13 +45,13 @@ def chosen_blocks(occupancy: Occupancy, chosen: NDArray[np.bool_]) -> Occupancy:
     )
 
 
-def says_something(occupancy: Occupancy) -> NDArray[np.bool_]:
+def mask_known_blocks(occupancy: Occupancy) -> NDArray[np.bool_]:
     """(B,) whether anything of each block is known."""
     known = (occupancy.probability > 0) | (occupancy.free > 0) | (occupancy.hits > 0)
     return np.asarray(known.any(axis=1))
 
 
-def uniform(occupancy: Occupancy, level: int = 0) -> Occupancy:
+def make_uniform(occupancy: Occupancy, level: int = 0) -> Occupancy:
     """The map with voxels of one size, ``voxel_size / 2^level``.
 
     Larger voxels are cut, each part saying what the whole says. Smaller ones are put together: a voxel is occupied if
@@ -68,7 +68,7 @@ def uniform(occupancy: Occupancy, level: int = 0) -> Occupancy:
     while (levels < level).any():
         coarse = levels < level
         cut = {name: np.concatenate((array[~coarse], _cut(array[coarse]))) for name, array in arrays.items()}
-        keys = np.concatenate((keys[~coarse], children(keys[coarse])))
+        keys = np.concatenate((keys[~coarse], subdivide_keys(keys[coarse])))
         levels = np.concatenate((levels[~coarse], np.repeat(levels[coarse] + 1, 8)))
         arrays = cut
     features, colors = np.asarray(current.features), current.colors
@@ -94,7 +94,7 @@ def uniform(occupancy: Occupancy, level: int = 0) -> Occupancy:
 
 
 def _cut(blocks: NDArray[np.generic]) -> NDArray[np.generic]:
-    """(B, 512) values of blocks to (8 B, 512) of the blocks of the next level, in the order of ``children``."""
+    """(B, 512) values of blocks to (8 B, 512) of the blocks of the next level, in the order of ``subdivide_keys``."""
     half = BLOCK // 2
     parts = blocks.reshape(-1, 2, half, 2, half, 2, half).transpose(0, 1, 3, 5, 2, 4, 6).reshape(-1, half, half, half)
     for axis in (1, 2, 3):
@@ -146,6 +146,6 @@ def _joined(
         mean_color = np.add.reduceat(colors[part_row].astype(np.float32), starts, axis=0) / count
         mean_feature = np.add.reduceat(features[part_row].astype(np.float32), starts, axis=0)
         colors = np.concatenate((colors, np.rint(mean_color).astype(np.uint8)))
-        features = np.concatenate((features, normalized(mean_feature)))
+        features = np.concatenate((features, normalize_rows(mean_feature)))
     made |= {"state": placed(joined), "rows": placed(rows.reshape(joined.shape))}
     return unpack(parents), made, features, colors

@@ -15,7 +15,7 @@ _BLOCKS_AT_ONCE = 1024
 _LOCAL = np.stack(np.unravel_index(np.arange(BLOCK**3), (BLOCK,) * 3), axis=1)
 
 
-def resampled(
+def resample_occupancy(
     occupancy: Occupancy, T_new_old: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> tuple[Occupancy, NDArray[np.int64]]:
     """A map of one voxel size on the lattice of the same size in another frame: its voxels without features, and for

@@ -41,11 +41,11 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from ..core.errors import ConfigError
-from ..core.hash_table import build_table, find
+from ..core.hash_table import build_table, find_row
 from ..core.types import BLOCK, Gaussians
 from ..settings.registry import require_positive
-from .gaussian_mass import box_masses
-from .voxel_blocks import packed_key, touched_blocks, union
+from .gaussian_mass import integrate_boxes
+from .voxel_blocks import find_touched_blocks, packed_key, unite_keys
 
 _PROBABILISTIC, _POISSON, _INTEGRATED, _RELEASED = range(4)
 _MODES = {"probabilistic": _PROBABILISTIC, "poisson": _POISSON, "integrated": _INTEGRATED, "released": _RELEASED}
@@ -83,7 +83,7 @@ class Options:
         if self.device != "cpu":
             from . import splat_torch
 
-            splat_torch.check(self.device, self.projection)
+            splat_torch.check_device(self.device, self.projection)
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def bin_gaussians(
     least_scale: s_min, metres.
     """
     mode = _MODES[options.projection]
-    scales, share = widened(gaussians.scales, least_scale, options)
+    scales, share = widen_scales(gaussians.scales, least_scale, options)
     means, form, log_weight, lo, hi = _prepared(
         gaussians.means, scales, gaussians.quats_wxyz, gaussians.opacities, origin, options.voxel_size,
         options.cutoff, mode,
@@ -150,7 +150,7 @@ def bin_gaussians(
     )  # fmt: skip
 
 
-def widened(
+def widen_scales(
     scales: NDArray[np.float32], least_scale: float, options: Options
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(N, 3) deviations of at least s_min, metres, and the (N,) shares that the phi are multiplied by. A mass within
@@ -161,19 +161,19 @@ def widened(
     return wide, np.asarray((scales / wide).prod(axis=1) ** np.float32(2 / 3), np.float32)
 
 
-def probability(bins: Bins, keys: NDArray[np.int32]) -> NDArray[np.float32]:
+def compute_probability(bins: Bins, keys: NDArray[np.int32]) -> NDArray[np.float32]:
     """(B, 512) alpha at every voxel of the bins' blocks, whose (B, 3) keys are given: equations (A) and (B)."""
     if bins.device != "cpu":
         from . import splat_torch
 
-        return splat_torch.probability(bins, keys, bins.mode != _PROBABILISTIC)
+        return splat_torch.compute_probability_torch(bins, keys, bins.mode != _PROBABILISTIC)
     listed = keys, bins.start, bins.gaussian, bins.means, bins.form, bins.lo, bins.hi
     if bins.mode == _INTEGRATED:
         return _probability_by_mass(*listed)
     return _probability(*listed, bins.opacities, bins.share, bins.squared_cutoff, bins.mode != _PROBABILISTIC)
 
 
-def posterior_mean(
+def compute_posterior_mean(
     bins: Bins, keys: NDArray[np.int32], slots: NDArray[np.int32], values: NDArray[np.floating]
 ) -> NDArray[np.float32]:
     """(V, D) posterior expectation of per-Gaussian values (N, D) at some voxels: equations (C) and (D).
@@ -185,7 +185,7 @@ def posterior_mean(
     if bins.device != "cpu":
         from . import splat_torch
 
-        return splat_torch.posterior_mean(bins, keys, slots, values, rows)
+        return splat_torch.compute_posterior_mean_torch(bins, keys, slots, values, rows)
     return _posterior_mean(
         keys, bins.start, bins.gaussian, bins.means, bins.form, bins.lo, bins.hi, bins.log_weight, bins.squared_cutoff,
         bins.mode == _INTEGRATED, slots, values.view(np.uint16) if values.dtype == np.float16 else values, rows,
@@ -258,7 +258,7 @@ def _sort_by_block(
     bounds = np.linspace(0, len(lo), get_num_threads() + 1).astype(int)
     parts = [slice(first, end) for first, end in pairwise(bounds)]
     with ThreadPoolExecutor(len(parts)) as threads:
-        packed = union(*threads.map(lambda part: touched_blocks(lo[part], hi[part]), parts))
+        packed = unite_keys(*threads.map(lambda part: find_touched_blocks(lo[part], hi[part]), parts))
         table, rows = build_table(packed, len(packed))
         count = np.stack(list(threads.map(lambda part: _count(table, rows, lo[part], hi[part], len(packed)), parts)))
         start = np.concatenate(([0], np.cumsum(count.sum(axis=0))))
@@ -284,7 +284,7 @@ def _count(
         for i in range(lo[g, 0] >> 3, (hi[g, 0] >> 3) + 1):
             for j in range(lo[g, 1] >> 3, (hi[g, 1] >> 3) + 1):
                 for k in range(lo[g, 2] >> 3, (hi[g, 2] >> 3) + 1):
-                    count[find(table, rows, packed_key(i, j, k))] += 1
+                    count[find_row(table, rows, packed_key(i, j, k))] += 1
     return count
 
 
@@ -305,7 +305,7 @@ def _place(
         for i in range(lo[g, 0] >> 3, (hi[g, 0] >> 3) + 1):
             for j in range(lo[g, 1] >> 3, (hi[g, 1] >> 3) + 1):
                 for k in range(lo[g, 2] >> 3, (hi[g, 2] >> 3) + 1):
-                    b = find(table, rows, packed_key(i, j, k))
+                    b = find_row(table, rows, packed_key(i, j, k))
                     gaussian[place[b]] = first + g
                     place[b] += 1
 
@@ -367,7 +367,7 @@ def _probability_by_mass(
         for pair in range(start[b], start[b + 1]):
             g = gaussian[pair]
             i0, j0, k0, i1, j1, k1 = _window(keys[b], lo[g], hi[g])
-            box_masses(means[g], covariance[g], keys[b], i0, j0, k0, i1, j1, k1, mass)
+            integrate_boxes(means[g], covariance[g], keys[b], i0, j0, k0, i1, j1, k1, mass)
             for i in range(i0, i1):
                 for j in range(j0, j1):
                     for k in range(k0, k1):
@@ -442,7 +442,7 @@ def _posterior_mean(
             i0, j0, k0, i1, j1, k1 = _window(keys[b], lo[g], hi[g])
             loaded = False
             if by_mass:
-                box_masses(means[g], form[g], keys[b], i0, j0, k0, i1, j1, k1, mass)
+                integrate_boxes(means[g], form[g], keys[b], i0, j0, k0, i1, j1, k1, mass)
             for i in range(i0, i1):
                 dx = np.float32(x0 + i) + half - means[g, 0]
                 for j in range(j0, j1):

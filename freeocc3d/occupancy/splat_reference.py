@@ -12,7 +12,7 @@ from ..core.types import Gaussians
 from .splat import Options
 
 
-def contributions(
+def compute_contributions_reference(
     gaussians: Gaussians, points: NDArray[np.float64], options: Options, least_scale: float = 0.0
 ) -> NDArray[np.float64]:
     """(P, N) c_k at voxels whose centres are the (P, 3) world points; cutoff included, except for "released", whose
@@ -32,22 +32,24 @@ def contributions(
     return phi if options.projection == "probabilistic" else np.asarray(1 - np.exp(-o * phi))
 
 
-def probability(
+def compute_probability_reference(
     gaussians: Gaussians, points: NDArray[np.float64], options: Options, least_scale: float = 0.0
 ) -> NDArray[np.float64]:
     """(P,) alpha of voxels, given by their centres: equation (B)."""
-    return np.asarray(1.0 - np.prod(1.0 - contributions(gaussians, points, options, least_scale), axis=1))
+    return np.asarray(
+        1.0 - np.prod(1.0 - compute_contributions_reference(gaussians, points, options, least_scale), axis=1)
+    )
 
 
-def posterior_mean(
+def compute_posterior_mean_reference(
     gaussians: Gaussians, points: NDArray[np.float64], values: NDArray[np.floating], options: Options
 ) -> NDArray[np.float64]:
     """(P, D) posterior expectation of values (N, D) at voxels, given by their centres: equations (C) and (D)."""
     o = gaussians.opacities.astype(np.float64)
     if options.projection == "integrated":
-        weight = contributions(gaussians, points, options) * o
+        weight = compute_contributions_reference(gaussians, points, options) * o
     elif options.projection == "released":
-        weight = -np.log(1 - contributions(gaussians, points, options))
+        weight = -np.log(1 - compute_contributions_reference(gaussians, points, options))
     else:
         squared = _squared_distances(gaussians, points)
         density = np.exp(-0.5 * squared) / gaussians.scales.astype(np.float64).prod(axis=1)

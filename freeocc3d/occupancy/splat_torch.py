@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _PAIRS = 1 << 24  # worked on at once: 60 bytes each
 
 
-def check(device: str, projection: str) -> None:
+def check_device(device: str, projection: str) -> None:
     """Raises ConfigError or DependencyError if this cannot be done there."""
     if projection == "integrated":
         raise ConfigError("'integrated' projects on the processor only: set occupancy.device=cpu.")
@@ -35,8 +35,8 @@ def check(device: str, projection: str) -> None:
         raise DependencyError(f"occupancy.device={device} needs a GPU and a torch that uses it; there is none here.")
 
 
-def probability(bins: Bins, keys: NDArray[np.int32], poisson: bool) -> NDArray[np.float32]:
-    """As ``splat.probability``."""
+def compute_probability_torch(bins: Bins, keys: NDArray[np.int32], poisson: bool) -> NDArray[np.float32]:
+    """As ``splat.compute_probability``."""
     device = torch.device(bins.device)
     logarithms = torch.zeros(len(keys) * BLOCK**3, dtype=torch.float32, device=device)
     opacities, share = (torch.from_numpy(array).to(device) for array in (bins.opacities, bins.share))
@@ -47,10 +47,10 @@ def probability(bins: Bins, keys: NDArray[np.int32], poisson: bool) -> NDArray[n
     return (-torch.expm1(logarithms)).reshape(-1, BLOCK**3).cpu().numpy()  # (B)
 
 
-def posterior_mean(
+def compute_posterior_mean_torch(
     bins: Bins, keys: NDArray[np.int32], slots: NDArray[np.int32], values: NDArray[np.floating], rows: int
 ) -> NDArray[np.float32]:
-    """As ``splat.posterior_mean``."""
+    """As ``splat.compute_posterior_mean``."""
     device = torch.device(bins.device)
     row_of_voxel = torch.from_numpy(slots.reshape(-1).astype(np.int64)).to(device)
     log_weight = torch.from_numpy(bins.log_weight).to(device)

@@ -9,7 +9,7 @@ from ..core.types import Occupancy
 from ..core.voxel_keys import contains, packed_voxels
 
 
-def exposed_faces(
+def find_exposed_faces(
     occupancy: Occupancy, chosen: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64]]:
     """The faces between occupied voxels and all others: (4 F, 3) vertices in metres, (F, 4) quads that index them,
@@ -19,15 +19,15 @@ def exposed_faces(
     """
     voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
     chosen_rows = np.arange(len(voxels)) if chosen is None else np.flatnonzero(chosen)
-    corners, quads, rows = faces_of(voxels[chosen_rows], edges[chosen_rows])
+    corners, quads, rows = build_faces(voxels[chosen_rows], edges[chosen_rows])
     vertices = (occupancy.origin + corners * occupancy.finest).astype(np.float32)
     return vertices, quads, chosen_rows[rows]
 
 
-def faces_of(
+def build_faces(
     voxels: NDArray[np.integer], edges: NDArray[np.integer] | None = None
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-    """The faces of voxels as ``exposed_faces``, but with (4 F, 3) corners on the lattice.
+    """The faces of voxels as ``find_exposed_faces``, but with (4 F, 3) corners on the lattice.
 
     voxels: (V, 3) lower corners, |i| < 2^20.  edges: (V,) powers of two that divide them; 1 by default. A face whose
     neighbour is cut into smaller voxels is drawn, whichever of them are there.

@@ -35,7 +35,7 @@ def estimate_up(T_world_cam: NDArray[np.float64], points_world: NDArray[np.float
     return up
 
 
-def turned_back(T_world_cam: NDArray[np.float64], quarters: NDArray[np.integer]) -> NDArray[np.float64]:
+def turn_back(T_world_cam: NDArray[np.float64], quarters: NDArray[np.integer]) -> NDArray[np.float64]:
     """(K, 4, 4) poses of the same cameras as they were held, whose images are turned counter-clockwise by (K,) quarter
     turns (``Capture.turned``)."""
     cos, sin = np.array((1, 0, -1, 0))[quarters % 4], np.array((0, -1, 0, 1))[quarters % 4]

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..core.hash_table import put
+from ..core.hash_table import put_key
 from ..core.types import BLOCK
 from ..core.voxel_keys import packed_voxels, unpacked_voxels
 
@@ -21,12 +21,12 @@ pack, unpack = packed_voxels, unpacked_voxels
 """(B, 3) block indices to (B,) integers and back."""
 
 
-def union(*packed: NDArray[np.int64]) -> NDArray[np.int64]:
+def unite_keys(*packed: NDArray[np.int64]) -> NDArray[np.int64]:
     """Ascending unique packed keys of all arguments."""
     return np.unique(np.concatenate(packed)) if packed else np.zeros(0, np.int64)
 
 
-def blocks_along_rays(
+def find_blocks_along_rays(
     points_world: NDArray[np.floating],
     center_world: NDArray[np.floating],
     origin: NDArray[np.float64],
@@ -45,7 +45,7 @@ def packed_key(i: int, j: int, k: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def touched_blocks(lo: NDArray[np.int32], hi: NDArray[np.int32]) -> NDArray[np.int64]:
+def find_touched_blocks(lo: NDArray[np.int32], hi: NDArray[np.int32]) -> NDArray[np.int64]:
     """Distinct packed keys of the blocks that boxes of voxels, (N, 3) first and last index, touch; empty boxes
     (lo > hi) touch none."""
     table = np.full(1024, -1, np.int64)
@@ -60,7 +60,7 @@ def touched_blocks(lo: NDArray[np.int32], hi: NDArray[np.int32]) -> NDArray[np.i
                     key = packed_key(i, j, k)
                     if key != last:
                         last = key
-                        table, count = put(table, count, key)
+                        table, count = put_key(table, count, key)
     return table[table != -1]
 
 
@@ -84,7 +84,7 @@ def _walked(start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np
             between[i] = 1.0 / abs(length) if length != 0 else np.inf
             ahead = cell[i] + 1 - start[i] if length > 0 else start[i] - cell[i]
             next_face[i] = ahead * between[i] if length != 0 else np.inf
-        table, count = put(table, count, packed_key(cell[0], cell[1], cell[2]))
+        table, count = put_key(table, count, packed_key(cell[0], cell[1], cell[2]))
         for _ in range(faces):
             i = 0
             if next_face[1] < next_face[i]:
@@ -93,5 +93,5 @@ def _walked(start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np
                 i = 2
             cell[i] += step[i]
             next_face[i] += between[i]
-            table, count = put(table, count, packed_key(cell[0], cell[1], cell[2]))
+            table, count = put_key(table, count, packed_key(cell[0], cell[1], cell[2]))
     return table[table != -1]

@@ -27,8 +27,8 @@ def check(settings: Config) -> None:
     for section, module in layers.items():
         options_of(module, config.options(settings, section))
     if settings["occupancy"]["finest"] is not None:
-        adaptive_voxels.halvings(settings["occupancy"]["voxel_size"], settings["occupancy"]["finest"])
-    scene_vocabulary.load(options_of(scene_vocabulary, settings["vocabulary"]))
+        adaptive_voxels.count_halvings(settings["occupancy"]["voxel_size"], settings["occupancy"]["finest"])
+    scene_vocabulary.load_namer(options_of(scene_vocabulary, settings["vocabulary"]))
     options_of(multi_view_stereo, settings["tracking"]["stereo"])
     for section, key in (("tracking", "backend"), ("fitting", "rasterizer"), ("language", "encoder")):
         name = settings[section][key]

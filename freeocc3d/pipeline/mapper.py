@@ -133,7 +133,7 @@ class Mapper:
             before, then = self._fitted
             count = len(then.keyframes)
             if np.array_equal(trajectory.keyframes[:count], then.keyframes):  # else submaps were merged: start anew
-                moved = anchors.reanchored(before, then.T_world_keyframe, trajectory.T_world_keyframe[:count])
+                moved = anchors.reanchor(before, then.T_world_keyframe, trajectory.T_world_keyframe[:count])
                 gaussians = fitting.carried_over(gaussians, moved, self.cell_size)
         window = trajectory.only_keyframes(trajectory.keyframes[-options.window :])
         gaussians = self._fit(gaussians, window, options.window_passes, Progress())
@@ -154,20 +154,22 @@ class Mapper:
         options: fitting.Options = options_of(fitting, config.options(self.settings, "fitting"))
         return options
 
-    def views(self, trajectory: Trajectory) -> list[rendered_views.View]:
+    def views(self, trajectory: Trajectory) -> list[rendered_views.CapturedView]:
         """The keyframes as they are rendered and compared."""
         device, width = self.rasterizer.device, self.fit_options.width
         posed = zip(self.mapped(trajectory), trajectory.T_world_keyframe, strict=True)
-        return [rendered_views.view_of(frame, T, width, device) for frame, T in posed]
+        return [rendered_views.prepare_captured_view(frame, T, width, device) for frame, T in posed]
 
     def _fit(self, gaussians: Gaussians, trajectory: Trajectory, passes: int, progress: Progress) -> Gaussians:
         """Fitted to the trajectory's keyframes, ``passes`` times each."""
         options = self.fit_options
         if passes == 0 or not len(gaussians):
             return gaussians
-        made = fitting.fitted(gaussians, self.views(trajectory), self.rasterizer, options, passes, progress.advance)
+        made = fitting.fit_gaussians(
+            gaussians, self.views(trajectory), self.rasterizer, options, passes, progress.advance
+        )
         if options.means == "free":
-            made = anchors.anchored_where_they_are(made, self.trajectory().T_world_keyframe)
+            made = anchors.anchor_in_place(made, self.trajectory().T_world_keyframe)
         return made
 
     def build_features(
@@ -177,7 +179,7 @@ class Mapper:
         trajectory = self.trajectory()
         options: lifting.Options = options_of(lifting, config.options(self.settings, "language"))
         keyframes = self.mapped(trajectory)
-        return lifting.lift(gaussians, keyframes, trajectory.T_world_keyframe, encoder, options, progress)
+        return lifting.lift_features(gaussians, keyframes, trajectory.T_world_keyframe, encoder, options, progress)
 
     def build_occupancy(
         self, gaussians: Gaussians, features: NDArray[np.float16], progress: Progress | None = None
@@ -194,7 +196,7 @@ class Mapper:
             options_of(splat, self.settings["occupancy"]),
             carving,
             progress=progress.advance,
-            least_scale=anchors.least_scale(
+            least_scale=anchors.compute_least_scale(
                 options_of(anchors, self.settings["gaussians"]),
                 self.cell_size,
                 self.settings["occupancy"]["voxel_size"],
@@ -214,7 +216,7 @@ class Mapper:
         if finest is None:
             return occupancy
         trajectory, progress = self.trajectory(), progress or Progress()
-        return adaptive_voxels.adaptive(
+        return adaptive_voxels.build_adaptive(
             occupancy,
             gaussians,
             features,

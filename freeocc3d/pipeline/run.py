@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..capture import Capture, check_depth_scale, open_capture, read_ahead, used_frames
+from ..capture import Capture, check_depth_scale, open_capture, read_ahead, select_frames
 from ..capture import base as capture_base
 from ..capture.focal_correction import Reregistered
 from ..core.errors import CaptureError, FrameError, Interrupted, MapError, TrackingError
@@ -134,7 +134,7 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
 def _vocabulary(mapper: Mapper, work: WorkFolder, progress: Progress) -> dict[str, Any] | None:
     """Names of what the mapped keyframes show, as the map keeps them; None if no model is to be asked."""
     options: scene_vocabulary.Options = options_of(scene_vocabulary, mapper.settings["vocabulary"])
-    namer = scene_vocabulary.load(options)
+    namer = scene_vocabulary.load_namer(options)
     if namer is None:
         return None
     frames = mapper.trajectory().keyframes
@@ -158,7 +158,7 @@ def _layer_2(mapper: Mapper, work: WorkFolder, progress: Progress) -> Gaussians:
 def _track(mapper: Mapper, work: WorkFolder, progress: Progress) -> None:
     """Layer 1 over all frames that are used, with checkpoints."""
     capture = mapper.capture
-    frames = used_frames(capture)
+    frames = select_frames(capture)
     if mapper.tracker.offline:
         mapper.tracker.prepare(work.begin_offline(), frames, progress)
         for text in mapper.tracker.warnings:
@@ -224,7 +224,7 @@ def _restore(mapper: Mapper, work: WorkFolder) -> int:
 def _open(capture: str | Path, settings: Config, progress: Progress, work: WorkFolder) -> Capture:
     section = settings["capture"]
     opened = open_capture(capture, options_of(capture_base, config.options(settings, "capture")), section)
-    used_frames(opened)
+    select_frames(opened)
     warning = check_depth_scale(opened) if opened.has_depth else None
     for text in (*opened.warnings, *([warning] if warning else [])):
         work.warnings.append(text)
@@ -239,7 +239,7 @@ def _registered(capture: Capture, settings: Config, progress: Progress, work: Wo
         return capture
     if ratio is None:
         progress.stage("calibration")
-        ratio = focal_calibration.color_focal(capture, used_frames(capture))
+        ratio = focal_calibration.estimate_color_focal(capture, select_frames(capture))
         if ratio != 1:
             text = (
                 f"Colour and depth of {capture.path} fit each other only if the colour camera's focal length is "

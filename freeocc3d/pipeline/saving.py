@@ -16,8 +16,8 @@ from ..core.types import Gaussians, Occupancy, Submap, Trajectory
 from ..gaussians import rendered_views
 from ..language.encoders.base import Encoder
 from ..language.feature_codec import Codec
-from ..occupancy.gravity_frame import gravity_frame
-from ..occupancy.up_direction import estimate_up, turned_back
+from ..occupancy.gravity_frame import estimate_gravity_frame
+from ..occupancy.up_direction import estimate_up, turn_back
 from ..settings import config
 from ..storage import store
 from ..storage.work_folder import WorkFolder
@@ -53,15 +53,15 @@ def save(
         metric = mapper.tracker.metric
         manifest = _manifest(mapper, trajectory, gaussians, occupancy, encoder, submaps)
         up = np.array(manifest["up"])
-        trajectory_picture.path_picture(
+        trajectory_picture.write_path_picture(
             folder / store.PATH_PICTURE, submaps, trajectory, gaussians, up, capture.path, metric
         )
         views = list(zip(trajectory.keyframes.tolist(), mapper.views(trajectory), strict=True))
         shown = [views[row] for row in evenly(len(views), render_pictures.SHOWN)]
         picture = folder / store.RENDER_PICTURE
-        render_pictures.render_picture(picture, gaussians, shown, mapper.rasterizer, capture.path, metric)
+        render_pictures.write_render_picture(picture, gaussians, shown, mapper.rasterizer, capture.path, metric)
         measured = [views[row][1] for row in evenly(len(views), _MEASURED_VIEWS)]
-        fidelity = rendered_views.fidelity(gaussians, measured, mapper.rasterizer)
+        fidelity = rendered_views.measure_fidelity(gaussians, measured, mapper.rasterizer)
         if len(keyframes) < len(mapper.keyframes):
             work.forget_tracking()  # it counts those that are left out from here on
         keyframes.save_index()
@@ -81,7 +81,7 @@ def _manifest(
 ) -> dict[str, Any]:
     capture = mapper.capture
     turned = np.array([capture.turned(index) for index in trajectory.keyframes.tolist()], np.int8)
-    held = turned_back(trajectory.T_world_keyframe, turned)
+    held = turn_back(trajectory.T_world_keyframe, turned)
     return {
         "freeocc3d": __version__,
         "capture": {"path": absolute(capture.path), "format": capture.format, "frames": len(capture)},
@@ -92,7 +92,7 @@ def _manifest(
         "scale": _scale(mapper),
         "up": estimate_up(held, gaussians.means).tolist(),
         "T_world_map": np.eye(4).tolist(),
-        "T_gravity_map": gravity_frame(held, gaussians).tolist(),
+        "T_gravity_map": estimate_gravity_frame(held, gaussians).tolist(),
         "encoder": {"name": encoder.name, "dimension": encoder.dimension, "state": encoder.text_state()},
         "codec": "transform coding, 8, 4 and 2 bits a direction",
         "counts": {

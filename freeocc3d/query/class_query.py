@@ -46,7 +46,9 @@ def query_classes(
         rows = np.flatnonzero(of_voxel == k)
         every = similarity(occupancy.features[rows], text)
         others = np.delete(every, k, axis=1)
-        confidence = word_matching.softmax(word_matching.beside(every[:, k], others, text_encoder.temperature)[1])
+        confidence = word_matching.compare_with_all(
+            word_matching.compare_competitors(every[:, k], others, text_encoder.temperature)[1]
+        )
         scores = np.zeros(len(of_voxel), np.float32)
         scores[rows] = every[:, k]
         regions = found_regions(occupancy, rows, scores[rows], confidence, -1.0, options, up, name)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError
 from ..core.types import Frame, Intrinsics, Occupancy
-from ..language.feature_codec import Features, cosines, known
+from ..language.feature_codec import Features, compute_cosines, mask_known
 from ..settings import config, registry
 from .word_query import Options, QueryResult, found_regions
 
@@ -104,11 +104,11 @@ def query_feature(
 
 def _apart_from_mean(features: Features, feature: NDArray[np.float32]) -> NDArray[np.float32]:
     """(V,) cosines of unit features and one, all less their mean; 0 where nothing is known."""
-    says = known(features)
+    says = mask_known(features)
     if not says.any():
         return np.zeros(len(features), np.float32)
     mean = _mean(features, says)
-    products = cosines(features, np.stack((feature, mean)))
+    products = compute_cosines(features, np.stack((feature, mean)))
     squared = float(mean @ mean)
     length = np.sqrt(np.maximum(1 - 2 * products[:, 1] + squared, 1e-12))
     own = float(np.sqrt(max(1 - 2 * float(feature @ mean) + squared, 1e-12)))

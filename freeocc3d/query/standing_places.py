@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from ..core.errors import MapError
 from ..core.transforms import invert, transform
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
-from ..occupancy.resampling import resampled
+from ..occupancy.resampling import resample_occupancy
 from .regions import Region
 
 _MOST_CELLS = 1 << 29
@@ -51,10 +51,10 @@ def standing_places(
     plain = occupancy.replace(features=np.zeros((len(occupancy.colors), 0), np.float16))
     one = plain
     if occupancy.deepest:
-        from ..occupancy.levels import uniform
+        from ..occupancy.levels import make_uniform
 
-        one = uniform(plain)
-    level, rows = resampled(one, T_gravity_map, np.array((0.0, 0.0, -0.5 * one.voxel_size)))
+        one = make_uniform(plain)
+    level, rows = resample_occupancy(one, T_gravity_map, np.array((0.0, 0.0, -0.5 * one.voxel_size)))
     if not len(level.voxels(OCCUPIED)):
         return [None] * len(regions)
     cells = _Cells(level)

@@ -22,8 +22,8 @@ from .. import __version__
 from ..core.errors import ConfigError, FreeOccError, MapError
 from ..core.types import Occupancy
 from ..language import word_matching
-from ..language.feature_codec import Features, cosines, known
-from ..occupancy.connected_components import connected
+from ..language.feature_codec import Features, compute_cosines, mask_known
+from ..occupancy.connected_components import label_components
 from ..settings.registry import nearest, require_positive
 from .region_splitting import told_apart
 from .regions import Region, best_regions
@@ -133,9 +133,9 @@ def query(
             f"{text.features.shape[1]}: make the map again with this version."
         )
     expressed = others.features.any(axis=1)
-    competes = (cosines(text.features, others.features) < text_encoder.same_word) & expressed
+    competes = (compute_cosines(text.features, others.features) < text_encoder.same_word) & expressed
     cosine = similarity(features, text)
-    says = known(features)
+    says = mask_known(features)
     plain = options.scores == "cosine"
     default = text_encoder.threshold if plain else _EVEN
     threshold = default if options.threshold is None else options.threshold
@@ -156,8 +156,8 @@ def query(
         scores = every_score[:, w]
         rows, confidence = best[w]
         if negative and len(rows):
-            meant = cosines(features[rows], text.features[w : w + 1])[:, 0]
-            allowed = meant >= cosines(features[rows], excluded.features).max(axis=1)
+            meant = compute_cosines(features[rows], text.features[w : w + 1])[:, 0]
+            allowed = meant >= compute_cosines(features[rows], excluded.features).max(axis=1)
             rows, confidence = rows[allowed], confidence[allowed]
         regions = found_regions(occupancy, rows, scores[rows], confidence, threshold, options, up, word)
         note = _note(word, part, text_encoder, scores, threshold, bool(regions))
@@ -180,8 +180,8 @@ def found_regions(
     seeds = scores >= threshold
     if not seeds.any():
         return []
-    component = connected(occupancy.occupied_voxels()[rows], occupancy.occupied_edges()[rows])
-    kept = word_matching.grown(seeds, component)
+    component = label_components(occupancy.occupied_voxels()[rows], occupancy.occupied_edges()[rows])
+    kept = word_matching.grow_regions(seeds, component)
     rows, scores, confidence, component = rows[kept], scores[kept], confidence[kept], component[kept]
     component = told_apart(occupancy, rows, component, scores, np.asarray(up), options.narrow)
     least = options.min_voxels, options.min_share
@@ -190,7 +190,7 @@ def found_regions(
 
 def similarity(features: Features, text: TextFeatures) -> NDArray[np.float32]:
     """(V, W) scores of (V, D) unit features for W words: cosine over attainable cosine, at most 1."""
-    score = cosines(features, text.features)
+    score = compute_cosines(features, text.features)
     if text.attainable is not None:
         score /= text.attainable
     return np.minimum(score, np.float32(1), out=score)
@@ -204,7 +204,9 @@ def nearest_word(features: Features, text: TextFeatures) -> NDArray[np.int64]:
     nearest = np.full(len(features), -1, np.int64)
     for start in range(0, len(features) if len(text.understood) else 0, _ROWS):
         chunk = features[start : start + _ROWS]
-        nearest[start : start + _ROWS] = np.where(known(chunk), cosines(chunk, text.features).argmax(axis=1), -1)
+        nearest[start : start + _ROWS] = np.where(
+            mask_known(chunk), compute_cosines(chunk, text.features).argmax(axis=1), -1
+        )
     return nearest
 
 
@@ -231,7 +233,7 @@ def _not_beaten(
     for start in range(0, len(asked), step):
         rows = asked[start : start + step]
         against = similarity(features[rows], others)
-        confidence = word_matching.confidences(cosine[rows], against, candidates[rows], competes, temperature)
+        confidence = word_matching.compute_confidences(cosine[rows], against, candidates[rows], competes, temperature)
         for w, own in enumerate(found):
             best = np.flatnonzero(confidence[:, w])
             own.append((rows[best], confidence[best, w]))
@@ -251,7 +253,7 @@ def _beside(
     for start in range(0, len(scores), step):
         chunk = slice(start, start + step)
         against = similarity(features[chunk], others)
-        largest[chunk], odds[chunk] = word_matching.beside(scores[chunk], against, temperature)
+        largest[chunk], odds[chunk] = word_matching.compare_competitors(scores[chunk], against, temperature)
     return largest, odds
 
 
@@ -267,9 +269,11 @@ def _probability(
         others = _some(canonical, expressed) if expressed.any() else contrast
     largest, odds = _beside(features, scores, others, text_encoder.temperature)
     made = (
-        word_matching.softmax(odds) if way == "softmax" else word_matching.relevancy(largest, text_encoder.temperature)
+        word_matching.compare_with_all(odds)
+        if way == "softmax"
+        else word_matching.compare_with_best(largest, text_encoder.temperature)
     )
-    return np.where(known(features), made, np.float32(0))
+    return np.where(mask_known(features), made, np.float32(0))
 
 
 def _only_known(word: str, text_encoder: TextEncoder) -> str:

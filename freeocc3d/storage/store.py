@@ -79,9 +79,9 @@ class Map:
     def T_gravity_map(self) -> NDArray[np.float64]:
         """(4, 4) to the frame with z up and the floor at z = 0; found now where an earlier version made the map."""
         if "T_gravity_map" not in self.manifest:
-            from ..occupancy.gravity_frame import gravity_frame
+            from ..occupancy.gravity_frame import estimate_gravity_frame
 
-            return gravity_frame(self.trajectory.T_world_keyframe, self.gaussians)
+            return estimate_gravity_frame(self.trajectory.T_world_keyframe, self.gaussians)
         T = np.array(self.manifest["T_gravity_map"], np.float64)
         if not is_rigid(T):
             raise MapError(f"{self.path / MANIFEST} is damaged: 'T_gravity_map' is no rigid transform.")
@@ -121,10 +121,10 @@ class Map:
     @functools.cached_property
     def gaussians(self) -> Gaussians:
         """The anchored Gaussians (imports Open3D)."""
-        from ..gaussians.point_cloud import read_ply
+        from ..gaussians.point_cloud import read_gaussian_ply
 
         self._require(GAUSSIANS)
-        return read_ply(self.path / GAUSSIANS)
+        return read_gaussian_ply(self.path / GAUSSIANS)
 
     @functools.cached_property
     def gaussian_features(self) -> NDArray[np.float16]:

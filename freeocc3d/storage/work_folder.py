@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import MapError
 from ..core.types import Gaussians
-from ..gaussians.point_cloud import read_ply, write_ply
+from ..gaussians.point_cloud import read_gaussian_ply, write_gaussian_ply
 from ..settings import config
 from ..settings.config import Config
 from . import store
@@ -151,10 +151,10 @@ class WorkFolder:
         """The saved result of layer 2, or ``compute()``, saved."""
         path = self.folder / store.GAUSSIANS
         if "gaussians" in self._valid and path.is_file():
-            return read_ply(path)
+            return read_gaussian_ply(path)
         result = compute()
         if len(result):
-            write_ply(result, path)
+            write_gaussian_ply(result, path)
             self._mark("gaussians")
         return result
 

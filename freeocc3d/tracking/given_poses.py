@@ -15,9 +15,9 @@ from ..core.progress import Progress
 from ..core.transforms import invert, nearest_rigid
 from ..core.types import Frame
 from ..depth.multi_view_stereo import Scan, StereoDepth
-from ..depth.sparse_points import triangulated
+from ..depth.sparse_points import triangulate
 from .base import Tracked, Tracker
-from .overlap import DepthView, mutual_overlap, sample_points
+from .overlap import DepthView, measure_mutual_overlap, sample_points
 from .records import Records
 
 _FARTHEST = 2000.0
@@ -46,7 +46,7 @@ class GivenTracker(Tracker):
 
     def scan(self, folder: Path, frames: range, progress: Progress) -> Scan:
         """The poses with points that the frames see, for stereo."""
-        return triangulated(self._capture, self.T_world_cam, frames, progress)
+        return triangulate(self._capture, self.T_world_cam, frames, progress)
 
     def as_pinhole(self, frame: Frame) -> Frame:
         """The frame as a pinhole camera would have taken it, should the tracker know the camera better."""
@@ -77,7 +77,7 @@ class GivenTracker(Tracker):
             return Tracked("lost", None, 0.0)
         if self._keyframe is not None:
             T_keyframe_cam = invert(self.records.T_world_keyframe[-1]) @ T_world_cam
-            shared = mutual_overlap(view, self._keyframe, T_keyframe_cam)
+            shared = measure_mutual_overlap(view, self._keyframe, T_keyframe_cam)
             if nothing_seen or shared >= self.keyframe_overlap:
                 row = len(self.records.keyframe_index) - 1
                 self.records.add_tracked(frame.index, row, T_keyframe_cam, 1.0)

@@ -29,13 +29,13 @@ class DepthView:
     points: NDArray[np.float32]
 
 
-def mutual_overlap(a: DepthView, b: DepthView, T_b_a: NDArray[np.float64]) -> float:
+def measure_mutual_overlap(a: DepthView, b: DepthView, T_b_a: NDArray[np.float64]) -> float:
     """The smaller of the shares that each sees of what the other shows: it falls when the camera turns away as well as
     when it steps back."""
-    return min(overlap(a.points, T_b_a, b), overlap(b.points, invert(T_b_a), a))
+    return min(measure_overlap(a.points, T_b_a, b), measure_overlap(b.points, invert(T_b_a), a))
 
 
-def overlap(points_a: NDArray[np.float32], T_b_a: NDArray[np.float64], b: DepthView) -> float:
+def measure_overlap(points_a: NDArray[np.float32], T_b_a: NDArray[np.float64], b: DepthView) -> float:
     """Share of camera a's points that camera b sees too: they project into its image, and its depth there is missing or
     agrees within 10 %. 0 for no points."""
     if len(points_a) == 0:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from ..core.transforms import apart, invert, nearest_rigid
+from ..core.transforms import invert, measure_pose_difference, nearest_rigid
 
 _SWEEPS = 6
 _HELD_M, _HELD_DEG = 0.1, 5.0
@@ -34,7 +34,9 @@ class Edge:
     uncertain: bool
 
 
-def agreeing(poses: Sequence[NDArray[np.float64]], submap: Sequence[int], edges: Sequence[Edge]) -> list[Edge]:
+def drop_unsupported_closures(
+    poses: Sequence[NDArray[np.float64]], submap: Sequence[int], edges: Sequence[Edge]
+) -> list[Edge]:
     """The edges without closures between two submaps that no other closure of the two agrees with: nothing else speaks
     for them, and one alone may be wrong. poses: of the keyframes, each in its submap's frame."""
     between: dict[tuple[int, int], list[tuple[int, NDArray[np.float64]]]] = {}
@@ -47,14 +49,14 @@ def agreeing(poses: Sequence[NDArray[np.float64]], submap: Sequence[int], edges:
         T_a_b = poses[e.target] @ e.T_target_source @ invert(poses[e.source])
         ends, T = ((a, b), T_a_b) if a < b else ((b, a), invert(T_a_b))
         for other, T_other in between.setdefault(ends, []):
-            metres, degrees = apart(T_other, T)
+            metres, degrees = measure_pose_difference(T_other, T)
             if metres <= _AGREE_M and degrees <= _AGREE_DEG:
                 kept |= {n, other}
         between[ends].append((n, T))
     return [edge for n, edge in enumerate(edges) if n in kept]
 
 
-def pieces(submap: Sequence[int], edges: Sequence[Edge]) -> list[list[int]]:
+def find_connected_components(submap: Sequence[int], edges: Sequence[Edge]) -> list[list[int]]:
     """Rows of the keyframes that hang together, the largest piece first: those of one submap, and of submaps that an
     edge ties."""
     root = {name: name for name in submap}
@@ -67,7 +69,7 @@ def pieces(submap: Sequence[int], edges: Sequence[Edge]) -> list[list[int]]:
     return sorted(rows.values(), key=lambda piece: (-len(piece), piece[0]))
 
 
-def optimize_piece(
+def optimize_component(
     poses: Sequence[NDArray[np.float64]], edges: Sequence[Edge], rows: Sequence[int]
 ) -> list[NDArray[np.float64]]:
     """Poses of the keyframes ``rows``, which hang together, in the frame of the first: ``optimize`` on these alone,
@@ -109,16 +111,16 @@ def optimize(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArra
     used = edges
     for _ in range(_SWEEPS):
         placed = _optimized(poses, used)
-        holding = [edge for edge in edges if not edge.uncertain or holds(placed, edge)]
+        holding = [edge for edge in edges if not edge.uncertain or agrees_with_edge(placed, edge)]
         if len(holding) == len(used) and all(a is b for a, b in zip(holding, used, strict=True)):
             break
         used = holding
     return placed
 
 
-def holds(poses: Sequence[NDArray[np.float64]], edge: Edge) -> bool:
+def agrees_with_edge(poses: Sequence[NDArray[np.float64]], edge: Edge) -> bool:
     """Whether poses T_world_keyframe agree with a measurement."""
-    metres, degrees = apart(invert(poses[edge.target]) @ poses[edge.source], edge.T_target_source)
+    metres, degrees = measure_pose_difference(invert(poses[edge.target]) @ poses[edge.source], edge.T_target_source)
     return metres <= _HELD_M and degrees <= _HELD_DEG
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..core.types import Submap, Trajectory
-from .pose_graph import Edge, holds
+from .pose_graph import Edge, agrees_with_edge
 
 STATUSES = ("unused", "lost", "tracked", "keyframe", "relocalised", "interpolated", "apart")
 
@@ -125,7 +125,7 @@ class Records:
                     T_submap_keyframe @ T_keyframe_cam[inside],
                     named[sorted(rows)],
                     named[[(e.source, e.target) for e in closed]] if closed else np.zeros((0, 2), np.int32),
-                    np.array([holds(self.T_world_keyframe, e) for e in closed], bool),
+                    np.array([agrees_with_edge(self.T_world_keyframe, e) for e in closed], bool),
                 )
             )
         return found

@@ -47,7 +47,7 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Alignment:
+class TrajectoryAlignment:
     """The similarity that takes the estimate's world to the true one: x_true = scale * rotation @ x_est + translation.
 
     scale: 1 unless it was asked for.  rotation: (3, 3).  translation: (3,) metres.
@@ -58,9 +58,9 @@ class Alignment:
     translation: NDArray[np.float64]
 
     @staticmethod
-    def identity() -> Alignment:
+    def identity() -> TrajectoryAlignment:
         """Both worlds are the same."""
-        return Alignment(1.0, np.eye(3), np.zeros(3))
+        return TrajectoryAlignment(1.0, np.eye(3), np.zeros(3))
 
     def to_true(self, points_est: NDArray[np.floating]) -> NDArray[np.float64]:
         """(..., 3) points of the estimate's world in the true world."""
@@ -86,7 +86,7 @@ class Alignment:
         }
 
 
-def align(estimated: Poses, true: Poses, how: str = "se3") -> Alignment:
+def align_trajectories(estimated: Poses, true: Poses, how: str = "se3") -> TrajectoryAlignment:
     """The alignment of the camera centres of the frames that have a pose in both.
 
     Raises FreeOccError: fewer than three frames match, their centres lie on one line, unknown ``how``.
@@ -94,19 +94,19 @@ def align(estimated: Poses, true: Poses, how: str = "se3") -> Alignment:
     if how not in ALIGNMENTS:
         raise FreeOccError(f"Trajectories are aligned by {', '.join(ALIGNMENTS)}, not by '{how}'.")
     if how == "none":
-        return Alignment.identity()
+        return TrajectoryAlignment.identity()
     rows_est, rows_true = associate(estimated.timestamps, true.timestamps)
     scale, R, t = umeyama(estimated.centers[rows_est], true.centers[rows_true], with_scale=how == "sim3")
-    return Alignment(scale, np.asarray(R, np.float64), np.asarray(t, np.float64))
+    return TrajectoryAlignment(scale, np.asarray(R, np.float64), np.asarray(t, np.float64))
 
 
-def estimated_poses(trajectory: Trajectory) -> Poses:
+def select_estimated_poses(trajectory: Trajectory) -> Poses:
     """The frames of a trajectory that have a pose."""
     rows = np.flatnonzero(trajectory.has_pose)
     return Poses(trajectory.timestamps[rows], trajectory.T_world_cam[rows])
 
 
-def true_poses(capture: Capture) -> Poses:
+def read_true_poses(capture: Capture) -> Poses:
     """The poses that a capture states. Raises FreeOccError if it has none at all."""
     stated = [(index, T) for index in range(len(capture)) if (T := capture.pose(index)) is not None]
     if not stated:
@@ -119,14 +119,14 @@ def read_poses(path: str | Path) -> Poses:
     """Poses of a capture (its folder, or ``builtin:room``) or of a file in any of the forms that
     ``capture.read_trajectory`` knows; one that states no times counts frames. Raises FreeOccError."""
     if str(path).startswith("builtin:"):
-        return true_poses(open_capture(path))
+        return read_true_poses(open_capture(path))
     if not Path(path).exists():
         raise FreeOccError(f"There is no file or capture {path} to take poses from.")
     if Path(path).is_dir():
         try:
             capture = open_capture(path)
             if capture.metric_poses:
-                return true_poses(capture)
+                return read_true_poses(capture)
         except CaptureError as no_capture:
             try:
                 found = read_trajectory(path)

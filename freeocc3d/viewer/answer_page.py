@@ -17,7 +17,7 @@ from ..query.best_views import View, best_views
 from ..query.oriented_boxes import oriented_boxes
 from ..query.word_query import QueryResult
 from ..storage.store import Map
-from .map_pictures import query_png
+from .map_pictures import draw_query
 from .palette import HIGHLIGHTS
 
 _CROP = 320, 240
@@ -26,7 +26,7 @@ _MARGIN = 0.25  # of a box, that a crop shows around it
 _QUALITY = 85
 
 
-def query_page(scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False) -> None:
+def write_query_page(scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False) -> None:
     """Write the page; the same answer gives the same page. Where the map cannot be drawn it says so instead.
 
     Raises ExportError: an empty map, it exists, or cannot be written; MapError for a broken keyframe.
@@ -50,7 +50,7 @@ def _page(scan_map: Map, results: Sequence[QueryResult]) -> str:
         lstrip_blocks=True,
     )
     try:
-        picture, why = _data("png", query_png(scan_map, results)), ""
+        picture, why = _data("png", draw_query(scan_map, results)), ""
     except DependencyError as error:
         picture, why = "", str(error)
     regions = [region for result in results for region in result.regions]

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..occupancy.surface_faces import faces_of
-from .scene_rendering import VIEWS, Scene, cut_height, render, shaded, upright
+from ..occupancy.surface_faces import build_faces
+from .scene_rendering import VIEWS, DrawnScene, choose_cut_height, render_scene, shade_faces, turn_upright
 
 SIZE = 880, 600
 """Pixels of one view; a picture is two of them, one above the other."""
 
 
 @dataclass(frozen=True)
-class Grid:
+class LabelGrid:
     """labels: (X, Y, Z) uint8, 0 is not drawn.  colors: (K, 3) uint8 RGB of label 0, 1, …  path: (P, 3) the camera's
     way, metres, in the frame that the grid lies in."""
 
@@ -26,8 +26,8 @@ class Grid:
     path: NDArray[np.float64]
 
 
-def grid_pictures(
-    grids: Mapping[str, Grid], origin: NDArray[np.float64], voxel_size: float, up: NDArray[np.float64]
+def draw_grids(
+    grids: Mapping[str, LabelGrid], origin: NDArray[np.float64], voxel_size: float, up: NDArray[np.float64]
 ) -> dict[str, bytes]:
     """PNG of each of several grids on one lattice, cut below the ceiling at the same height and seen from the corner
     of the first one's camera; none if all are empty.
@@ -39,20 +39,20 @@ def grid_pictures(
     if not drawn.any():
         return {}
     centers = origin + (np.argwhere(drawn) + 0.5) * voxel_size
-    R = upright(up, centers)
+    R = turn_upright(up, centers)
     turned = centers @ R.T
-    top = cut_height(turned[:, 2], voxel_size)
+    top = choose_cut_height(turned[:, 2], voxel_size)
     low = turned[turned[:, 2] <= top]
     first = next(iter(grids.values()))
-    framed = Scene(low, np.zeros((0, 4), np.int32), np.zeros((0, 3), np.uint8), first.path @ R.T)
+    framed = DrawnScene(low, np.zeros((0, 4), np.int32), np.zeros((0, 3), np.uint8), first.path @ R.T)
     pictures = {}
     for name, grid in grids.items():
         voxels = np.argwhere(grid.labels)
         voxels = voxels[(origin + (voxels + 0.5) * voxel_size) @ R[2] <= top]
-        corners, quads, rows = faces_of(voxels)
+        corners, quads, rows = build_faces(voxels)
         vertices = (origin + corners * voxel_size) @ R.T
         colors = grid.colors[grid.labels[tuple(voxels[rows].T)]]
-        scene = Scene(vertices, quads, shaded(vertices, colors), grid.path @ R.T)
-        views = np.vstack([render(scene, view, SIZE, framed) for view in VIEWS])
+        scene = DrawnScene(vertices, quads, shade_faces(vertices, colors), grid.path @ R.T)
+        views = np.vstack([render_scene(scene, view, SIZE, framed) for view in VIEWS])
         pictures[name] = cv2.imencode(".png", views[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
     return pictures

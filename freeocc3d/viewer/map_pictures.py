@@ -12,13 +12,22 @@ from numpy.typing import NDArray
 from ..core.atomic_files import write_whole
 from ..core.errors import ExportError
 from ..core.transforms import transform
-from ..occupancy.surface_faces import exposed_faces
+from ..occupancy.surface_faces import find_exposed_faces
 from ..query.oriented_boxes import OrientedBox, oriented_boxes
 from ..query.regions import Region
 from ..query.word_query import QueryResult
 from ..storage.store import Map
-from .palette import HIGHLIGHTS, class_colors, height_colors, highlighted
-from .scene_rendering import BACKGROUND, CUT, VIEWS, Scene, cut_height, lengthwise, render, shaded
+from .palette import HIGHLIGHTS, assign_class_colors, color_by_height, highlight_regions
+from .scene_rendering import (
+    BACKGROUND,
+    CUT,
+    VIEWS,
+    DrawnScene,
+    choose_cut_height,
+    render_scene,
+    shade_faces,
+    turn_lengthwise,
+)
 
 SIZE = 1600, 900
 _BAR = 56  # pixels above and below the views
@@ -28,7 +37,7 @@ _LONGEST_NAME = 48  # characters of a word in the legend
 _MARGIN, _SWATCH, _GAP, _MORE = 16, 22, 20, 130  # pixels: left edge, box before a name, after it, room for "and N more"
 
 
-def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: bool = False) -> None:
+def write_map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: bool = False) -> None:
     """Draw the map coloured by "rgb", "class" or "height", with the camera's way, as PNG.
 
     Raises ExportError (empty map, unwritable target, unknown colouring), DependencyError (no off-screen rendering).
@@ -39,28 +48,30 @@ def map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: boo
     if by == "rgb":
         colors = occupancy.colors
     elif by == "class":
-        palette, labels = class_colors(scan_map.vocabulary), scan_map.labels()
+        palette, labels = assign_class_colors(scan_map.vocabulary), scan_map.labels()
         colors = palette[labels]
         present = np.bincount(labels, minlength=len(palette))
         common = [int(k) for k in np.argsort(-present, kind="stable") if present[k]]
         names = ["nothing known", *scan_map.vocabulary]
         legend = [(names[k], tuple(palette[k].tolist())) for k in common]
     elif by == "height":
-        colors = height_colors(occupancy, scan_map.up)
+        colors = color_by_height(occupancy, scan_map.up)
     else:
         raise ExportError(f"A map can be coloured by rgb, class or height, not by '{by}'.")
     _write(_drawn(scan_map, colors, [], _title(scan_map), legend), Path(path), overwrite)
 
 
-def query_picture(scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False) -> None:
-    """Draw the map pale with what each word matched in a strong colour, boxed; PNG. Raises as ``map_picture``."""
-    _write(query_png(scan_map, results), Path(path), overwrite)
+def write_query_picture(
+    scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False
+) -> None:
+    """Draw the map pale with what each word matched in a strong colour, boxed; PNG. Raises as ``write_map_picture``."""
+    _write(draw_query(scan_map, results), Path(path), overwrite)
 
 
-def query_png(scan_map: Map, results: Sequence[QueryResult]) -> bytes:
-    """What ``query_picture`` writes."""
+def draw_query(scan_map: Map, results: Sequence[QueryResult]) -> bytes:
+    """What ``write_query_picture`` writes."""
     _refuse_empty(scan_map)
-    colors = highlighted(scan_map.occupancy.colors, [result.regions for result in results])
+    colors = highlight_regions(scan_map.occupancy.colors, [result.regions for result in results])
     legend = []
     boxes: list[tuple[Region, tuple[int, int, int]]] = []
     for number, result in enumerate(results):
@@ -100,7 +111,7 @@ def _drawn(
     """The picture as PNG."""
     scene = _scene(scan_map, colors, regions)
     width, height = SIZE[0] // 2, SIZE[1] - 2 * _BAR
-    views = np.hstack([render(scene, view, (width, height)) for view in VIEWS])
+    views = np.hstack([render_scene(scene, view, (width, height)) for view in VIEWS])
     picture = _framed(views, title, legend)
     return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
 
@@ -109,24 +120,24 @@ def _write_bytes(path: Path, data: bytes) -> None:
     path.write_bytes(data)
 
 
-def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region, tuple[int, int, int]]]) -> Scene:
+def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region, tuple[int, int, int]]]) -> DrawnScene:
     """The exposed faces of the voxels below the cut and of the regions that lie mostly above it, turned so that z is up
     and the walls lie along x and y."""
     occupancy = scan_map.occupancy
     centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
-    R = lengthwise(scan_map.T_gravity_map[:3, :3], centers)
+    R = turn_lengthwise(scan_map.T_gravity_map[:3, :3], centers)
     height = centers @ R[2]
-    kept = height <= cut_height(height, occupancy.voxel_size)
+    kept = height <= choose_cut_height(height, occupancy.voxel_size)
     for region, _ in regions:  # a lamp that was asked for is drawn; a wall that was asked for does not hide the room
         if 2 * np.count_nonzero(kept[region.rows]) < len(region.rows):
             kept[region.rows] = True
-    vertices, quads, rows = exposed_faces(occupancy, kept)
+    vertices, quads, rows = find_exposed_faces(occupancy, kept)
     turned = vertices.astype(np.float64) @ R.T
     trajectory = scan_map.trajectory
     way = trajectory.T_world_cam[trajectory.has_pose][:, :3, 3] @ R.T
     upright = oriented_boxes(occupancy, [region for region, _ in regions], scan_map.T_gravity_map)
     boxes = tuple((_corners(box) @ R.T, color) for box, (_, color) in zip(upright, regions, strict=True))
-    return Scene(turned, quads, shaded(turned, colors[rows]), way, boxes)
+    return DrawnScene(turned, quads, shade_faces(turned, colors[rows]), way, boxes)
 
 
 def _corners(box: OrientedBox) -> NDArray[np.float64]:

@@ -24,13 +24,13 @@ _KNOWN = {
 }  # fmt: skip
 
 
-def class_colors(names: list[str]) -> NDArray[np.uint8]:
+def assign_class_colors(names: list[str]) -> NDArray[np.uint8]:
     """(C + 1, 3) RGB: row 0 is for "nothing known", row k for names[k - 1]. A name has the same colour always."""
     rows = [(90, 90, 90), *(_KNOWN.get(name) or _hashed(name) for name in names)]
     return np.array(rows, np.uint8)
 
 
-def highlighted(colors: NDArray[np.uint8], words: list[list[Region]]) -> NDArray[np.uint8]:
+def highlight_regions(colors: NDArray[np.uint8], words: list[list[Region]]) -> NDArray[np.uint8]:
     """(V, 3) voxel colours with everything pale and grey but the regions, which take their word's strong colour."""
     grey = colors.astype(np.float32).mean(axis=1, keepdims=True)
     pale = 0.25 * colors + 0.35 * grey + 0.4 * 215.0
@@ -41,13 +41,13 @@ def highlighted(colors: NDArray[np.uint8], words: list[list[Region]]) -> NDArray
     return out
 
 
-def height_colors(occupancy: Occupancy, up: NDArray[np.float64]) -> NDArray[np.uint8]:
+def color_by_height(occupancy: Occupancy, up: NDArray[np.float64]) -> NDArray[np.uint8]:
     """(V, 3) colour of each occupied voxel by its height along ``up``, lowest dark blue, highest yellow."""
     height = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges()) @ up
-    return ramp((height - height.min()) / max(float(np.ptp(height)), 1e-9))
+    return color_by_value((height - height.min()) / max(float(np.ptp(height)), 1e-9))
 
 
-def ramp(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+def color_by_value(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     """(N, 3) viridis colours of (N,) values in 0…1."""
     import cv2  # here, for a query's PLY has no use for it and starts sooner without
 

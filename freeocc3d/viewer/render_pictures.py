@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.types import Gaussians
 from ..gaussians.rasterizers.base import Rasterizer
-from ..gaussians.rendered_views import View, fidelity, render
+from ..gaussians.rendered_views import CapturedView, measure_fidelity, render_gaussians
 from .scene_rendering import BACKGROUND
 
 SHOWN = 4
@@ -21,10 +21,10 @@ _TEXT = (40, 40, 40)
 _COLUMNS = "photograph", "rendered", "measured depth", "rendered depth"
 
 
-def render_picture(
+def write_render_picture(
     path: Path,
     gaussians: Gaussians,
-    views: Sequence[tuple[int, View]],
+    views: Sequence[tuple[int, CapturedView]],
     rasterizer: Rasterizer,
     capture: Path,
     metric: bool = True,
@@ -42,8 +42,10 @@ def render_picture(
     path.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1].tobytes())
 
 
-def _row(gaussians: Gaussians, frame: int, view: View, rasterizer: Rasterizer, metric: bool) -> NDArray[np.uint8]:
-    rendered = render(gaussians, view, rasterizer)
+def _row(
+    gaussians: Gaussians, frame: int, view: CapturedView, rasterizer: Rasterizer, metric: bool
+) -> NDArray[np.uint8]:
+    rendered = render_gaussians(gaussians, view, rasterizer)
     photograph = view.color.cpu().numpy()
     image = np.rint(255 * rendered.image.clamp(0, 1).cpu().numpy()).astype(np.uint8)
     measured = view.depth_m.cpu().numpy()
@@ -57,7 +59,7 @@ def _row(gaussians: Gaussians, frame: int, view: View, rasterizer: Rasterizer, m
     for column, panel in enumerate(panels):
         x = _GAP + column * (_WIDTH + _GAP)
         row[:height, x : x + _WIDTH] = cv2.resize(panel, (_WIDTH, height), interpolation=cv2.INTER_AREA)
-    found = fidelity(gaussians, [view], rasterizer)
+    found = measure_fidelity(gaussians, [view], rasterizer)
     facts = [f"frame {frame}"]
     if found.psnr_measured is not None:
         facts.append(f"{found.psnr_measured:.1f} dB where depth is measured")

@@ -20,7 +20,7 @@ _BOX_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1
 
 
 @dataclass(frozen=True)
-class Scene:
+class DrawnScene:
     """What is drawn, turned so that z is up: quads with a colour each, lines, boxes."""
 
     vertices: NDArray[np.float64]  # (4 F, 3)
@@ -30,7 +30,7 @@ class Scene:
     boxes: tuple[tuple[NDArray[np.float64], tuple[int, int, int]], ...] = ()  # (8, 3) corners and a colour
 
 
-def upright(up: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
+def turn_upright(up: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
     """(3, 3) rotation that takes ``up`` to z and the longer horizontal extent of the (N, 3) points to x."""
     z = up / np.linalg.norm(up)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
@@ -47,20 +47,20 @@ def upright(up: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np
     return turn @ R
 
 
-def lengthwise(R: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
+def turn_lengthwise(R: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
     """A (3, 3) rotation to a frame with z up and walls along x and y, or that and a quarter turn, so that (N, 3) points
     reach farther along x than along y."""
     x, y = np.ptp(points @ R[:2].T, axis=0)
     return R if x >= y else np.array(((0, 1, 0), (-1, 0, 0), (0, 0, 1.0))) @ R
 
 
-def cut_height(height: NDArray[np.floating], voxel_size: float) -> float:
+def choose_cut_height(height: NDArray[np.floating], voxel_size: float) -> float:
     """Up to which height voxels are drawn, of (V,) heights of voxel centres: not too near to the ceiling."""
     low, high = np.percentile(height, (1, 99))
     return float(low + CUT * (high - low) + 0.5 * voxel_size)
 
 
-def shaded(vertices: NDArray[np.float64], colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def shade_faces(vertices: NDArray[np.float64], colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """(F, 3) colours of faces, (4 F, 3) vertices with z up, under a light from each direction that never moves: faces
     of a cube are told apart, and colours stay what they are."""
     corners = vertices.reshape(-1, 4, 3)
@@ -70,7 +70,9 @@ def shaded(vertices: NDArray[np.float64], colors: NDArray[np.uint8]) -> NDArray[
     return np.clip(colors * light[:, None], 0, 255).astype(np.uint8)
 
 
-def render(scene: Scene, view: str, size: tuple[int, int], framed: Scene | None = None) -> NDArray[np.uint8]:
+def render_scene(
+    scene: DrawnScene, view: str, size: tuple[int, int], framed: DrawnScene | None = None
+) -> NDArray[np.uint8]:
     """(H, W, 3) RGB of one of ``VIEWS``. size: (W, H) pixels.
 
     framed: the scene that fills the view, by default this one: pictures that are to be compared are framed alike.
@@ -108,7 +110,7 @@ def render(scene: Scene, view: str, size: tuple[int, int], framed: Scene | None 
     return np.asarray(image, np.uint8)[..., :3]
 
 
-def _aim(plotter: Any, scene: Scene, view: str, size: tuple[int, int]) -> None:
+def _aim(plotter: Any, scene: DrawnScene, view: str, size: tuple[int, int]) -> None:
     """Look from straight above, or down into the scene from the diagonal on which the camera walked, such that all but
     a few stray voxels, and all boxes, fill the view. Both views are parallel projections: equal lengths look equal."""
     points, path = scene.vertices, scene.path
@@ -135,7 +137,7 @@ def _aim(plotter: Any, scene: Scene, view: str, size: tuple[int, int]) -> None:
     plotter.reset_camera_clipping_range()
 
 
-def _bounds(spread: NDArray[np.float64], scene: Scene) -> tuple[NDArray[np.float64], ...]:
+def _bounds(spread: NDArray[np.float64], scene: DrawnScene) -> tuple[NDArray[np.float64], ...]:
     """(2,) and (2,) between which lies all but 0.3 % to either side of the scene's faces, by area, their vertices in
     the view being given; of its points, where it has no faces."""
     weights = np.ones(len(spread))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.types import Gaussians, Submap, Trajectory
 from ..occupancy.up_direction import estimate_up
-from .scene_rendering import BACKGROUND, cut_height, upright
+from .scene_rendering import BACKGROUND, choose_cut_height, turn_upright
 
 SIZE = 1500, 1000
 """Width and height of the picture, pixels."""
@@ -27,7 +27,7 @@ _DOT_M = 0.04
 _RULERS_M = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
 
-def path_picture(
+def write_path_picture(
     path: Path,
     submaps: Sequence[Submap],
     trajectory: Trajectory,
@@ -79,7 +79,7 @@ def _draw(
         poses, means = trajectory.T_world_cam[frames], mapped[0].means
     at_keyframe = np.searchsorted(frames, submap.keyframes)
     up = estimate_up(poses[at_keyframe], means) if mapped is None else mapped[1]
-    R = upright(up, np.concatenate((means[:: max(1, len(means) // 50_000)], poses[:, :3, 3])))
+    R = turn_upright(up, np.concatenate((means[:: max(1, len(means) // 50_000)], poses[:, :3, 3])))
     way = poses[:, :3, 3] @ R.T
     points = means @ R.T.astype(np.float32)
     extent = np.concatenate((way[:, :2], points[:, :2])).astype(np.float64)
@@ -128,7 +128,7 @@ def _plan(
     size = min(max(size, 1), 6)
     u, v = np.rint(pixels - 0.5 * size).astype(int).T
     inside = (u >= x0) & (v >= y0) & (u <= x0 + width - size) & (v <= y0 + rows - size)
-    shown = inside & (height < cut_height(height, _DOT_M))
+    shown = inside & (height < choose_cut_height(height, _DOT_M))
     order = np.flatnonzero(shown)[np.argsort(height[shown], kind="stable")]
     faint = (0.35 * colors[order] + 0.65 * np.array(BACKGROUND)).astype(np.uint8)
     for dv in range(size):

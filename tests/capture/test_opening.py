@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import data_folder, depth_image, write_image, write_replica, write_scannet, write_seven_scenes
 
-from freeocc3d.capture import Options, check_depth_scale, open_capture, used_frames
+from freeocc3d.capture import Options, check_depth_scale, open_capture, select_frames
 from freeocc3d.core.errors import CaptureError, ConfigError
 from freeocc3d.settings import registry
 
@@ -98,10 +98,10 @@ def test_a_builtin_path_goes_to_the_synthetic_reader_with_its_own_options(monkey
 
 def test_used_frames_follow_the_options(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path, 10)
-    assert list(used_frames(open_capture(tmp_path))) == list(range(10))
-    assert list(used_frames(open_capture(tmp_path, Options(start=1, stop=8, stride=3)))) == [1, 4, 7]
+    assert list(select_frames(open_capture(tmp_path))) == list(range(10))
+    assert list(select_frames(open_capture(tmp_path, Options(start=1, stop=8, stride=3)))) == [1, 4, 7]
     with pytest.raises(CaptureError, match="No frame of"):
-        used_frames(open_capture(tmp_path, Options(start=10)))
+        select_frames(open_capture(tmp_path, Options(start=10)))
 
 
 def test_depth_in_its_own_units_raises_no_warning(tmp_path: Path) -> None:

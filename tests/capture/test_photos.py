@@ -10,7 +10,7 @@ from PIL import Image, ImageOps
 
 from freeocc3d.capture import Options, open_capture
 from freeocc3d.capture.camera_files import DIAGONAL_35MM, USUAL_FOCAL
-from freeocc3d.capture.readers.photos import images_in, upright
+from freeocc3d.capture.readers.photos import apply_orientation, list_images
 from freeocc3d.core.errors import CaptureError, FrameError
 
 SIZE = 64, 48
@@ -72,7 +72,7 @@ def test_the_orientation_of_exif_is_applied(tmp_path: Path, orientation: int) ->
     with Image.open(tmp_path / "IMG_9.jpg") as image:
         expected = np.asarray(ImageOps.exif_transpose(image))
     np.testing.assert_allclose(frame.color.astype(int), expected.astype(int), atol=4)
-    np.testing.assert_array_equal(upright(color_image(1, SIZE), 1), color_image(1, SIZE))
+    np.testing.assert_array_equal(apply_orientation(color_image(1, SIZE), 1), color_image(1, SIZE))
     assert (frame.intrinsics.width, frame.intrinsics.height) == expected.shape[1::-1]
     assert frame.intrinsics.cx == (expected.shape[1] - 1) / 2
 
@@ -182,7 +182,7 @@ def test_damaged_images_are_broken_frames(tmp_path: Path) -> None:
         capture[1]
     with pytest.raises(FrameError, match=r"IMG_10\.jpg is cut off"):
         capture[2]
-    for path in images_in(tmp_path):
+    for path in list_images(tmp_path):
         path.write_text("no image")
     with pytest.raises(CaptureError, match=r"No image of .* can be read"):
         open_capture(tmp_path)

@@ -8,7 +8,7 @@ import pytest
 from helpers import camera_matrix, class_image, color_image, pose_matrix, write_image, write_matrix, write_scannet
 
 from freeocc3d.capture.base import Options
-from freeocc3d.capture.depth_registration import OVERLAP_PX, DepthPatches, Grid
+from freeocc3d.capture.depth_registration import OVERLAP_PX, DepthPatches, PixelGrid
 from freeocc3d.capture.readers.scannet import Reader
 from freeocc3d.core.errors import CaptureError
 from freeocc3d.core.transforms import back_project, invert, project, transform
@@ -91,7 +91,7 @@ def test_colour_is_resampled_through_both_cameras() -> None:
     """The colour camera sees less than the depth camera and off its centre; what a ray sees is known analytically."""
     depth_camera = Intrinsics(64, 48, 50.0, 52.0, 31.0, 23.0)
     color_camera = Intrinsics(128, 96, 130.0, 126.0, 65.0, 45.0)
-    grid = Grid(color_camera, depth_camera)
+    grid = PixelGrid(color_camera, depth_camera)
     v, u = np.mgrid[:96, :128]
     x, y = (u - 65.0) / 130.0, (v - 45.0) / 126.0
     image = np.stack((128 + 200 * x, 128 + 200 * y, np.zeros(x.shape)), axis=-1).round().astype(np.uint8)
@@ -109,7 +109,7 @@ def test_colour_is_resampled_through_both_cameras() -> None:
 
 def test_cameras_that_coincide_change_nothing() -> None:
     camera = Intrinsics(32, 24, 32.0, 32.0, 15.5, 11.5)
-    grid = Grid(camera, camera, np.eye(4))
+    grid = PixelGrid(camera, camera, np.eye(4))
     image, depth_m = color_image(0), np.full((24, 32), 2.0, np.float32)
     assert grid.color(image) is image
     assert grid.depth(depth_m) is depth_m

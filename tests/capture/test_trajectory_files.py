@@ -243,7 +243,7 @@ def test_points_become_depth_where_there_is_none_and_hide_what_is_behind() -> No
     near = (1.5 * rays[::2]).astype(np.float32)  # a wall with gaps
     far = (3.0 * rays).astype(np.float32)
     behind = np.array([[0, 0, -2.0]], np.float32)
-    depth = file.depth_of_points(np.concatenate((far, near, behind)), frame)
+    depth = file.project_depth(np.concatenate((far, near, behind)), frame)
     np.testing.assert_allclose(depth.ravel()[::2], 1.5, rtol=1e-6)
     assert (depth.ravel()[1::2] == 0).all()
 

@@ -9,7 +9,7 @@ import pytest
 from helpers import truncate
 from videos import SIZE, number_of, write_video
 
-from freeocc3d.capture import Options, open_capture, read_ahead, used_frames
+from freeocc3d.capture import Options, open_capture, read_ahead, select_frames
 from freeocc3d.capture.camera_files import DIAGONAL_35MM, USUAL_FOCAL
 from freeocc3d.core.errors import CaptureError, ConfigError, FrameError
 
@@ -103,7 +103,7 @@ def test_ascending_reading_decodes_each_frame_once(tmp_path: Path, monkeypatch: 
     seeks = []
     seek = decoder._seek
     monkeypatch.setattr(decoder, "_seek", lambda start: (seeks.append(start), seek(start)))
-    read = [number_of(frame.color) for _, frame in read_ahead(capture, used_frames(capture))]
+    read = [number_of(frame.color) for _, frame in read_ahead(capture, select_frames(capture))]
     assert read == list(range(0, 60, 5))
     assert len(seeks) <= 5, "one for each group of pictures at the most"
 

@@ -16,7 +16,7 @@ from freeocc3d.core.progress import Progress
 from freeocc3d.core.transforms import invert, project, transform
 from freeocc3d.core.types import Frame
 from freeocc3d.depth import multi_view_stereo
-from freeocc3d.depth.sparse_points import triangulated
+from freeocc3d.depth.sparse_points import triangulate
 from freeocc3d.tracking.trackers import known
 
 FRAMES = range(24)
@@ -151,7 +151,7 @@ def test_images_that_show_nothing_are_told(tmp_path: Path) -> None:
             return replace(frame, color=np.full_like(frame.color, 128))
 
     capture, tracker = Colour(), known.load(known.Options(), Colour())
-    scan = triangulated(capture, tracker.T_world_cam, range(6), Progress())
+    scan = triangulate(capture, tracker.T_world_cam, range(6), Progress())
     depth = multi_view_stereo.StereoDepth(tmp_path, multi_view_stereo.Options(size=64))
     with pytest.raises(TrackingError, match="bare surfaces"):
         depth.compute(Blank(), scan, range(6), Progress())
@@ -159,7 +159,7 @@ def test_images_that_show_nothing_are_told(tmp_path: Path) -> None:
 
 def test_points_are_where_surfaces_are(computed) -> None:
     capture, _, tracker = computed
-    scan = triangulated(capture, tracker.T_world_cam, FRAMES, Progress())
+    scan = triangulate(capture, tracker.T_world_cam, FRAMES, Progress())
     assert len(scan.points) > 500
     frame = capture.room[10]
     seen = scan.points[scan.seen_point[scan.seen_frame == 10]]

@@ -5,7 +5,7 @@ import torch
 from textured import CAMERA, Rectangle, looking, render
 
 from freeocc3d.core.transforms import back_project, invert, project, transform
-from freeocc3d.depth.photo_consistency import NOISE, Matcher, best_half, box_mean, pooled_mean
+from freeocc3d.depth.photo_consistency import NOISE, Matcher, average_best_half, average_box, average_box_reference
 
 WALL = [Rectangle((-3, -3, 2.0), (6, 0, 0.5), (0, 6, 0))]
 RADIUS = 2
@@ -60,7 +60,7 @@ def test_one_depth_for_all_pixels_and_one_for_each_score_alike() -> None:
     planes = torch.linspace(0.3, 0.7, 9)[:, None, None]
     each = planes.expand(-1, CAMERA.height, CAMERA.width)
     torch.testing.assert_close(matcher.scores(planes), matcher.scores(each))
-    torch.testing.assert_close(matcher.agreement(planes), best_half(matcher.scores(each)))
+    torch.testing.assert_close(matcher.agreement(planes), average_best_half(matcher.scores(each)))
 
 
 def test_what_no_view_sees_scores_nothing() -> None:
@@ -70,13 +70,13 @@ def test_what_no_view_sees_scores_nothing() -> None:
 
 def test_better_half_of_the_views() -> None:
     scores = torch.tensor([[0.9, -1.0], [0.1, 0.5], [0.7, 0.3], [-0.5, 0.1]])
-    torch.testing.assert_close(best_half(scores), torch.tensor([0.8, 0.4]))
-    torch.testing.assert_close(best_half(scores[:1]), scores[0])
+    torch.testing.assert_close(average_best_half(scores), torch.tensor([0.8, 0.4]))
+    torch.testing.assert_close(average_best_half(scores[:1]), scores[0])
 
 
 def test_means_at_the_border_are_of_what_is_inside() -> None:
     image = torch.arange(20.0).reshape(1, 4, 5)
-    means = box_mean(image, 1)[0]
+    means = average_box(image, 1)[0]
     assert means[0, 0] == image[0, :2, :2].mean()
     assert means[2, 3] == image[0, 1:4, 2:5].mean()
 
@@ -84,4 +84,4 @@ def test_means_at_the_border_are_of_what_is_inside() -> None:
 def test_means_are_those_that_pooling_gives() -> None:
     images = torch.from_numpy(np.random.default_rng(0).random((3, 17, 23), np.float32)) - 0.5
     for radius in (1, 2, 3):
-        torch.testing.assert_close(box_mean(images, radius), pooled_mean(images, radius))
+        torch.testing.assert_close(average_box(images, radius), average_box_reference(images, radius))

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from freeocc3d.depth.building_planes import Layout, Plane
-from freeocc3d.depth.plane_detection import directions, layout
-from freeocc3d.depth.scan_points import Points
+from freeocc3d.depth.plane_detection import detect_layout, find_directions
+from freeocc3d.depth.scan_points import ScanPoints
 
 _SIZE = np.array((5.0, 4.0, 2.6))
 _CELL = 0.02
@@ -26,7 +26,7 @@ _BEHIND = 2.5  # metres: the wall that is seen through it
 
 @dataclass(frozen=True)
 class _Room:
-    points: Points
+    points: ScanPoints
     centres: np.ndarray
     normals: np.ndarray
     planes: Layout
@@ -102,9 +102,9 @@ def _room(behind: int = 0) -> _Room:
     sigma_m = rng.uniform(0.5, 1.5, len(points)) * _NOISE
     normals = np.repeat(np.eye(3)[[2, 0, 1]], (1500, 500, 400), axis=0) + 0.04 * rng.normal(size=(2400, 3))
     normals *= rng.choice((-1.0, 1.0), (2400, 1)) / np.linalg.norm(normals, axis=1, keepdims=True)
-    found = Points(_world(measured), sigma_m, ray_point, ray_camera, _CELL)
+    found = ScanPoints(_world(measured), sigma_m, ray_point, ray_camera, _CELL)
     centres = _world(cameras)
-    return _Room(found, centres, normals @ _WORLD.T, layout(found, centres, normals @ _WORLD.T))
+    return _Room(found, centres, normals @ _WORLD.T, detect_layout(found, centres, normals @ _WORLD.T))
 
 
 def _world(points: np.ndarray) -> np.ndarray:
@@ -133,7 +133,7 @@ _WALLS = [(axis, at) for axis in range(3) for at in (0.0, float(_SIZE[axis]))]
 
 
 def test_the_directions_are_the_rooms(room) -> None:
-    axes = directions(room.points, room.normals)
+    axes = find_directions(room.points, room.normals)
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-9)
     cosine = np.abs(axes @ _WORLD)
     assert sorted(cosine.argmax(axis=1)) == [0, 1, 2]
@@ -277,20 +277,20 @@ def test_damaged_arrays_are_refused(damage) -> None:
         Layout.from_arrays({**arrays, **damage(arrays)})
 
 
-def _measured(points: np.ndarray, centres: np.ndarray) -> Points:
+def _measured(points: np.ndarray, centres: np.ndarray) -> ScanPoints:
     ray_point, ray_camera = np.indices((len(points), len(centres))).reshape(2, -1).astype(np.int32)
-    return Points(points, np.full(len(points), _NOISE), ray_point, ray_camera, _CELL)
+    return ScanPoints(points, np.full(len(points), _NOISE), ray_point, ray_camera, _CELL)
 
 
 @pytest.mark.parametrize("count", [0, 4, 59])
 def test_few_points_make_no_planes(count: int) -> None:
     points, centres = np.random.default_rng(7).random((count, 3)), np.ones((2, 3))
-    assert layout(_measured(points, centres), centres, np.eye(3)).planes == ()
+    assert detect_layout(_measured(points, centres), centres, np.eye(3)).planes == ()
 
 
 def test_points_without_surfaces_make_no_planes() -> None:
     points, centres = np.random.default_rng(7).random((500, 3)), np.ones((2, 3))
-    assert layout(_measured(points, centres), centres, np.zeros((0, 3))).planes == ()
+    assert detect_layout(_measured(points, centres), centres, np.zeros((0, 3))).planes == ()
 
 
 @pytest.mark.filterwarnings("error")
@@ -300,8 +300,8 @@ def test_points_of_one_plane_alone_do_no_harm(extent, spread: float) -> None:
     rng = np.random.default_rng(8)
     points = rng.random((8000, 3)) * extent + spread * rng.normal(size=(8000, 3))
     centres = np.array([(2.5, 2.0, 1.5)] * 4)  # all cameras at one place
-    layout(_measured(points, centres), centres, np.eye(3)[2:])  # along the axes, all numbers are exact
-    found = layout(_measured(_world(points), _world(centres)), _world(centres), _WORLD.T[2:])
+    detect_layout(_measured(points, centres), centres, np.eye(3)[2:])  # along the axes, all numbers are exact
+    found = detect_layout(_measured(_world(points), _world(centres)), _world(centres), _WORLD.T[2:])
     for plane in found.planes:
         assert all(np.isfinite(getattr(plane, field.name)).all() for field in fields(Plane))
     if min(extent[:2]) > 0:
@@ -313,9 +313,9 @@ def test_points_of_one_plane_alone_do_no_harm(extent, spread: float) -> None:
 def test_one_point_far_away_changes_little(room, far: float) -> None:
     given, centres = room.points, room.centres
     points = np.concatenate((given.points, _world(np.array([[far, -2.0 * far, 0.7 * far]]))))
-    more = Points(points, np.append(given.sigma_m, _NOISE), np.append(given.ray_point, np.int32(len(points) - 1)),
+    more = ScanPoints(points, np.append(given.sigma_m, _NOISE), np.append(given.ray_point, np.int32(len(points) - 1)),
                   np.append(given.ray_camera, np.int32(0)), _CELL)  # fmt: skip
-    planes = layout(more, centres, room.normals).planes
+    planes = detect_layout(more, centres, room.normals).planes
     assert sum(plane.outermost for plane in planes) == 6
 
 
@@ -323,5 +323,5 @@ def test_planes_of_pieces_far_apart_take_no_memory() -> None:
     points = np.random.default_rng(9).random((16000, 3)) * (5.0, 4.0, 0.0)
     points[8000:] += 3000.0, 2000.0, 0.0
     centres = np.array([(2.5, 2.0, 1.5), (2.0, 2.0, 1.5)])
-    for plane in layout(_measured(points, centres), centres, np.eye(3)[2:]).planes:
+    for plane in detect_layout(_measured(points, centres), centres, np.eye(3)[2:]).planes:
         assert plane.support.size <= 1 << 24

@@ -5,7 +5,7 @@ import pytest
 from textured import CAMERA, Rectangle, looking, render
 
 from freeocc3d.depth.cross_view_check import DepthImage
-from freeocc3d.depth.scan_points import confirmed_points, merged
+from freeocc3d.depth.scan_points import confirm_points, merge_points
 
 ROOM = [Rectangle((-3, -3, 3.0), (6, 0, 0), (0, 6, 0)), Rectangle((-0.3, -0.4, 1.5), (0.6, 0, 0), (0, 0.8, 0), seed=1)]
 
@@ -17,12 +17,12 @@ def _depth(x: float, scale: float = 1.0) -> DepthImage:
 
 
 def test_points_that_others_confirm_lie_on_the_surfaces() -> None:
-    points, sigma_m = confirmed_points(_depth(0.0), [_depth(0.3), _depth(-0.3)], agreeing=2)
+    points, sigma_m = confirm_points(_depth(0.0), [_depth(0.3), _depth(-0.3)], agreeing=2)
     assert len(points) > 0.7 * CAMERA.width * CAMERA.height
     off = np.minimum(np.abs(points[:, 2] - 3.0), np.abs(points[:, 2] - 1.5))
     assert np.percentile(off, 99) < 0.02
     assert ((sigma_m > 1e-3) & (sigma_m < 0.1)).all()
-    refuted, _ = confirmed_points(_depth(0.0, scale=0.9), [_depth(0.3), _depth(-0.3)], agreeing=2)
+    refuted, _ = confirm_points(_depth(0.0, scale=0.9), [_depth(0.3), _depth(-0.3)], agreeing=2)
     assert len(refuted) < 0.05 * len(points)
 
 
@@ -50,7 +50,7 @@ def _plain(measured, edge: float):
 
 def test_cells_hold_the_weighted_means_of_two_cameras_or_more() -> None:
     measured = _measured(5, 300)
-    found = merged(measured, depth_m=20.0)
+    found = merge_points(measured, depth_m=20.0)
     points, sigma_m, rays = _plain(measured, 0.2)
     np.testing.assert_allclose(found.points, points)
     np.testing.assert_allclose(found.sigma_m, sigma_m)
@@ -60,7 +60,7 @@ def test_cells_hold_the_weighted_means_of_two_cameras_or_more() -> None:
 
 def test_there_are_no_more_points_than_asked_for() -> None:
     measured = _measured(8, 500)
-    found = merged(measured, depth_m=5.0, most=100)
+    found = merge_points(measured, depth_m=5.0, most=100)
     assert 0 < len(found.points) <= 100
     points, sigma_m, rays = _plain(measured, found.cell_m)
     np.testing.assert_allclose(found.points, points)
@@ -70,7 +70,7 @@ def test_there_are_no_more_points_than_asked_for() -> None:
 
 def test_what_lies_beyond_all_measure_or_is_nothing_is_left_out() -> None:
     far = np.array([[0.0, 0.0, 0.0], [1e9, 0.0, 0.0]]), np.array([0.01, 0.01])
-    assert len(merged([far, far], depth_m=1.0).points) == 1
+    assert len(merge_points([far, far], depth_m=1.0).points) == 1
     nothing = np.zeros((0, 3)), np.zeros(0)
-    assert len(merged([nothing, nothing], depth_m=1.0).points) == 0
-    assert len(merged([], depth_m=1.0).points) == 0
+    assert len(merge_points([nothing, nothing], depth_m=1.0).points) == 0
+    assert len(merge_points([], depth_m=1.0).points) == 0

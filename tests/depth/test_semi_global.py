@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from freeocc3d.depth.semi_global import aggregated, jumps
+from freeocc3d.depth.semi_global import aggregate_costs, price_jumps
 
 DIRECTIONS = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
 
@@ -36,14 +36,14 @@ def test_sum_of_the_least_paths() -> None:
     rng = np.random.default_rng(1)
     costs = rng.random((7, 9, 5)).astype(np.float32)
     down, right = rng.random((2, 7, 9)).astype(np.float32)
-    found = aggregated(torch.from_numpy(costs), step, torch.from_numpy(down), torch.from_numpy(right)).numpy()
+    found = aggregate_costs(torch.from_numpy(costs), step, torch.from_numpy(down), torch.from_numpy(right)).numpy()
     np.testing.assert_allclose(found, _plain(costs, step, down, right), atol=1e-5)
 
 
 def test_edges_make_jumps_cheap() -> None:
     grey = torch.zeros(4, 6)
     grey[:, 3:] = 1.0
-    down, right = jumps(grey, 0.2, 2.0, 0.05)
+    down, right = price_jumps(grey, 0.2, 2.0, 0.05)
     assert (down == 2.0).all()
     assert right[0, 3] == pytest.approx(0.2, abs=1e-3)
     assert right[0, 2] == 2.0

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from textured import CAMERA, looking
 
 from freeocc3d.depth.building_planes import Layout, Plane
-from freeocc3d.depth.surface_depth import surface_depth
+from freeocc3d.depth.surface_depth import render_surface_depth
 from freeocc3d.depth.watertight_surface import Surface
 
 _DEEP = 2.0
@@ -35,16 +35,16 @@ _LEFT, _RIGHT = (slice(20, 110), slice(5, 75)), (slice(20, 110), slice(85, 155))
 
 
 def test_what_was_measured_is_shown_and_large_gaps_are_left_empty() -> None:
-    found = surface_depth(_wall(0.03), Layout([]), CAMERA, np.eye(4))
+    found = render_surface_depth(_wall(0.03), Layout([]), CAMERA, np.eye(4))
     np.testing.assert_allclose(found.inverse[_LEFT], 1.0 / _DEEP, rtol=1e-5)
     np.testing.assert_allclose(found.sigma[_LEFT], 0.01 / _DEEP**2, rtol=1e-5)
     assert not found.inverse[_RIGHT].any()
-    assert not surface_depth(_wall(0.03), Layout([]), CAMERA, np.diag((1.0, -1.0, -1.0, 1.0))).inverse.any()
+    assert not render_surface_depth(_wall(0.03), Layout([]), CAMERA, np.diag((1.0, -1.0, -1.0, 1.0))).inverse.any()
 
 
 @pytest.mark.parametrize(("plane", "taken"), [(1.9, False), (1.97, True), (2.15, True), (2.3, False)])
 def test_planes_near_the_surface_fill_its_gaps(plane: float, taken: bool) -> None:
-    found = surface_depth(_wall(0.03), _layout(plane), CAMERA, np.eye(4))
+    found = render_surface_depth(_wall(0.03), _layout(plane), CAMERA, np.eye(4))
     np.testing.assert_allclose(found.inverse[_LEFT], 1.0 / _DEEP, rtol=1e-5)
     np.testing.assert_allclose(found.inverse[_RIGHT], 1.0 / plane if taken else 0.0, rtol=1e-5)
     if taken:
@@ -52,19 +52,19 @@ def test_planes_near_the_surface_fill_its_gaps(plane: float, taken: bool) -> Non
 
 
 def test_small_gaps_are_shown_as_guesses_unless_they_are_seen_edge_on() -> None:
-    found = surface_depth(_wall(0.05), Layout([]), CAMERA, np.eye(4))
+    found = render_surface_depth(_wall(0.05), Layout([]), CAMERA, np.eye(4))
     np.testing.assert_allclose(found.inverse[_RIGHT], 1.0 / _DEEP, rtol=1e-5)
     np.testing.assert_allclose(found.sigma[_RIGHT], 0.04 / _DEEP, rtol=1e-5)
-    found = surface_depth(_wall(0.05), _layout(1.97), CAMERA, np.eye(4))  # planes are surer
+    found = render_surface_depth(_wall(0.05), _layout(1.97), CAMERA, np.eye(4))  # planes are surer
     np.testing.assert_allclose(found.inverse[_RIGHT], 1.0 / 1.97, rtol=1e-5)
     along = np.eye(4)
     along[:3, :3] = Rotation.from_euler("y", 89.0, degrees=True).as_matrix()
     along[:3, 3] = 0.1, 0.5, 1.5
     centre = (slice(50, 65), slice(30, 50))  # towards the right part, at a cosine of at most 0.4
-    assert surface_depth(_wall(0.8), Layout([]), CAMERA, along).inverse[centre].all()
-    assert not surface_depth(_wall(0.05), Layout([]), CAMERA, along).inverse[centre].any()
+    assert render_surface_depth(_wall(0.8), Layout([]), CAMERA, along).inverse[centre].all()
+    assert not render_surface_depth(_wall(0.05), Layout([]), CAMERA, along).inverse[centre].any()
 
 
 def test_no_surface_no_depth() -> None:
     empty = Surface(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.int32), 0.01)
-    assert not surface_depth(empty, _layout(2.0), CAMERA, looking(0.3)).inverse.any()
+    assert not render_surface_depth(empty, _layout(2.0), CAMERA, looking(0.3)).inverse.any()

@@ -6,7 +6,7 @@ import torch
 from textured import CAMERA, Rectangle, looking, render
 
 from freeocc3d.depth import multi_view_stereo
-from freeocc3d.depth.view_depth import measured, median, unfolded_median
+from freeocc3d.depth.view_depth import filter_median, filter_median_reference, measure_depth
 
 SLANTED = Rectangle((-3, -3, 1.5), (6, 0, 1.0), (0, 6, 0.6))
 PLACES = (0.0, -0.3, -0.15, 0.15, 0.3)
@@ -20,7 +20,7 @@ def _views(rectangles, noise=1.0):
 
 def test_a_slanted_wall_is_measured_to_a_fraction_of_a_pixel() -> None:
     view, others, depth = _views([SLANTED])
-    found = measured(view, others, others, 1.0, 6.0)
+    found = measure_depth(view, others, others, 1.0, 6.0)
     known = found.inverse > 0
     assert known.mean() > 0.75
     pixels = np.abs(found.inverse - 1.0 / depth)[known] * CAMERA.fx * 0.225  # in the views' median baseline
@@ -30,7 +30,7 @@ def test_a_slanted_wall_is_measured_to_a_fraction_of_a_pixel() -> None:
 
 def test_sigma_is_what_errors_are() -> None:
     view, others, depth = _views([SLANTED], noise=4.0)
-    found = measured(view, others, others, 1.0, 6.0)
+    found = measure_depth(view, others, others, 1.0, 6.0)
     known = found.inverse > 0
     off = np.abs(found.inverse - 1.0 / depth)[known] / found.sigma[known]
     assert 0.1 < np.median(off) < 1.0
@@ -39,13 +39,13 @@ def test_sigma_is_what_errors_are() -> None:
 
 def test_what_has_no_texture_is_not_measured() -> None:
     view, others, _ = _views([Rectangle((-3, -3, 2.0), (6, 0, 0), (0, 6, 0), blank=(0.0, 1.0))])
-    assert (measured(view, others, others, 1.0, 6.0).inverse > 0).mean() < 0.02
+    assert (measure_depth(view, others, others, 1.0, 6.0).inverse > 0).mean() < 0.02
 
 
 def test_edges_of_what_stands_in_front_stay_where_they_are() -> None:
     box = Rectangle((-0.25, -0.4, 1.4), (0.5, 0, 0), (0, 0.8, 0), seed=1)
     view, others, depth = _views([Rectangle((-4, -4, 3.0), (8, 0, 0), (0, 8, 0)), box])
-    found = measured(view, others, others, 1.0, 6.0)
+    found = measure_depth(view, others, others, 1.0, 6.0)
     known = found.inverse > 0
     off = np.abs(1.0 / np.maximum(found.inverse, 1e-6) - depth)[known] / depth[known]
     assert (off < 0.02).mean() > 0.93
@@ -67,6 +67,6 @@ def test_depth_maps_have_the_size_asked_for(size: int) -> None:
 
 def test_medians_are_those_of_a_plain_implementation() -> None:
     image = torch.from_numpy(np.random.default_rng(0).random((13, 18), np.float32))
-    torch.testing.assert_close(median(image), unfolded_median(image))
+    torch.testing.assert_close(filter_median(image), filter_median_reference(image))
     padded = np.pad(image.numpy(), 2, mode="edge")
-    assert float(median(image)[4, 0]) == np.median(padded[4:9, 0:5])
+    assert float(filter_median(image)[4, 0]) == np.median(padded[4:9, 0:5])

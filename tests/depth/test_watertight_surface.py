@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from freeocc3d.depth.scan_points import Points
-from freeocc3d.depth.tetrahedra import BEHIND, Evidence, Tetrahedra, evidence, tetrahedra
-from freeocc3d.depth.watertight_surface import Surface, boundary, cut, roundness, watertight
+from freeocc3d.depth.scan_points import ScanPoints
+from freeocc3d.depth.tetrahedra import BEHIND, CellVotes, Tetrahedra, collect_votes, tetrahedralize
+from freeocc3d.depth.watertight_surface import Surface, build_surface, cut_cells, extract_boundary, measure_roundness
 
 
 def _crossings(space: Tetrahedra, start, way, length: float):
@@ -34,14 +34,14 @@ def _crossings(space: Tetrahedra, start, way, length: float):
 
 def test_rays_vote_as_in_a_plain_march() -> None:
     rng = np.random.default_rng(0)
-    space = tetrahedra(np.concatenate((rng.normal(size=(30, 3)), rng.normal(size=(4, 3)) * 2.0)))
+    space = tetrahedralize(np.concatenate((rng.normal(size=(30, 3)), rng.normal(size=(4, 3)) * 2.0)))
     rays = [(p, c) for p in range(30) for c in range(30, 34)]
     joined = [set(corners) for corners in space.corners.tolist()]
     rays = [ray for ray in rays if not any(cell.issuperset(ray) for cell in joined)]  # not along an edge
     ray_point, ray_camera = np.array(rays, np.int32).T
     sigma_m, outside = rng.uniform(0.02, 0.3, 34), len(space.corners)
-    found = evidence(space, ray_point, ray_camera, sigma_m)
-    expected = Evidence(*(np.zeros_like(a) for a in (found.free, found.full, found.facets)))
+    found = collect_votes(space, ray_point, ray_camera, sigma_m)
+    expected = CellVotes(*(np.zeros_like(a) for a in (found.free, found.full, found.facets)))
     for point, camera in zip(ray_point, ray_camera, strict=True):
         start, sigma = space.vertices[point], sigma_m[point]
         way = space.vertices[camera] - start
@@ -65,11 +65,11 @@ def test_rays_vote_as_in_a_plain_march() -> None:
 
 def test_the_cut_is_as_cheap_as_linear_programming_finds_it() -> None:
     rng = np.random.default_rng(1)
-    space = tetrahedra(rng.normal(size=(25, 3)))
+    space = tetrahedralize(rng.normal(size=(25, 3)))
     count = len(space.corners) + 1
     votes = rng.integers(0, 9, (2, count)).astype(float)
-    seen = Evidence(votes[0], votes[1], rng.integers(0, 3, (count - 1, 4)).astype(float))
-    shape = 1.0 - roundness(space.vertices, space.corners)
+    seen = CellVotes(votes[0], votes[1], rng.integers(0, 3, (count - 1, 4)).astype(float))
+    shape = 1.0 - measure_roundness(space.vertices, space.corners)
     pairs, price = [], []
     for c, f in np.ndindex(count - 1, 4):
         d = space.beside[c, f]
@@ -92,15 +92,15 @@ def test_the_cut_is_as_cheap_as_linear_programming_finds_it() -> None:
     least = scipy.optimize.linprog(
         np.concatenate((seen.full - seen.free, price)), A, np.zeros(len(pairs)), bounds=bounds
     )
-    assert cost(cut(space, seen)) == pytest.approx(least.fun + seen.free.sum(), rel=0.005)
+    assert cost(cut_cells(space, seen)) == pytest.approx(least.fun + seen.free.sum(), rel=0.005)
 
 
 def test_facets_are_as_round_as_the_angle_to_their_sphere_is() -> None:
     regular = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
     corners = np.array([[0, 1, 2, 3], [3, 0, 2, 1]], np.int32)
-    np.testing.assert_allclose(roundness(regular, corners), 1.0 / 3.0)
+    np.testing.assert_allclose(measure_roundness(regular, corners), 1.0 / 3.0)
     flat = np.array([[0, 0, 0.01], [1, 0, 0], [-0.5, 0.8, 0], [-0.5, -0.8, 0]], float)
-    found = roundness(flat, corners[:1])[0]
+    found = measure_roundness(flat, corners[:1])[0]
     assert found[0] < -0.99  # the centre of its sphere lies far on the other side
 
 
@@ -127,8 +127,8 @@ def test_a_sphere_seen_from_outside_is_closed() -> None:
     ball, centres = _sphere(2000), 3.0 * _sphere(12)
     sees = np.argwhere(np.einsum("pc,kc->pk", ball, centres) > 1.2)
     noisy = ball * (1.0 + 0.005 * rng.normal(size=(len(ball), 1)))
-    points = Points(noisy, np.full(len(ball), 0.005), *sees.T.astype(np.int32), cell_m=0.02)
-    surface = watertight(points, centres)
+    points = ScanPoints(noisy, np.full(len(ball), 0.005), *sees.T.astype(np.int32), cell_m=0.02)
+    surface = build_surface(points, centres)
     assert _closed(surface)
     assert _volume(surface) == pytest.approx(4.0 / 3.0 * np.pi, rel=0.02)
     met = surface.met(centres[0], -centres[:1][None] / 3.0)
@@ -157,7 +157,7 @@ def test_a_blank_wall_of_a_room_is_closed_between_its_edges() -> None:
     rays = np.concatenate((point, len(measured) + np.arange(60))), rng.integers(0, 20, len(point) + 60)
     points = np.concatenate((measured, wrong))
     rays = (rays[0].astype(np.int32), rays[1].astype(np.int32))
-    surface = watertight(Points(points, np.full(len(points), 0.004), *rays, cell_m=0.02), centres)
+    surface = build_surface(ScanPoints(points, np.full(len(points), 0.004), *rays, cell_m=0.02), centres)
     assert _closed(surface)
     assert -_volume(surface) == pytest.approx(size.prod(), rel=0.02)  # seen from inside
     across, up = np.meshgrid(np.linspace(0.4, 2.6, 23), np.linspace(0.4, 2.1, 18))
@@ -169,13 +169,13 @@ def test_a_blank_wall_of_a_room_is_closed_between_its_edges() -> None:
 
 
 def test_many_rays_do_not_overflow_the_solver() -> None:
-    space = tetrahedra(np.random.default_rng(2).normal(size=(30, 3)))
+    space = tetrahedralize(np.random.default_rng(2).normal(size=(30, 3)))
     count = len(space.corners) + 1
     votes = np.where(np.arange(count) % 3 == 0, 1e9, 0.0), np.where(np.arange(count) % 3 == 1, 1e9, 0.0)
-    free = cut(space, Evidence(*votes, np.zeros((count - 1, 4))))
+    free = cut_cells(space, CellVotes(*votes, np.zeros((count - 1, 4))))
     assert free[::3].all()
     assert not free[1::3].any()
-    assert len(boundary(space, free)) > 0
+    assert len(extract_boundary(space, free)) > 0
 
 
 def test_points_of_a_grid_make_a_surface_too() -> None:
@@ -183,7 +183,7 @@ def test_points_of_a_grid_make_a_surface_too() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     for centres in ([(2, 2, 9), (9, 3, 3), (3, 3, -4)], [(2.5, 2.5, 2.5), (1.5, 1, 2.5)], [(2, 2, 2), (1.5, 1, 2.5)]):
         sees = np.indices((len(grid), len(centres))).reshape(2, -1).astype(np.int32)
-        surface = watertight(Points(grid, np.full(len(grid), 0.01), *sees, cell_m=0.1), np.array(centres, float))
+        surface = build_surface(ScanPoints(grid, np.full(len(grid), 0.01), *sees, cell_m=0.1), np.array(centres, float))
         edges = np.sort(np.concatenate([surface.triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
         assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()  # flat ones have no orientation
         assert len(edges) > 100
@@ -194,7 +194,7 @@ def test_all_cameras_at_one_place_and_a_point_far_away_do_no_harm() -> None:
     ball = np.concatenate((_sphere(1000), [(1e4, -1e4, 1e4)]))
     centres = np.array([(0.1, 0.0, 0.2)] * 4)
     sees = np.indices((len(ball), len(centres))).reshape(2, -1).astype(np.int32)
-    surface = watertight(Points(ball, np.full(len(ball), 0.005), *sees, cell_m=0.1), centres)
+    surface = build_surface(ScanPoints(ball, np.full(len(ball), 0.005), *sees, cell_m=0.1), centres)
     assert _closed(surface)
     met = surface.met(centres[0], _sphere(50)[None] - centres[0])
     assert np.median(np.abs(met.times - 1.0)) < 0.01

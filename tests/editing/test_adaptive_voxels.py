@@ -15,12 +15,12 @@ from freeocc3d.core.types import FREE, OCCUPIED, Gaussians
 from freeocc3d.editing import adaptive_voxels
 from freeocc3d.export import export_map
 from freeocc3d.occupancy import build, carve, levels, splat
-from freeocc3d.occupancy.connected_components import connected
+from freeocc3d.occupancy.connected_components import label_components
 from freeocc3d.pipeline import checks
 from freeocc3d.pipeline import run as pipeline
 from freeocc3d.settings import config
 from freeocc3d.storage.store import Map
-from freeocc3d.viewer.map_pictures import map_picture
+from freeocc3d.viewer.map_pictures import write_map_picture
 
 RED, YELLOW = (np.array(CUPS[name]) + (0, 0, 0.5 * CUP_HEIGHT) for name in ("red", "yellow"))
 SETTINGS = {
@@ -103,7 +103,7 @@ def test_down_to_the_finest_only_along_the_line_where_the_meaning_changes() -> N
     base = build.build_occupancy(
         wall, kinds(wall), posed(frames, poses), splat.Options(), carve.Options(), origin=np.array((0, 0, 0.013))
     )
-    made = adaptive_voxels.adaptive(
+    made = adaptive_voxels.build_adaptive(
         base,
         wall,
         kinds(wall),
@@ -132,11 +132,11 @@ def test_points_near_blocks() -> None:
 
 
 def test_sizes_that_halving_reaches() -> None:
-    assert adaptive_voxels.halvings(0.08, 0.08) == 0
-    assert adaptive_voxels.halvings(0.08, 0.005) == 4
+    assert adaptive_voxels.count_halvings(0.08, 0.08) == 0
+    assert adaptive_voxels.count_halvings(0.08, 0.005) == 4
     for finest in (0.03, 0.16, 0.0, -1.0, 0.08 / 2**9):
         with pytest.raises(MapError, match="take one of"):
-            adaptive_voxels.halvings(0.08, finest)
+            adaptive_voxels.count_halvings(0.08, finest)
 
 
 def test_no_space_is_claimed_twice_and_none_is_lost(room: Map, fine: Map) -> None:
@@ -160,7 +160,7 @@ def test_flat_walls_stay_coarse_and_things_become_fine(room: Map, fine: Map) -> 
     for cup in (RED, YELLOW):
         near = np.linalg.norm(centers - cup, axis=1) < 0.06
         assert (edges[near] == 1).mean() > 0.6
-    uniform = levels.uniform(made, 3)
+    uniform = levels.make_uniform(made, 3)
     assert made.state.nbytes < 0.5 * uniform.state.nbytes
 
 
@@ -169,7 +169,7 @@ def test_cups_that_were_one_lump_are_two_in_the_map_of_the_room(fine: Map) -> No
     corners, edges = made.occupied_voxels(), made.occupied_edges()
     centers = made.centers(corners, edges)
     above_table = (np.linalg.norm(centers - 0.5 * (RED + YELLOW), axis=1) < 0.2) & (centers[:, 2] > 0.77)
-    component = connected(corners[above_table], edges[above_table])
+    component = label_components(corners[above_table], edges[above_table])
     middles = [centers[above_table][component == c].mean(axis=0) for c in np.unique(component)]
     sizes = np.bincount(component)
     large = [middle for middle, size in zip(middles, sizes, strict=True) if size > 30]
@@ -196,7 +196,7 @@ def test_saved_loaded_exported_and_drawn(room: Map, fine: Map, tmp_path: Path) -
     assert set(np.unique(sparse["edges"])) == {1, 2, 4, 8}
     volume = (sparse["edges"][sparse["state"] == OCCUPIED].astype(float) ** 3).sum()
     assert volume == (again.occupancy.occupied_edges().astype(float) ** 3).sum()
-    map_picture(again, tmp_path / "map.png")
+    write_map_picture(again, tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 20_000
     facts = json.loads(run("info", fine.path, "--json").stdout)
     assert facts["voxel_size_m"] == 0.08
@@ -229,9 +229,9 @@ def test_what_cannot_be_refined(room: Map, fine: Map, tmp_path: Path) -> None:
 
 
 def test_faces_of_two_sizes() -> None:
-    from freeocc3d.occupancy.surface_faces import faces_of
+    from freeocc3d.occupancy.surface_faces import build_faces
 
-    corners, quads, rows = faces_of(np.array([(0, 0, 0), (2, 0, 0)]), np.array([2, 1]))
+    corners, quads, rows = build_faces(np.array([(0, 0, 0), (2, 0, 0)]), np.array([2, 1]))
     assert np.bincount(rows).tolist() == [6, 5]  # the small cube's face on the large one is hidden, not the other way
     assert corners.max(axis=0).tolist() == [3, 2, 2]
     assert len(quads) == 11
@@ -249,5 +249,5 @@ def test_components_of_two_sizes_agree_with_plain_boxes() -> None:
         touch = ((corners[:, None] <= ends) & (corners <= ends[:, None])).all(axis=2)
         while (more := touch.astype(int) @ touch > 0).sum() > touch.sum():
             touch = more
-        found = connected(corners.astype(np.int32), edges.astype(np.int32))
+        found = label_components(corners.astype(np.int32), edges.astype(np.int32))
         np.testing.assert_array_equal(found[:, None] == found, touch)

@@ -13,7 +13,7 @@ from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import FREE
 from freeocc3d.editing import box_refinement
 from freeocc3d.language.encoders import colour
-from freeocc3d.occupancy.connected_components import connected
+from freeocc3d.occupancy.connected_components import label_components
 from freeocc3d.pipeline import run as pipeline
 from freeocc3d.storage.store import Map
 
@@ -35,7 +35,7 @@ def room(tmp_path_factory) -> Map:
 @pytest.fixture(scope="module")
 def cups(room: Map) -> Map:
     box = box_refinement.Box(MIDDLE - REACH, MIDDLE + REACH)
-    return box_refinement.refine(room, box, 0.005, room.path.parent / "cups")
+    return box_refinement.refine_box(room, box, 0.005, room.path.parent / "cups")
 
 
 def near(found: Map, point: np.ndarray, radius: float) -> np.ndarray:
@@ -45,7 +45,7 @@ def near(found: Map, point: np.ndarray, radius: float) -> np.ndarray:
 
 def test_cups_that_are_one_lump_at_8_cm_are_two_regions_at_5_mm(room: Map, cups: Map) -> None:
     lump = near(room, MIDDLE, 0.2)
-    assert len(np.unique(connected(lump))) == 1
+    assert len(np.unique(label_components(lump))) == 1
     for word, middle in (("red cup", RED), ("yellow cup", YELLOW)):
         best = cups.query(word).regions[0]
         assert np.linalg.norm(best.centroid[:2] - middle[:2]) < 0.015
@@ -74,7 +74,7 @@ def test_surfaces_are_where_they_are_to_a_voxel(cups: Map) -> None:
 
 
 def test_what_is_refined_is_a_map_that_can_be_refined_again(cups: Map) -> None:
-    again = box_refinement.refine(cups, box_refinement.Box(RED - 0.06, RED + 0.06), 0.004, cups.path.parent / "red")
+    again = box_refinement.refine_box(cups, box_refinement.Box(RED - 0.06, RED + 0.06), 0.004, cups.path.parent / "red")
     assert again.manifest["voxel_size_m"] == 0.004
     assert again.query("red cup").regions[0].volume_m3 > 1e-5
     assert again.manifest["refined"]["map"].endswith("cups")
@@ -86,16 +86,20 @@ def test_boxes_that_cannot_be_refined(room: Map, tmp_path: Path) -> None:
     with pytest.raises(MapError, match="lower and an upper corner"):
         box_refinement.Box(np.ones(3), np.zeros(3))
     with pytest.raises(MapError, match="No keyframe"):
-        box_refinement.refine(room, box_refinement.Box(np.full(3, 50.0), np.full(3, 50.5)), 0.01, tmp_path / "map")
+        box_refinement.refine_box(room, box_refinement.Box(np.full(3, 50.0), np.full(3, 50.5)), 0.01, tmp_path / "map")
     with pytest.raises(MapError, match="more than can be kept"):
-        box_refinement.refine(room, box_refinement.Box(np.full(3, -50.0), np.full(3, 50.0)), 0.01, tmp_path / "map")
+        box_refinement.refine_box(room, box_refinement.Box(np.full(3, -50.0), np.full(3, 50.0)), 0.01, tmp_path / "map")
     with pytest.raises(MapError, match="cannot be had"):
-        box_refinement.refine(room, box_refinement.Box(np.zeros(3), np.ones(3)), 0.2, tmp_path / "map")
+        box_refinement.refine_box(room, box_refinement.Box(np.zeros(3), np.ones(3)), 0.2, tmp_path / "map")
     with pytest.raises(MapError, match="own place"):
-        box_refinement.refine(room, box_refinement.Box(MIDDLE - REACH, MIDDLE + REACH), 0.01, room.path, overwrite=True)
+        box_refinement.refine_box(
+            room, box_refinement.Box(MIDDLE - REACH, MIDDLE + REACH), 0.01, room.path, overwrite=True
+        )
     in_the_air = MIDDLE + (0, 0, 0.5)
     with pytest.raises(MapError, match=r"No keyframe|No voxel"):
-        box_refinement.refine(room, box_refinement.Box(in_the_air - 0.05, in_the_air + 0.05), 0.01, tmp_path / "map")
+        box_refinement.refine_box(
+            room, box_refinement.Box(in_the_air - 0.05, in_the_air + 0.05), 0.01, tmp_path / "map"
+        )
     assert not list(tmp_path.iterdir())
 
 
@@ -107,7 +111,7 @@ def test_a_map_that_has_moved_to_another_machine(room: Map, needed: bool, tmp_pa
     progress = Progress()
     progress.warn = told.append  # type: ignore[method-assign]
     moved = Map(room.path, {**room.manifest, "capture": {**room.manifest["capture"], "path": "/gone"}})
-    found = box_refinement.refine(
+    found = box_refinement.refine_box(
         moved, box_refinement.Box(MIDDLE - REACH, MIDDLE + REACH), 0.01, tmp_path / "map", progress=progress
     )
     assert len(told) == needed

@@ -34,7 +34,7 @@ def room(tmp_path_factory) -> Map:
 @pytest.fixture(scope="module")
 def half(room: Map) -> Map:
     """Half as large, in no unit."""
-    made = scaling.scaled(room, 0.5, "given", room.path.parent / "half")
+    made = scaling.scale_map(room, 0.5, "given", room.path.parent / "half")
     manifest = yaml.safe_load((made.path / store.MANIFEST).read_text())
     manifest["scale"] = {"metric": False, "by": "none", "factor": 1.0}
     report = {**made.report, "warnings": [scaling.UNKNOWN, "another"]}
@@ -79,7 +79,7 @@ def test_words_are_found_at_half_the_place(room: Map, half: Map) -> None:
 
 
 def test_scaling_back_gives_the_map_that_it_was(room: Map, half: Map, tmp_path: Path) -> None:
-    back = scaling.scaled(half, 2.0, "length", tmp_path / "back")
+    back = scaling.scale_map(half, 2.0, "length", tmp_path / "back")
     assert back.metric
     assert back.manifest["scale"] == {"metric": True, "by": "length", "factor": 2.0}
     assert back.manifest["voxel_size_m"] == pytest.approx(room.manifest["voxel_size_m"])
@@ -99,24 +99,24 @@ def test_a_length_between_two_pixels_or_words(room: Map, half: Map) -> None:
     ]
     true = float(np.linalg.norm(np.subtract(*points)))
     ends = [f"{frame.index}:{x},{y}" for x, y in pixels]
-    assert scaling.by_length(half, ends, true) == pytest.approx(2.0, rel=0.02)
+    assert scaling.scale_by_length(half, ends, true) == pytest.approx(2.0, rel=0.02)
     places = [half.query(word).regions[0].centroid for word in ("red cup", "green plant")]
     apart = 2 * float(np.linalg.norm(places[0] - places[1]))
-    assert scaling.by_length(half, ["red cup", "green plant"], apart) == pytest.approx(2.0)
+    assert scaling.scale_by_length(half, ["red cup", "green plant"], apart) == pytest.approx(2.0)
 
 
 def test_points_that_are_none_are_told(half: Map) -> None:
     keyframe = int(half.trajectory.keyframes[1])
     with pytest.raises(MapError, match=r"Frame 1 is no keyframe of .*; the nearest are 0, "):
-        scaling.by_length(half, ["1:5,5", "red cup"], 1.0)
+        scaling.scale_by_length(half, ["1:5,5", "red cup"], 1.0)
     with pytest.raises(MapError, match=r"Pixel 999,5 is outside of keyframe .*320 x 240"):
-        scaling.by_length(half, [f"{keyframe}:999,5", "red cup"], 1.0)
+        scaling.scale_by_length(half, [f"{keyframe}:999,5", "red cup"], 1.0)
     with pytest.raises(MapError, match=r"'xylophone' matches nothing"):
-        scaling.by_length(half, ["xylophone", "red cup"], 1.0)
+        scaling.scale_by_length(half, ["xylophone", "red cup"], 1.0)
     with pytest.raises(MapError, match="are one point of the map"):
-        scaling.by_length(half, ["red cup", "red cup"], 1.0)
+        scaling.scale_by_length(half, ["red cup", "red cup"], 1.0)
     with pytest.raises(MapError, match="A length is a positive number of metres"):
-        scaling.by_length(half, ["red cup", "blue chair"], -1.0)
+        scaling.scale_by_length(half, ["red cup", "blue chair"], -1.0)
 
 
 def test_a_pixel_without_depth_takes_the_nearest_that_has_one(half: Map) -> None:
@@ -139,36 +139,36 @@ def test_a_pixel_without_depth_takes_the_nearest_that_has_one(half: Map) -> None
 
     holed = Holed()
     holed.keyframes = Frames()  # type: ignore[attr-defined]
-    assert scaling.by_length(holed, [f"{frame}:102,102", "red cup"], 1.0) > 0  # type: ignore[arg-type]
+    assert scaling.scale_by_length(holed, [f"{frame}:102,102", "red cup"], 1.0) > 0  # type: ignore[arg-type]
     with pytest.raises(MapError, match=rf"Keyframe {frame} has no depth within 6 pixels of 110,110"):
-        scaling.by_length(holed, [f"{frame}:110,110", "red cup"], 1.0)  # type: ignore[arg-type]
+        scaling.scale_by_length(holed, [f"{frame}:110,110", "red cup"], 1.0)  # type: ignore[arg-type]
 
 
 def test_the_cameras_height_above_the_floor(half: Map, tmp_path: Path) -> None:
     """The camera goes at 1.5 m, up and down by 3 cm."""
-    assert scaling.by_camera_height(half, 1.5) == pytest.approx(2.0, rel=0.03)
+    assert scaling.scale_by_camera_height(half, 1.5) == pytest.approx(2.0, rel=0.03)
     floorless = load_map(half.path)
     above = (floorless.gaussians.means @ half.up.astype(np.float32)) > 0.3
     floorless.__dict__["gaussians"] = floorless.gaussians[np.flatnonzero(above)]
     with pytest.raises(MapError, match="shows no floor below the cameras: give a known length"):
-        scaling.by_camera_height(floorless, 1.5)
+        scaling.scale_by_camera_height(floorless, 1.5)
 
 
 def test_metric_poses_of_the_capture_or_of_a_file(room: Map, half: Map, tmp_path: Path) -> None:
-    assert scaling.by_poses(half, "builtin:room") == pytest.approx(2.0, rel=1e-4)
-    assert scaling.by_poses(half, str(room.path / store.TRAJECTORY)) == pytest.approx(2.0, rel=1e-4)
+    assert scaling.scale_by_poses(half, "builtin:room") == pytest.approx(2.0, rel=1e-4)
+    assert scaling.scale_by_poses(half, str(room.path / store.TRAJECTORY)) == pytest.approx(2.0, rel=1e-4)
     rng = np.random.default_rng(0)
     T = room.trajectory.T_world_cam.copy()
     T[:, :3, 3] = rng.normal(size=(len(T), 3))
     write_tum(tmp_path / "other.txt", dataclasses.replace(room.trajectory, T_world_cam=T))
     with pytest.raises(FreeOccError, match=r"The poses of .*other\.txt are not this map's"):
-        scaling.by_poses(half, str(tmp_path / "other.txt"))
+        scaling.scale_by_poses(half, str(tmp_path / "other.txt"))
 
 
 @pytest.mark.parametrize("factor", [0.0, -2.0, float("nan"), 1e-3, 1e3])
 def test_factors_that_no_map_can_have_are_refused(half: Map, tmp_path: Path, factor: float) -> None:
     with pytest.raises(MapError, match=r"positive number|check the length"):
-        scaling.scaled(half, factor, "given", tmp_path / "out")
+        scaling.scale_map(half, factor, "given", tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from freeocc3d.core.errors import FreeOccError
-from freeocc3d.evaluation.confusion import Prediction, Scores, confusion
+from freeocc3d.evaluation.confusion import Prediction, Scores, count_confusion
 
 NAMES = ("wall", "floor", "sofa", "lamp")
 
@@ -15,7 +15,7 @@ def scores(labels: object, occupied: object, classes: object = None, names: tupl
     true = np.array(labels, np.uint8).reshape(-1, 1, 1)
     claimed = None if classes is None else np.array(classes, np.uint8).reshape(true.shape)
     predicted = Prediction(np.array(occupied, bool).reshape(true.shape), claimed)
-    return Scores(confusion(true, predicted, true != 255, len(names)), names)
+    return Scores(count_confusion(true, predicted, true != 255, len(names)), names)
 
 
 def test_occupancy_counted_by_hand() -> None:
@@ -118,13 +118,15 @@ def test_a_swapped_axis_costs_what_the_overlap_says() -> None:
 
 def test_a_prediction_on_another_lattice_is_refused() -> None:
     with pytest.raises(FreeOccError, match=r"\(2, 2, 3\)"):
-        confusion(np.zeros((2, 2, 2), np.uint8), Prediction(np.zeros((2, 2, 3), bool)), np.ones((2, 2, 2), bool), 1)
+        count_confusion(
+            np.zeros((2, 2, 2), np.uint8), Prediction(np.zeros((2, 2, 3), bool)), np.ones((2, 2, 2), bool), 1
+        )
 
 
 def test_voxel_states_are_not_taken_for_a_prediction() -> None:
     states = np.full((2, 2, 2), 255, np.uint8)
     with pytest.raises(FreeOccError, match="boolean"):
-        confusion(np.zeros((2, 2, 2), np.uint8), Prediction(states), np.ones((2, 2, 2), bool), 1)  # type: ignore[arg-type]
+        count_confusion(np.zeros((2, 2, 2), np.uint8), Prediction(states), np.ones((2, 2, 2), bool), 1)  # type: ignore[arg-type]
 
 
 def test_a_truth_that_observed_nothing_is_refused() -> None:

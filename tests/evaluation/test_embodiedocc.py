@@ -12,7 +12,7 @@ from freeocc3d.core.errors import FreeOccError
 from freeocc3d.evaluation.embodiedocc import (
     EMBODIEDOCC_CLASSES,
     find_package,
-    frames_mask,
+    load_frames_mask,
     load_global_package,
     load_preprocessed,
     read_split,
@@ -199,10 +199,10 @@ def test_frames_of_other_scenes_and_unlisted_ones_do_not_count(tmp_path: Path) -
     for stranger in ("scene0000_001_00001", "scene0000_00_1_00001", "scene0000_01_00001", "scene0000_00_00002"):
         write(folder / "train" / f"{stranger}_new.pkl", {"mask_in_global": full})
     np.testing.assert_array_equal(load_global_package(path).frames_mask, one)
-    np.testing.assert_array_equal(frames_mask(folder, "scene0000_00", SHAPE), full)
-    assert frames_mask(folder, "scene0000_02", SHAPE) is None
-    assert frames_mask(folder, "scene0000_0?", SHAPE) is None
-    assert frames_mask(tmp_path / "none", "scene0000_00", SHAPE) is None
+    np.testing.assert_array_equal(load_frames_mask(folder, "scene0000_00", SHAPE), full)
+    assert load_frames_mask(folder, "scene0000_02", SHAPE) is None
+    assert load_frames_mask(folder, "scene0000_0?", SHAPE) is None
+    assert load_frames_mask(tmp_path / "none", "scene0000_00", SHAPE) is None
 
 
 def test_missing_frames_are_told(tmp_path: Path) -> None:

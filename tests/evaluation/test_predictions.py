@@ -15,12 +15,17 @@ from freeocc3d.core.types import Gaussians, PosedFrame
 from freeocc3d.evaluation import predictions, scoring
 from freeocc3d.evaluation.confusion import Prediction
 from freeocc3d.evaluation.ground_truth import save_ground_truth
-from freeocc3d.evaluation.scored_classes import ClassMap, identity
+from freeocc3d.evaluation.scored_classes import ClassMap, map_each_to_itself
 from freeocc3d.evaluation.true_occupancy import GroundTruth
 from freeocc3d.occupancy import carve, splat_reference
 from freeocc3d.occupancy.splat import Options
 from freeocc3d.settings import config
-from freeocc3d.tracking.trajectory_alignment import Alignment, Poses, align, estimated_poses
+from freeocc3d.tracking.trajectory_alignment import (
+    Poses,
+    TrajectoryAlignment,
+    align_trajectories,
+    select_estimated_poses,
+)
 
 SHAPE = (40, 40, 48)
 ORIGIN = np.array((-1.6, -1.6, 0.0))
@@ -47,27 +52,27 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", settings)
 
 
-def of_room(room: Any, alignment: Alignment, truth: GroundTruth) -> NDArray[np.bool_]:
+def of_room(room: Any, alignment: TrajectoryAlignment, truth: GroundTruth) -> NDArray[np.bool_]:
     settings = config.load(room.path / "config.yaml")
-    return predictions.of_map(room, settings, alignment, truth, NO_CLASSES)[0].occupied
+    return predictions.predict_from_map(room, settings, alignment, truth, NO_CLASSES)[0].occupied
 
 
 def test_a_similarity_of_map_and_lattice_changes_nothing(room: Any) -> None:
-    same = of_room(room, Alignment.identity(), lattice())
+    same = of_room(room, TrajectoryAlignment.identity(), lattice())
     assert same.sum() > 500
     for scale in (0.5, 3.0):
-        moved = Alignment(scale, np.eye(3), np.array((1.0, 2.0, 3.0)))
+        moved = TrajectoryAlignment(scale, np.eye(3), np.array((1.0, 2.0, 3.0)))
         scaled = of_room(room, moved, lattice(scale * ORIGIN + (1, 2, 3), 0.08 * scale))
         # Depth noise is absolute, so that the carving margin differs a little between scales.
         assert agreement(same, scaled) > 0.9
-    turned = of_room(room, Alignment(1.0, QUARTER, np.zeros(3)), lattice())
+    turned = of_room(room, TrajectoryAlignment(1.0, QUARTER, np.zeros(3)), lattice())
     assert agreement(turned, np.rot90(same, 1, axes=(0, 1))) > 0.99
 
 
 def test_a_map_on_its_own_lattice_is_the_map(room: Any) -> None:
     voxels = room.occupancy.occupied_voxels()
     low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
-    on_lattice = of_room(room, Alignment.identity(), lattice(low * 0.08, shape=tuple(high - low)))
+    on_lattice = of_room(room, TrajectoryAlignment.identity(), lattice(low * 0.08, shape=tuple(high - low)))
     expected = np.zeros(tuple(high - low), bool)
     expected[tuple((voxels - low).T)] = True
     # The map was carved by every frame, the score is by its keyframes: few voxels are contradicted by one alone.
@@ -78,15 +83,15 @@ def test_a_map_of_finer_cells_claims_the_same_voxels(room: Any, tmp_path: Path) 
     cells = {"gaussians": {"cell_size": 0.02}, "capture": {"stop": 30, "synthetic": {"width": 160, "height": 120}}}
     fine = freeocc3d.reconstruct("builtin:room", tmp_path / "fine", cells)
     assert len(fine.gaussians) > 2.5 * len(room.gaussians)
-    same, claimed = (of_room(scan_map, Alignment.identity(), lattice()) for scan_map in (room, fine))
+    same, claimed = (of_room(scan_map, TrajectoryAlignment.identity(), lattice()) for scan_map in (room, fine))
     assert agreement(same, claimed) > 0.85
 
 
 def test_the_rooms_map_agrees_with_its_truth(room: Any) -> None:
-    capture = scoring.capture_of(room)
+    capture = scoring.reopen_capture(room)
     arrays = capture.ground_truth()  # type: ignore[attr-defined]
     truth = GroundTruth(arrays["labels"], arrays["origin"], arrays["voxel_size"], tuple(arrays["classes"].tolist()))
-    scene = scoring.score_map(room, truth, identity(truth.classes))
+    scene = scoring.score_map(room, truth, map_each_to_itself(truth.classes))
     assert scene.errors is not None
     assert scene.errors.ate_rmse_m < 0.01
     scored = scoring.Evaluation((scene,), truth.classes[1:], "se3")
@@ -114,7 +119,7 @@ def test_the_order_of_frames_does_not_count(room: Any) -> None:
         for rows in (np.arange(len(order)), order)
     )
     np.testing.assert_array_equal(usual.state, shuffled.state)
-    own = estimated_poses(room.trajectory)
+    own = select_estimated_poses(room.trajectory)
     turned = Poses(own.timestamps[::-1], own.T_world_cam[::-1])
     scored = [scoring.score_map(room, lattice(), NO_CLASSES, poses) for poses in (own, turned)]
     np.testing.assert_array_equal(scored[0].predicted.occupied, scored[1].predicted.occupied)
@@ -128,12 +133,19 @@ def test_gaussians_are_projected_at_the_lattices_centres() -> None:
     truth = lattice((-0.5, -0.5, -0.5), 0.05, (20, 20, 20))
     semantics = np.eye(2, dtype=np.float32)[np.arange(60) % 2]
     settings = config.load(None, ["occupancy.cutoff=8"])
-    found = predictions.of_gaussians(some, semantics, settings, Alignment.identity(), truth)
+    found = predictions.predict_from_gaussians(some, semantics, settings, TrajectoryAlignment.identity(), truth)
     points, wide = truth.centers().reshape(-1, 3), Options(cutoff=8.0)
-    expected = (splat_reference.probability(some, points, wide) >= wide.threshold).reshape(truth.shape)
+    expected = (splat_reference.compute_probability_reference(some, points, wide) >= wide.threshold).reshape(
+        truth.shape
+    )
     np.testing.assert_array_equal(found.occupied, expected)
     assert found.labels is not None
-    nearest = splat_reference.posterior_mean(some, points, semantics, wide).argmax(axis=1).reshape(truth.shape) + 1
+    nearest = (
+        splat_reference.compute_posterior_mean_reference(some, points, semantics, wide)
+        .argmax(axis=1)
+        .reshape(truth.shape)
+        + 1
+    )
     np.testing.assert_array_equal(found.labels, np.where(expected, nearest, 0))
 
 
@@ -142,10 +154,10 @@ def test_gaussians_and_lattice_may_move_together() -> None:
     some = random_gaussians(80, seed=4, extent=1.2)
     truth = lattice((-0.8, -0.8, -0.8), 0.05, (32, 32, 32))
     settings = config.load(None)
-    here = predictions.of_gaussians(some, None, settings, Alignment.identity(), truth).occupied
-    moved = Alignment(2.0, QUARTER, np.array((5.0, -3.0, 1.0)))
+    here = predictions.predict_from_gaussians(some, None, settings, TrajectoryAlignment.identity(), truth).occupied
+    moved = TrajectoryAlignment(2.0, QUARTER, np.array((5.0, -3.0, 1.0)))
     there = lattice(2.0 * truth.origin + moved.translation, 0.1, (32, 32, 32))
-    turned = predictions.of_gaussians(some, None, settings, moved, there).occupied
+    turned = predictions.predict_from_gaussians(some, None, settings, moved, there).occupied
     assert 100 < here.sum() < here.size / 2
     assert agreement(turned, np.rot90(here, 1, axes=(0, 1))) > 0.998  # but for single precision at the threshold
 
@@ -155,8 +167,10 @@ def test_a_scaled_map_scores_what_its_shell_overlaps() -> None:
     ball = gaussians((0.0, 0.0, 0.0), 1.0)
     truth = lattice((-2.0, -2.0, -2.0), 0.05, (80, 80, 80))
     settings = config.load(None)
-    small = predictions.of_gaussians(ball, None, settings, Alignment.identity(), truth).occupied
-    large = predictions.of_gaussians(ball, None, settings, Alignment(1.25, np.eye(3), np.zeros(3)), truth).occupied
+    small = predictions.predict_from_gaussians(ball, None, settings, TrajectoryAlignment.identity(), truth).occupied
+    large = predictions.predict_from_gaussians(
+        ball, None, settings, TrajectoryAlignment(1.25, np.eye(3), np.zeros(3)), truth
+    ).occupied
     radius = np.sqrt(2 * np.log(2))
     assert small.sum() * 0.05**3 == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.01)
     assert agreement(small, large) == pytest.approx(1 / 1.25**3, rel=0.02)
@@ -164,9 +178,13 @@ def test_a_scaled_map_scores_what_its_shell_overlaps() -> None:
 
 def test_a_gaussian_far_larger_than_the_lattice_costs_no_memory() -> None:
     truth = lattice((0, 0, 0), 0.08, (10, 10, 10))
-    huge = predictions.of_gaussians(gaussians((0.0, 0, 0), 500.0), None, config.load(None), Alignment.identity(), truth)
+    huge = predictions.predict_from_gaussians(
+        gaussians((0.0, 0, 0), 500.0), None, config.load(None), TrajectoryAlignment.identity(), truth
+    )
     assert huge.occupied.all()
-    far = predictions.of_gaussians(gaussians((900.0, 0, 0), 1.0), None, config.load(None), Alignment.identity(), truth)
+    far = predictions.predict_from_gaussians(
+        gaussians((900.0, 0, 0), 1.0), None, config.load(None), TrajectoryAlignment.identity(), truth
+    )
     assert not far.occupied.any()
 
 
@@ -183,12 +201,12 @@ def test_frames_are_fused_by_their_true_poses(tmp_path: Path) -> None:
             means=part.means, scales=part.scales, quats_wxyz=part.quats_wxyz, opacities=part.opacities,
             labels=np.full(len(part), index + 1),
         )  # fmt: skip
-    truth, classes = lattice((-0.6, -0.6, -0.6), 0.06, (20, 20, 20)), identity(("free", "wall", "sofa"))
+    truth, classes = lattice((-0.6, -0.6, -0.6), 0.06, (20, 20, 20)), map_each_to_itself(("free", "wall", "sofa"))
     settings = config.load(None)
-    fused, count = predictions.of_frames(tmp_path, Poses(np.arange(2.0), T), settings, truth, classes)
+    fused, count = predictions.predict_from_frames(tmp_path, Poses(np.arange(2.0), T), settings, truth, classes)
     assert count == 2
     semantics = np.eye(2, dtype=np.float32)[(np.arange(40) >= 25).astype(int)]
-    expected = predictions.of_gaussians(world, semantics, settings, Alignment.identity(), truth)
+    expected = predictions.predict_from_gaussians(world, semantics, settings, TrajectoryAlignment.identity(), truth)
     assert agreement(fused.occupied, expected.occupied) > 0.99
     both = fused.occupied & expected.occupied
     assert fused.labels is not None
@@ -210,7 +228,7 @@ def _assert_ply_frames_are_the_same(
     folder.mkdir()
     for index, rows in enumerate((slice(0, 25), slice(25, 40))):
         write_standard_ply(folder / f"{index:06d}.ply", _seen_from(world[rows], T[index]))
-    fused, _ = predictions.of_frames(folder, Poses(np.arange(2.0), T), config.load(None), truth, NO_CLASSES)
+    fused, _ = predictions.predict_from_frames(folder, Poses(np.arange(2.0), T), config.load(None), truth, NO_CLASSES)
     assert fused.labels is None
     assert agreement(fused.occupied, expected.occupied) > 0.99
 
@@ -219,22 +237,22 @@ def test_unusable_frames_are_told_in_a_sentence(tmp_path: Path) -> None:
     poses, settings, classes = Poses(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))), config.load(None), NO_CLASSES
     truth = lattice(shape=(4, 4, 4))
     with pytest.raises(FreeOccError, match="no per-frame Gaussians"):
-        predictions.of_frames(tmp_path, poses, settings, truth, classes)
+        predictions.predict_from_frames(tmp_path, poses, settings, truth, classes)
     arrays = {
         "means": np.zeros((3, 3)), "scales": np.ones((3, 3)), "quats_wxyz": np.ones((3, 4)), "opacities": np.ones(3)
     }  # fmt: skip
     np.savez(tmp_path / "7.npz", **arrays)
     with pytest.raises(FreeOccError, match="number of a frame with a true pose"):
-        predictions.of_frames(tmp_path, poses, settings, truth, classes)
+        predictions.predict_from_frames(tmp_path, poses, settings, truth, classes)
     np.savez(tmp_path / "1.npz", **(arrays | {"scales": np.ones((2, 3))}))
     with pytest.raises(FreeOccError, match=r"'scales' of .*\(3, 3\)"):
-        predictions.of_frames(tmp_path, poses, settings, truth, classes)
+        predictions.predict_from_frames(tmp_path, poses, settings, truth, classes)
     np.savez(tmp_path / "1.npz", **arrays, labels=np.full(3, 9))
     with pytest.raises(FreeOccError, match="label 9, but 0 classes"):
-        predictions.of_frames(tmp_path, poses, settings, truth, classes)
+        predictions.predict_from_frames(tmp_path, poses, settings, truth, classes)
     np.savez(tmp_path / "1.npz", **arrays, semantics=np.ones((3, 5)))
     with pytest.raises(FreeOccError, match="'semantics'"):
-        predictions.of_frames(tmp_path, poses, settings, truth, classes)
+        predictions.predict_from_frames(tmp_path, poses, settings, truth, classes)
 
 
 # Finished grids
@@ -247,24 +265,27 @@ def grid_file(path: Path, labels: NDArray[np.uint8], origin: object, size: float
 
 def test_a_grid_is_read_where_its_voxels_are(tmp_path: Path) -> None:
     labels = np.random.default_rng(0).choice(np.array([0, 1, 2, 255], np.uint8), (6, 7, 8))
-    classes = identity(("free", "wall", "sofa"))
-    same, note = predictions.of_grid(
-        grid_file(tmp_path / "g.npz", labels, ORIGIN), Alignment.identity(), lattice(shape=(6, 7, 8)), classes
+    classes = map_each_to_itself(("free", "wall", "sofa"))
+    same, note = predictions.predict_from_grid(
+        grid_file(tmp_path / "g.npz", labels, ORIGIN), TrajectoryAlignment.identity(), lattice(shape=(6, 7, 8)), classes
     )
     np.testing.assert_array_equal(same.occupied, (labels == 1) | (labels == 2))
     np.testing.assert_array_equal(same.labels, np.where(labels == 255, 0, labels))
     assert note == ""
-    shifted, note = predictions.of_grid(
+    shifted, note = predictions.predict_from_grid(
         grid_file(tmp_path / "g.npz", labels, ORIGIN + (0.08, 0, -0.16)),
-        Alignment.identity(),
+        TrajectoryAlignment.identity(),
         lattice(shape=(6, 7, 8)),
         classes,
     )
     np.testing.assert_array_equal(shifted.occupied[1:, :, :6], same.occupied[:-1, :, 2:])
     assert not shifted.occupied[0].any()
     assert note == ""
-    _, note = predictions.of_grid(
-        grid_file(tmp_path / "g.npz", labels, ORIGIN + 0.02), Alignment.identity(), lattice(shape=(6, 7, 8)), classes
+    _, note = predictions.predict_from_grid(
+        grid_file(tmp_path / "g.npz", labels, ORIGIN + 0.02),
+        TrajectoryAlignment.identity(),
+        lattice(shape=(6, 7, 8)),
+        classes,
     )
     assert "up to 0.25 voxels apart" in note
 
@@ -273,7 +294,7 @@ def test_a_grid_is_moved_by_its_alignment(tmp_path: Path) -> None:
     labels = np.random.default_rng(1).choice(np.array([0, 1], np.uint8), (10, 10, 4))
     truth = lattice((-0.4, -0.4, 0), 0.08, (10, 10, 4))
     path = grid_file(tmp_path / "g.npz", labels, truth.origin)
-    turned, _ = predictions.of_grid(path, Alignment(1.0, QUARTER, np.zeros(3)), truth, NO_CLASSES)
+    turned, _ = predictions.predict_from_grid(path, TrajectoryAlignment(1.0, QUARTER, np.zeros(3)), truth, NO_CLASSES)
     np.testing.assert_array_equal(turned.occupied, np.rot90(labels, 1, axes=(0, 1)) == 1)
     assert turned.labels is None
 
@@ -284,8 +305,8 @@ def test_an_export_is_scored_like_the_map_it_shows(room: Any, tmp_path: Path) ->
     export_map(room, "npz", tmp_path / "room.npz")
     origin = np.load(tmp_path / "room.npz")["origin"]
     shape = np.load(tmp_path / "room.npz")["occupancy"].shape
-    claimed, _ = predictions.of_grid(
-        tmp_path / "room.npz", Alignment.identity(), lattice(origin, shape=shape), NO_CLASSES
+    claimed, _ = predictions.predict_from_grid(
+        tmp_path / "room.npz", TrajectoryAlignment.identity(), lattice(origin, shape=shape), NO_CLASSES
     )
     assert claimed.occupied.sum() == len(room.occupancy.occupied_voxels())
 
@@ -293,34 +314,36 @@ def test_an_export_is_scored_like_the_map_it_shows(room: Any, tmp_path: Path) ->
 def test_grids_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     labels = np.zeros((3, 3, 3), np.uint8)
     with pytest.raises(FreeOccError, match=r"voxels of 0\.1 m, the ground truth of 0\.08 m"):
-        predictions.of_grid(
-            grid_file(tmp_path / "g.npz", labels, ORIGIN, 0.1), Alignment.identity(), lattice(), NO_CLASSES
+        predictions.predict_from_grid(
+            grid_file(tmp_path / "g.npz", labels, ORIGIN, 0.1), TrajectoryAlignment.identity(), lattice(), NO_CLASSES
         )
     np.savez(tmp_path / "flat.npz", labels=labels[0], origin=ORIGIN, voxel_size=np.float64(0.08))
     with pytest.raises(FreeOccError, match="whole numbers"):
-        predictions.of_grid(tmp_path / "flat.npz", Alignment.identity(), lattice(), NO_CLASSES)
+        predictions.predict_from_grid(tmp_path / "flat.npz", TrajectoryAlignment.identity(), lattice(), NO_CLASSES)
     np.savez(tmp_path / "bare.npz", grid=labels, origin=ORIGIN, voxel_size=np.float64(0.08))
     with pytest.raises(FreeOccError, match="no 'labels'"):
-        predictions.of_grid(tmp_path / "bare.npz", Alignment.identity(), lattice(), NO_CLASSES)
+        predictions.predict_from_grid(tmp_path / "bare.npz", TrajectoryAlignment.identity(), lattice(), NO_CLASSES)
 
 
 def test_another_systems_map_is_scored_through_its_trajectory(room: Any, tmp_path: Path) -> None:
     """The room's Gaussians as a 3DGS PLY, in a world of another scale, with that world's trajectory."""
-    other = Alignment(0.5, turn(7), np.array((3.0, 4.0, 5.0)))
-    from freeocc3d.gaussians.anchors import aligned
+    other = TrajectoryAlignment(0.5, turn(7), np.array((3.0, 4.0, 5.0)))
+    from freeocc3d.gaussians.anchors import align_gaussians
 
     ply = write_standard_ply(
-        tmp_path / "map.ply", aligned(room.gaussians, other.scale, other.rotation, other.translation)
+        tmp_path / "map.ply", align_gaussians(room.gaussians, other.scale, other.rotation, other.translation)
     )
-    own = estimated_poses(room.trajectory)
+    own = select_estimated_poses(room.trajectory)
     theirs = Poses(own.timestamps, other.poses(own.T_world_cam))
-    direct = predictions.of_gaussians(room.gaussians, None, config.load(None), Alignment.identity(), lattice())
+    direct = predictions.predict_from_gaussians(
+        room.gaussians, None, config.load(None), TrajectoryAlignment.identity(), lattice()
+    )
     scene = scoring.score_gaussians(ply, lattice(), NO_CLASSES, theirs, own, "sim3")
     assert scene.alignment.scale == pytest.approx(2.0)
     assert agreement(scene.predicted.occupied, direct.occupied) > 0.995
     wrong = scoring.score_gaussians(ply, lattice(), NO_CLASSES, theirs, own, "se3")
     assert agreement(wrong.predicted.occupied, direct.occupied) < 0.5
-    assert align(theirs, own, "sim3").scale == pytest.approx(2.0)
+    assert align_trajectories(theirs, own, "sim3").scale == pytest.approx(2.0)
     with pytest.raises(FreeOccError, match="--trajectory"):
         scoring.score_gaussians(ply, lattice(), NO_CLASSES, None, own)
     with pytest.raises(FreeOccError, match="--poses"):

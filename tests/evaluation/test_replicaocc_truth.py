@@ -92,7 +92,7 @@ def test_an_analytic_scene_is_matched_exactly() -> None:
     """Cameras along x from -0.5 to 0.5: the wall's voxels lie at z index 25 (2.00 … 2.08), the post's at 15 (1.20 …
     1.28) from x = 0.25 to 0.35; whoever looks past the post sees the space behind it."""
     capture = Corner([-0.5, 0.0, 0.5])
-    truth = replicaocc_truth.from_capture(capture, replicaocc_truth.Options(pixel_stride=1, frame_stride=1))
+    truth = replicaocc_truth.build_truth_from_capture(capture, replicaocc_truth.Options(pixel_stride=1, frame_stride=1))
     low = np.rint(truth.origin / 0.08).astype(int)
     assert low[2] == 15
     assert truth.shape[2] == 11
@@ -121,7 +121,7 @@ def test_an_analytic_scene_is_matched_exactly() -> None:
 )
 def test_the_builder_agrees_with_the_protocol_written_out(changes: dict) -> None:
     capture, options = Corner([-0.21, 0.02, 0.13, 0.3]), replicaocc_truth.Options(**changes)
-    built, expected = replicaocc_truth.from_capture(capture, options), plain(capture, options)
+    built, expected = replicaocc_truth.build_truth_from_capture(capture, options), plain(capture, options)
     np.testing.assert_allclose(built.origin, expected.origin)
     np.testing.assert_array_equal(built.labels, expected.labels)
     assert built.classes == ("free", "wall", "door", "post")
@@ -130,7 +130,7 @@ def test_the_builder_agrees_with_the_protocol_written_out(changes: dict) -> None
 def test_within_fills_the_neighbours_of_what_a_point_lies_in() -> None:
     capture = Corner([0.0])
     inside, within = (
-        replicaocc_truth.from_capture(
+        replicaocc_truth.build_truth_from_capture(
             capture, replicaocc_truth.Options(pixel_stride=1, frame_stride=1, dilation=50, fill=fill)
         )
         for fill in ("inside", "within")
@@ -148,21 +148,21 @@ def test_within_fills_the_neighbours_of_what_a_point_lies_in() -> None:
 
 def test_dilation_and_range_change_only_what_is_known() -> None:
     capture = Corner([-0.2, 0.2])
-    usual = replicaocc_truth.from_capture(capture, replicaocc_truth.Options(frame_stride=1))
-    grown = replicaocc_truth.from_capture(capture, replicaocc_truth.Options(frame_stride=1, dilation=2))
+    usual = replicaocc_truth.build_truth_from_capture(capture, replicaocc_truth.Options(frame_stride=1))
+    grown = replicaocc_truth.build_truth_from_capture(capture, replicaocc_truth.Options(frame_stride=1, dilation=2))
     known = usual.labels != 255
     assert ((grown.labels != 255) & ~known).any()
     np.testing.assert_array_equal(grown.labels[known], usual.labels[known])
-    near = replicaocc_truth.from_capture(capture, replicaocc_truth.Options(frame_stride=1, max_range=1.5))
+    near = replicaocc_truth.build_truth_from_capture(capture, replicaocc_truth.Options(frame_stride=1, max_range=1.5))
     assert set(np.unique(near.labels)) <= {0, 3, 255}
     with pytest.raises(FreeOccError, match=r"measured nothing within 0\.5 m"):
-        replicaocc_truth.from_capture(capture, replicaocc_truth.Options(max_range=0.5))
+        replicaocc_truth.build_truth_from_capture(capture, replicaocc_truth.Options(max_range=0.5))
 
 
 def test_few_points_are_left_out_if_asked() -> None:
     capture = Corner([0.0])
-    usual = replicaocc_truth.from_capture(capture, replicaocc_truth.Options(frame_stride=1))
-    sure = replicaocc_truth.from_capture(capture, replicaocc_truth.Options(frame_stride=1, min_points=2))
+    usual = replicaocc_truth.build_truth_from_capture(capture, replicaocc_truth.Options(frame_stride=1))
+    sure = replicaocc_truth.build_truth_from_capture(capture, replicaocc_truth.Options(frame_stride=1, min_points=2))
     counts = [int(((t.labels > 0) & (t.labels < 255)).sum()) for t in (usual, sure)]
     assert 0 < counts[1] < counts[0]
 
@@ -183,10 +183,10 @@ def test_votes_do_not_depend_on_the_order_of_frames_or_on_merging(monkeypatch: p
 
 
 def test_a_capture_without_class_images_gives_geometry(tmp_path: Path) -> None:
-    truth = replicaocc_truth.build(write_seven_scenes(tmp_path / "scan", 4), ["pixel_stride=1"])
+    truth = replicaocc_truth.build_truth(write_seven_scenes(tmp_path / "scan", 4), ["pixel_stride=1"])
     assert truth.classes == ("free", "occupied")
     assert set(np.unique(truth.labels)) == {0, 1, 255}
-    classed = replicaocc_truth.build(write_replica(tmp_path / "classed", 4, classes=True), ["pixel_stride=1"])
+    classed = replicaocc_truth.build_truth(write_replica(tmp_path / "classed", 4, classes=True), ["pixel_stride=1"])
     assert classed.classes == ("free", "sofa", "lamp")
     assert {1, 2} <= set(np.unique(classed.labels))
 
@@ -194,18 +194,18 @@ def test_a_capture_without_class_images_gives_geometry(tmp_path: Path) -> None:
 def test_what_cannot_be_built_is_told_in_a_sentence(tmp_path: Path) -> None:
     bare = write_seven_scenes(tmp_path / "bare", 3, poses=False)
     with pytest.raises(FreeOccError, match="has no poses"):
-        replicaocc_truth.build(bare)
+        replicaocc_truth.build_truth(bare)
     scan = write_seven_scenes(tmp_path / "scan", 3)
     with pytest.raises(ConfigError, match="did you mean 'pixel_stride'"):
-        replicaocc_truth.build(scan, ["pixelstride=3"])
+        replicaocc_truth.build_truth(scan, ["pixelstride=3"])
     with pytest.raises(ConfigError, match="inside or within"):
-        replicaocc_truth.build(scan, ["fill=near"])
+        replicaocc_truth.build_truth(scan, ["fill=near"])
     with pytest.raises(ConfigError, match="name=value"):
-        replicaocc_truth.build(scan, ["fill"])
+        replicaocc_truth.build_truth(scan, ["fill"])
     with pytest.raises(FreeOccError, match="too many for memory"):
-        replicaocc_truth.build(scan, ["voxel_size=0.0005"])
+        replicaocc_truth.build_truth(scan, ["voxel_size=0.0005"])
     truncate(scan / "frame-000001.depth.png")
-    assert replicaocc_truth.build(scan, ["pixel_stride=1"]).labels.size  # the other frames are used
+    assert replicaocc_truth.build_truth(scan, ["pixel_stride=1"]).labels.size  # the other frames are used
 
 
 def agreement(name: str, *overrides: str) -> tuple[float, float]:
@@ -213,7 +213,7 @@ def agreement(name: str, *overrides: str) -> tuple[float, float]:
     call occupied that has the same class."""
     folder = data_folder() / name
     shipped = load_ground_truth(folder / "ground_truth.npz")
-    built = replicaocc_truth.build(folder, ["max_range=6", "lattice_offset=[0, 0, -0.04]", *overrides])
+    built = replicaocc_truth.build_truth(folder, ["max_range=6", "lattice_offset=[0, 0, -0.04]", *overrides])
     low = np.rint((built.origin - shipped.origin) / 0.08).astype(int)
     np.testing.assert_allclose(shipped.origin + low * 0.08, built.origin, atol=1e-6)  # the same lattice
     own = np.full(shipped.shape, 255, np.uint8)
@@ -238,7 +238,9 @@ def test_the_room_built_from_its_frames_agrees_with_its_exact_truth() -> None:
     capture = open_capture("builtin:room", Options(stride=4), {"synthetic": {"width": 320, "height": 240}})
     exact = capture.ground_truth()
     offset = tuple(float(c) for c in np.mod(exact["origin"], 0.08))
-    built = replicaocc_truth.from_capture(capture, replicaocc_truth.Options(pixel_stride=1, lattice_offset=offset))
+    built = replicaocc_truth.build_truth_from_capture(
+        capture, replicaocc_truth.Options(pixel_stride=1, lattice_offset=offset)
+    )
     low = np.rint((built.origin - exact["origin"]) / 0.08).astype(int)
     np.testing.assert_allclose(exact["origin"] + low * 0.08, built.origin, atol=1e-6)
     common = tuple(slice(max(int(o), 0), int(o) + n) for o, n in zip(low, built.shape, strict=True))

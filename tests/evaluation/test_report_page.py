@@ -13,11 +13,11 @@ import pytest
 from freeocc3d.core.errors import DependencyError, ExportError
 from freeocc3d.evaluation import report_page
 from freeocc3d.evaluation.confusion import Prediction
-from freeocc3d.evaluation.scoring import Evaluation, Scene
-from freeocc3d.evaluation.trajectory_errors import trajectory_errors
+from freeocc3d.evaluation.scoring import Evaluation, ScoredScene
+from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors
 from freeocc3d.evaluation.true_occupancy import GroundTruth
-from freeocc3d.tracking.trajectory_alignment import Alignment, Poses
-from freeocc3d.viewer.palette import class_colors
+from freeocc3d.tracking.trajectory_alignment import Poses, TrajectoryAlignment
+from freeocc3d.viewer.palette import assign_class_colors
 
 CLASSES = ("wall", 'a <b>"sofa"</b> & co', "lamp")
 VOID = {"meta", "img", "br", "link"}
@@ -67,7 +67,7 @@ class Page(HTMLParser):
         return [cv2.imdecode(np.frombuffer(base64.b64decode(a), np.uint8), 1)[..., ::-1] for a in found]
 
 
-def room(name: str = "room", classes: bool = True, way: bool = False) -> Scene:
+def room(name: str = "room", classes: bool = True, way: bool = False) -> ScoredScene:
     """A floor of walls' class, a sofa on it of which a part is missed and a part is called a lamp, an invented block;
     what the truth does not know is predicted occupied everywhere."""
     true = np.zeros((20, 12, 10), np.uint8)
@@ -88,15 +88,15 @@ def room(name: str = "room", classes: bool = True, way: bool = False) -> Scene:
         off = T.copy()
         off[20:, 1, 3] += 0.03
         times = np.arange(40.0)
-        errors = trajectory_errors(Poses(times, off), Poses(times, T), Alignment.identity())
+        errors = measure_trajectory_errors(Poses(times, off), Poses(times, T), TrajectoryAlignment.identity())
     truth = GroundTruth(true, np.zeros(3), 0.1, ("free", *CLASSES))
-    return Scene(
+    return ScoredScene(
         name, truth, Prediction(occupied, labels if classes else None),
-        Alignment.identity(), errors, 40, 40 if way else None, np.array((0.0, 0.0, 1.0)), ("A note & more.",),
+        TrajectoryAlignment.identity(), errors, 40, 40 if way else None, np.array((0.0, 0.0, 1.0)), ("A note & more.",),
     )  # fmt: skip
 
 
-def written(path: Path, *scenes: Scene, listed: bool = False) -> Page:
+def written(path: Path, *scenes: ScoredScene, listed: bool = False) -> Page:
     report_page.write_report(Evaluation(scenes, CLASSES, "none", listed), path, overwrite=True)
     return Page(path)
 
@@ -150,7 +150,7 @@ def test_the_page_needs_nothing_beside_it_and_is_the_same_each_time(tmp_path: Pa
 
 def test_pictures_show_truth_prediction_and_difference_alike_framed(tmp_path: Path) -> None:
     truth, prediction, difference = written(tmp_path / "r.html", room()).pictures()
-    sofa, lamp = class_colors(list(CLASSES))[2:4].tolist()
+    sofa, lamp = assign_class_colors(list(CLASSES))[2:4].tolist()
     assert share(truth, sofa) == pytest.approx(3 * share(prediction, sofa), rel=0.1)
     assert share(truth, lamp) == 0.0  # what the truth does not know is not drawn
     assert share(prediction, lamp) == pytest.approx(share(prediction, sofa), rel=0.1)
@@ -171,9 +171,9 @@ def test_every_voxel_has_one_difference() -> None:
     occupied = np.array([0, 1, 0, 1, 1, 1], bool).reshape(6, 1, 1)
     labels = np.array([0, 1, 0, 1, 2, 0]).reshape(6, 1, 1)
     names = ["", *report_page.DIFFERENCES]
-    said = [names[k] for k in report_page.differences(true, occupied, labels).ravel()]
+    said = [names[k] for k in report_page.compare_voxels(true, occupied, labels).ravel()]
     assert said == ["", "invented", "missed", "right", "wrong class", "wrong class"]
-    plain = [names[k] for k in report_page.differences(true, occupied, None).ravel()]
+    plain = [names[k] for k in report_page.compare_voxels(true, occupied, None).ravel()]
     assert plain == ["", "invented", "missed", "right", "right", "right"]
 
 
@@ -200,7 +200,7 @@ def test_without_rendering_the_page_is_written_and_says_so(tmp_path: Path, monke
     def fails(*_: object) -> dict[str, bytes]:
         raise DependencyError("Pictures need pyvista with EGL and GL: apt-get install libegl1 libgl1.")
 
-    monkeypatch.setattr(report_page, "grid_pictures", fails)
+    monkeypatch.setattr(report_page, "draw_grids", fails)
     page = written(tmp_path / "r.html", room())
     assert page.pictures() == []
     assert "There are no pictures. Pictures need pyvista" in page.text

@@ -8,7 +8,7 @@ from helpers import data_folder
 
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.evaluation.ground_truth import load_ground_truth
-from freeocc3d.evaluation.scored_classes import EMBODIEDOCC, SHARED, identity, load_class_map
+from freeocc3d.evaluation.scored_classes import EMBODIEDOCC, SHARED, load_class_map, map_each_to_itself
 from freeocc3d.evaluation.true_occupancy import GroundTruth
 
 EXAMPLE = Path(__file__).parents[2] / "configs" / "classes" / "house_to_embodiedocc.yaml"
@@ -43,7 +43,7 @@ def test_a_class_that_the_file_does_not_know_is_named(tmp_path: Path) -> None:
 
 def test_every_class_stands_for_itself_without_a_file() -> None:
     original = truth([0, 1, 2, 255], ("free", "wall", "sofa"))
-    mapped = identity(original.classes).apply(original, "")
+    mapped = map_each_to_itself(original.classes).apply(original, "")
     np.testing.assert_array_equal(mapped.labels, original.labels)
     assert mapped.classes == original.classes
 

@@ -14,17 +14,17 @@ import freeocc3d
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.evaluation.confusion import Prediction
 from freeocc3d.evaluation.ground_truth import load_ground_truth, save_ground_truth
-from freeocc3d.evaluation.scored_classes import identity
-from freeocc3d.evaluation.scoring import Asked, Evaluation, Scene, evaluate
+from freeocc3d.evaluation.scored_classes import map_each_to_itself
+from freeocc3d.evaluation.scoring import Evaluation, ScoredScene, ScoringRequest, evaluate_scenes
 from freeocc3d.evaluation.true_occupancy import GroundTruth
-from freeocc3d.tracking.trajectory_alignment import Alignment
+from freeocc3d.tracking.trajectory_alignment import TrajectoryAlignment
 
 CLASSES = Path(__file__).parents[2] / "configs" / "classes" / "house_to_embodiedocc.yaml"
 
 
 def scene(
     labels: list[int], claimed: list[int] | None, classes: tuple[str, ...], name: str = "a", frames: object = None
-) -> Scene:
+) -> ScoredScene:
     """A scene of a row of voxels; claims are classes, 99 = occupied by no known class."""
     true = np.array(labels, np.uint8).reshape(-1, 1, 1)
     mask = None if frames is None else np.array(frames, bool).reshape(true.shape)
@@ -32,9 +32,9 @@ def scene(
     predicted = Prediction(
         (own > 0) & (own < 255), None if claimed is None else np.where(own == 99, 0, own).astype("u1")
     )
-    return Scene(
-        name, GroundTruth(true, np.zeros(3), 0.1, ("free", *classes), mask), predicted, Alignment.identity(), None,
-        None, None, np.array((0.0, 0.0, 1.0)), (),
+    return ScoredScene(
+        name, GroundTruth(true, np.zeros(3), 0.1, ("free", *classes), mask), predicted, TrajectoryAlignment.identity(),
+        None, None, None, np.array((0.0, 0.0, 1.0)), (),
     )  # fmt: skip
 
 
@@ -142,7 +142,9 @@ def test_a_shifted_and_a_swapped_truth_score_what_numpy_counts(tmp_path: Path) -
     def scored(labels: Any, origin: Any = truth.origin) -> dict[str, Any]:
         save_ground_truth(GroundTruth(labels, origin, 0.08, truth.classes), tmp_path / "claim.npz", True)
         save_ground_truth(truth, tmp_path / "truth.npz", True)
-        return evaluate(Asked(grid=tmp_path / "claim.npz", ground_truths=[tmp_path / "truth.npz"])).to_json()
+        return evaluate_scenes(
+            ScoringRequest(grid=tmp_path / "claim.npz", ground_truths=[tmp_path / "truth.npz"])
+        ).to_json()
 
     occupied = known & (truth.labels > 0)
     for axis in range(3):
@@ -163,16 +165,16 @@ def test_a_shifted_and_a_swapped_truth_score_what_numpy_counts(tmp_path: Path) -
 
 
 def test_maps_are_pooled_and_a_split_must_be_whole(bedroom: Path, tmp_path: Path) -> None:
-    one = evaluate(Asked(maps=[bedroom]))
-    two = evaluate(Asked(maps=[bedroom, bedroom]))
+    one = evaluate_scenes(ScoringRequest(maps=[bedroom]))
+    two = evaluate_scenes(ScoringRequest(maps=[bedroom, bedroom]))
     np.testing.assert_array_equal(two.scores.matrix, 2 * one.scores.matrix)
     assert two.to_json()["frames_with_pose"] == 60
     assert two.ate_rmse_m == pytest.approx(one.ate_rmse_m)
     (tmp_path / "split.txt").write_text("bedroom\n")
-    assert evaluate(Asked(maps=[bedroom], split=tmp_path / "split.txt")).scores.iou == one.scores.iou
+    assert evaluate_scenes(ScoringRequest(maps=[bedroom], split=tmp_path / "split.txt")).scores.iou == one.scores.iou
     (tmp_path / "split.txt").write_text("bedroom\nscene0011_00\n")
     with pytest.raises(FreeOccError, match="scene0011_00"):
-        evaluate(Asked(maps=[bedroom], split=tmp_path / "split.txt"))
+        evaluate_scenes(ScoringRequest(maps=[bedroom], split=tmp_path / "split.txt"))
 
 
 def test_truth_and_maps_that_do_not_fit_are_told_in_a_sentence(bedroom: Path, tmp_path: Path) -> None:
@@ -214,15 +216,17 @@ def test_truth_and_maps_that_do_not_fit_are_told_in_a_sentence(bedroom: Path, tm
 def test_a_map_that_misses_the_truth_altogether_says_so(bedroom: Path, tmp_path: Path) -> None:
     arrays = dict(np.load(data_folder() / "house" / "bedroom" / "ground_truth.npz"))
     np.savez(tmp_path / "away.npz", **{**arrays, "origin": arrays["origin"] + 1000})
-    result = evaluate(Asked(maps=[bedroom], ground_truths=[tmp_path / "away.npz"]))
+    result = evaluate_scenes(ScoringRequest(maps=[bedroom], ground_truths=[tmp_path / "away.npz"]))
     assert result.scores.iou == 0
     assert any("no voxel inside the truth" in note for note in result.notes)
-    assert not any("no voxel inside the truth" in note for note in evaluate(Asked(maps=[bedroom])).notes)
+    assert not any(
+        "no voxel inside the truth" in note for note in evaluate_scenes(ScoringRequest(maps=[bedroom])).notes
+    )
 
 
 def test_the_threshold_can_be_swept_without_mapping_again(bedroom: Path) -> None:
-    strict = evaluate(Asked(maps=[bedroom], overrides=["occupancy.threshold=0.9"]))
-    usual = evaluate(Asked(maps=[bedroom]))
+    strict = evaluate_scenes(ScoringRequest(maps=[bedroom], overrides=["occupancy.threshold=0.9"]))
+    usual = evaluate_scenes(ScoringRequest(maps=[bedroom]))
     assert strict.scores.recall < usual.scores.recall
     assert strict.scores.precision > usual.scores.precision
 
@@ -238,5 +242,5 @@ def test_the_ground_truth_command_writes_what_evaluate_reads(tmp_path: Path) -> 
         "ground-truth", bedroom, "-o", tmp_path / "b.npz", "--set", "maxrange=6"
     )
     assert run("ground-truth", bedroom, "-o", tmp_path / "b.npz", "--protocol", "other", code=2).stderr
-    classes = identity(load_ground_truth(out).classes)
+    classes = map_each_to_itself(load_ground_truth(out).classes)
     assert len(classes.classes) == 39

@@ -12,8 +12,8 @@ from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.transforms import quats_to_rotations
 from freeocc3d.core.tum_files import write_tum
 from freeocc3d.core.types import Trajectory
-from freeocc3d.evaluation.trajectory_errors import pairs_by_path, relative_error, trajectory_errors
-from freeocc3d.tracking.trajectory_alignment import Alignment, Poses, align, read_poses
+from freeocc3d.evaluation.trajectory_errors import measure_relative_error, measure_trajectory_errors, pair_by_path
+from freeocc3d.tracking.trajectory_alignment import Poses, TrajectoryAlignment, align_trajectories, read_poses
 
 
 def walk(n: int, seed: int, rests: bool = False) -> NDArray[np.float64]:
@@ -55,7 +55,7 @@ def test_ate_is_the_root_mean_square_of_what_alignment_leaves() -> None:
     estimated[:, 2, 3] = 0.03, -0.03, 0.03, -0.03
     # Corners lifted and lowered in turn: no rigid motion makes that better.
     a, b = Poses(np.arange(4.0), estimated), Poses(np.arange(4.0), true)
-    errors = trajectory_errors(a, b, align(a, b))
+    errors = measure_trajectory_errors(a, b, align_trajectories(a, b))
     assert errors.ate_rmse_m == pytest.approx(0.03, rel=1e-3)
     assert errors.to_json()["ate_m"]["max"] == pytest.approx(0.03, rel=1e-3)
 
@@ -71,7 +71,7 @@ def test_a_mirrored_trajectory_keeps_its_error() -> None:
     mirrored = true.copy()
     mirrored[:, 0, 3] *= -1
     a, b = Poses(np.arange(len(true), dtype=float), mirrored), Poses(np.arange(len(true), dtype=float), true)
-    assert trajectory_errors(a, b, align(a, b)).ate_rmse_m == pytest.approx(0.2)
+    assert measure_trajectory_errors(a, b, align_trajectories(a, b)).ate_rmse_m == pytest.approx(0.2)
 
 
 def test_a_steady_drift_is_the_relative_error_over_its_distance() -> None:
@@ -79,14 +79,14 @@ def test_a_steady_drift_is_the_relative_error_over_its_distance() -> None:
     true[:, 0, 3] = 0.02 * np.arange(51)
     estimated = true.copy()
     estimated[:, 0, 3] *= 1.05
-    found = relative_error(estimated, true, 0.5)
+    found = measure_relative_error(estimated, true, 0.5)
     assert found is not None
     assert found.rotation_rmse_deg == pytest.approx(0, abs=1e-6)
     # 26 frames have one 0.5 m ahead; for two more the last frame is within a tenth of that.
     apart = np.concatenate((np.full(26, 0.5), (0.48, 0.46)))
     assert found.pairs == len(apart)
     assert found.translation_rmse_m == pytest.approx(0.05 * np.sqrt((apart**2).mean()))
-    assert relative_error(estimated, true, 2.0) is None
+    assert measure_relative_error(estimated, true, 2.0) is None
 
 
 def test_a_steady_turn_is_the_relative_rotation() -> None:
@@ -96,7 +96,7 @@ def test_a_steady_turn_is_the_relative_rotation() -> None:
     estimated = true.copy()
     estimated[:, 0, 0] = estimated[:, 1, 1] = np.cos(angle)
     estimated[:, 1, 0], estimated[:, 0, 1] = np.sin(angle), -np.sin(angle)
-    found = relative_error(estimated, true, 0.5)
+    found = measure_relative_error(estimated, true, 0.5)
     assert found is not None
     assert found.rotation_rmse_deg == pytest.approx(10.0)
 
@@ -109,7 +109,7 @@ def test_the_pairs_are_those_of_a_plain_search() -> None:
         off = np.abs(path[i + 1 :] - path[i] - 0.5)
         if off.min() <= 0.05:
             expected.append((i, i + 1 + int(np.argmin(off))))
-    np.testing.assert_array_equal(np.stack(pairs_by_path(centers, 0.5), axis=1), expected)
+    np.testing.assert_array_equal(np.stack(pair_by_path(centers, 0.5), axis=1), expected)
 
 
 def test_the_order_of_frames_does_not_count() -> None:
@@ -117,15 +117,17 @@ def test_the_order_of_frames_does_not_count() -> None:
     estimated = disturbed(true, seed=1)
     times = np.arange(50.0)
     a, b = Poses(times, estimated), Poses(times, true)
-    shuffled = align(Poses(times, estimated[order]), Poses(times, true[order]))
-    np.testing.assert_allclose(shuffled.rotation, align(a, b).rotation, atol=1e-12)
-    np.testing.assert_allclose(shuffled.translation, align(a, b).translation, atol=1e-12)
+    shuffled = align_trajectories(Poses(times, estimated[order]), Poses(times, true[order]))
+    np.testing.assert_allclose(shuffled.rotation, align_trajectories(a, b).rotation, atol=1e-12)
+    np.testing.assert_allclose(shuffled.translation, align_trajectories(a, b).translation, atol=1e-12)
 
 
 def test_trajectories_of_other_recordings_are_refused() -> None:
     true = walk(10, seed=0)
     with pytest.raises(FreeOccError, match="true: 10 from 1000"):
-        trajectory_errors(Poses(np.arange(10.0), true), Poses(1000 + np.arange(10.0), true), Alignment.identity())
+        measure_trajectory_errors(
+            Poses(np.arange(10.0), true), Poses(1000 + np.arange(10.0), true), TrajectoryAlignment.identity()
+        )
 
 
 @pytest.mark.parametrize("how", ["se3", "sim3", "none"])
@@ -141,8 +143,8 @@ def test_errors_agree_with_evo_on_the_same_files(tmp_path: Path, how: str, seed:
         write(tmp_path / "true.txt", times, true),
     )
     own_est, own_true = (read_poses(path) for path in files)
-    alignment = align(own_est, own_true, how)
-    own = trajectory_errors(own_est, own_true, alignment)
+    alignment = align_trajectories(own_est, own_true, how)
+    own = measure_trajectory_errors(own_est, own_true, alignment)
 
     evo_est, evo_true = (file_interface.read_tum_trajectory_file(path) for path in files)
     evo_true, evo_est = sync.associate_trajectories(evo_true, evo_est, max_diff=0.02)

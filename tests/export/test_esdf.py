@@ -8,7 +8,7 @@ from test_openvdb_files import read
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.export import esdf, export_map
-from freeocc3d.export.export_frames import placed
+from freeocc3d.export.export_frames import place_voxels
 
 
 def scene():
@@ -49,7 +49,7 @@ def test_distances_are_exact_and_in_metres(tmp_path, unknown) -> None:
 def test_in_another_frame_the_arrays_say_where_they_are(tmp_path) -> None:
     scan_map = map_of(scene())
     export_map(scan_map, "esdf", tmp_path / "esdf.npz")
-    there = placed(scan_map, "gravity").occupancy
+    there = place_voxels(scan_map, "gravity").occupancy
     with np.load(tmp_path / "esdf.npz") as file:
         at = np.argwhere(file["state"] == 1)
         found = file["origin"] + (at + 0.5) * float(file["voxel_size"])

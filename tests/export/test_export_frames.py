@@ -10,7 +10,7 @@ from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.core.transforms import transform
 from freeocc3d.core.types import FREE, OCCUPIED, Occupancy
 from freeocc3d.export import export_map
-from freeocc3d.export.export_frames import placed
+from freeocc3d.export.export_frames import place_voxels
 
 CAMERA_TO_UP = np.array([(0.0, 0, 1, 0), (-1, 0, 0, 0), (0, -1, 0, 1.52), (0, 0, 0, 1)])
 """A level camera at 1.52 m: x right, y down, z forward to x forward, y left, z up."""
@@ -36,9 +36,9 @@ VOXELS, SPACE = [(0, 14, 20), (1, 14, 20), (3, 5, 21)], [(0, 13, 20), (0, 12, 20
 def test_a_voxel_ahead_below_and_right_is_there_in_each_frame() -> None:
     scan_map = map_of(occupancy_of(VOXELS, free=SPACE))
     center = scan_map.occupancy.centers(scan_map.occupancy.occupied_voxels())
-    np.testing.assert_array_equal(placed(scan_map, "map").occupancy.keys, scan_map.occupancy.keys)
+    np.testing.assert_array_equal(place_voxels(scan_map, "map").occupancy.keys, scan_map.occupancy.keys)
     for frame, height in (("gravity", 1.52), ("first-camera", 0.0)):
-        there = placed(scan_map, frame)
+        there = place_voxels(scan_map, frame)
         expected = np.stack((center[:, 2], -center[:, 0], height - center[:, 1]), axis=1)
         np.testing.assert_allclose(transform(there.T_frame_map, center), expected, atol=1e-9)
         found = there.occupancy.centers(there.occupancy.occupied_voxels())
@@ -82,7 +82,7 @@ def test_a_map_of_several_sizes_is_brought_to_the_largest() -> None:
         np.zeros_like(state, np.uint16), np.zeros_like(state, np.uint16), state,
         features=np.ones((2, 4), np.float16), colors=np.uint8([(1, 2, 3), (4, 5, 6)]), levels=np.uint8([0, 1, 1]),
     )  # fmt: skip
-    there = placed(map_of(several), "gravity")
+    there = place_voxels(map_of(several), "gravity")
     assert there.occupancy.deepest == 0
     assert there.occupancy.voxel_size == 0.1
     assert set(there.rows.tolist()) == {0, 1}
@@ -90,9 +90,9 @@ def test_a_map_of_several_sizes_is_brought_to_the_largest() -> None:
     center = transform(there.T_frame_map, several.centers(several.occupied_voxels(), several.occupied_edges()))
     found = there.occupancy.centers(there.occupancy.occupied_voxels())
     assert np.abs(found - center[there.rows]).max() < 0.11
-    in_map = placed(map_of(several), "map")
+    in_map = place_voxels(map_of(several), "map")
     assert in_map.occupancy.deepest == 1
-    assert placed(map_of(several), "map", one_size=True).occupancy.deepest == 0
+    assert place_voxels(map_of(several), "map", one_size=True).occupancy.deepest == 0
 
 
 def test_bad_frames_are_told(tmp_path) -> None:
@@ -100,10 +100,10 @@ def test_bad_frames_are_told(tmp_path) -> None:
     with pytest.raises(ConfigError, match="map, gravity or first-camera, got 'robot'"):
         export_map(scan_map, "npz", tmp_path / "a.npz", {"frame": "robot"})
     with pytest.raises(ExportError, match="no voxel"):
-        placed(map_of(occupancy_of([])), "gravity")
+        place_voxels(map_of(occupancy_of([])), "gravity")
     scan_map.trajectory.has_pose[:] = False
     with pytest.raises(ExportError, match="no first camera"):
-        placed(scan_map, "first-camera")
+        place_voxels(scan_map, "first-camera")
 
 
 @pytest.mark.parametrize("frame", ["map", "gravity"])
@@ -113,7 +113,7 @@ def test_a_box_holds_the_voxels_whose_centres_lie_in_it(frame) -> None:
     occupied, free = voxels[::2], voxels[1::2]
     scan_map = map_of(occupancy_of(occupied, colors=rng.integers(0, 255, (len(occupied), 3)), free=free))
     box = (-0.62, -0.31, -0.78, 0.57, 0.74, 0.92)
-    every, part = placed(scan_map, frame), placed(scan_map, frame, box=box)
+    every, part = place_voxels(scan_map, frame), place_voxels(scan_map, frame, box=box)
     for state in (FREE, OCCUPIED):
         centers = every.occupancy.centers(every.occupancy.voxels(state))
         inside = ((centers > box[:3]) & (centers < box[3:])).all(axis=1)
@@ -129,7 +129,7 @@ def test_a_box_of_a_map_of_several_sizes() -> None:
     from test_octomap import of_several_sizes
 
     several = of_several_sizes()
-    part = placed(map_of(several), "map", box=(0.0, 0.0, 0.0, 5.0, 1.0, 1.0)).occupancy
+    part = place_voxels(map_of(several), "map", box=(0.0, 0.0, 0.0, 5.0, 1.0, 1.0)).occupancy
     for state in (FREE, OCCUPIED):
         centers, edges = several.centers(several.voxels(state), several.edges(state)), several.edges(state)
         inside = ((centers > 0) & (centers < (5, 1, 1))).all(axis=1)

@@ -14,8 +14,8 @@ from test_export_frames import SPACE, VOXELS, map_of
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.core.transforms import transform
 from freeocc3d.export import export_map
-from freeocc3d.export.export_frames import placed
-from freeocc3d.occupancy.surface_faces import exposed_faces
+from freeocc3d.export.export_frames import place_voxels
+from freeocc3d.occupancy.surface_faces import find_exposed_faces
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -25,9 +25,9 @@ def test_faces_stand_upright_where_the_frame_has_them(tmp_path, frame) -> None:
     scan_map = map_of(occupancy_of(VOXELS, free=SPACE))
     export_map(scan_map, "glb", tmp_path / "map.glb", {"frame": frame})
     scene = trimesh.load(tmp_path / "map.glb")
-    there = placed(scan_map, frame)
+    there = place_voxels(scan_map, frame)
     mesh = scene.to_geometry() if hasattr(scene, "to_geometry") else scene.dump(concatenate=True)
-    vertices, quads, _ = exposed_faces(there.occupancy)
+    vertices, quads, _ = find_exposed_faces(there.occupancy)
     assert len(mesh.faces) == 2 * len(quads)
     x, y, z = vertices.T if frame != "map" else transform(scan_map.T_gravity_map, vertices).T
     expected = np.stack((x, z, -y), axis=1)
@@ -96,7 +96,7 @@ def test_khronos_validator_finds_nothing(tmp_path, gltf_validator, options) -> N
     report = gltf_validator(tmp_path / "map.glb")
     assert report["issues"]["messages"] == []
     assert report["info"]["totalTriangleCount"] == 2 * len(
-        exposed_faces(placed(scan_map, options["frame"]).occupancy)[1]
+        find_exposed_faces(place_voxels(scan_map, options["frame"]).occupancy)[1]
     )
     (tmp_path / "broken.glb").write_bytes((tmp_path / "map.glb").read_bytes()[:-4])
     assert gltf_validator(tmp_path / "broken.glb")["issues"]["numErrors"] > 0

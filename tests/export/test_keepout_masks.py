@@ -12,8 +12,8 @@ from test_nav2 import Z_UP, room
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.export import export_map
-from freeocc3d.export.export_frames import placed
-from freeocc3d.export.keepout_masks import Avoided, cost_map, parsed
+from freeocc3d.export.export_frames import place_voxels
+from freeocc3d.export.keepout_masks import Avoided, compute_cost_map, parse_avoided
 
 
 def asked(occupancy, regions, **notes):
@@ -87,7 +87,7 @@ def test_distances_from_a_disc_and_from_beyond_the_plan(size, cost) -> None:
     shape, centre, radius, metres = (60, 45), (20.2, 30.7), 6.3, 0.5
     x, y = np.indices((80, 60)) - 10  # the disc is cut off by the plan's upper edge, y = 45
     disc = np.argwhere(np.hypot(x - centre[0], y - centre[1] - 9) <= radius) - 10
-    found = cost_map(disc, shape, size, Avoided("disc", metres, cost))
+    found = compute_cost_map(disc, shape, size, Avoided("disc", metres, cost))
     i, j = np.indices(shape)
     distance = size * np.sqrt(((np.stack((i, j), -1)[:, :, None] - disc) ** 2).sum(axis=-1).min(axis=-1))
     if cost == 100:
@@ -107,7 +107,7 @@ def test_a_layer_is_where_the_plan_is_whatever_the_lattice(tmp_path) -> None:
     notes = export_map(scan_map, "nav2", tmp_path / "map.yaml", {"avoid": ["table"]})
     assert notes == ["Only a part was understood."]
     data, size, origin = map_server(tmp_path / "map.table.yaml")
-    there = placed(scan_map, "gravity")
+    there = place_voxels(scan_map, "gravity")
     inside = np.isin(there.rows, np.flatnonzero(table))
     centers = there.occupancy.centers(there.occupancy.occupied_voxels()[inside])[:, :2]
     column, row = np.floor((centers - origin) / size).astype(int).T
@@ -125,7 +125,7 @@ def test_a_layer_is_where_the_plan_is_whatever_the_lattice(tmp_path) -> None:
     ],
 )
 def test_entries_are_words_metres_and_costs(entry, expected) -> None:
-    assert parsed([entry]) == [expected]
+    assert parse_avoided([entry]) == [expected]
 
 
 @pytest.mark.parametrize(

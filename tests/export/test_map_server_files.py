@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from freeocc3d.export.map_server_files import COSTS, PLAN, Grid, cost_pixels, write_map
+from freeocc3d.export.map_server_files import COSTS, PLAN, CellGrid, encode_costs, write_map
 
 
 def map_server(path):
@@ -29,13 +29,13 @@ def map_server(path):
 
 def test_costs_are_read_as_they_were_written(tmp_path) -> None:
     costs = np.arange(101, dtype=np.uint8).reshape(101, 1)
-    grid = Grid(np.array((-1.5, 0.25)), 0.05, (101, 1), "gravity")
-    write_map(tmp_path / "costs.yaml", cost_pixels(costs), grid, COSTS, "costs")
+    grid = CellGrid(np.array((-1.5, 0.25)), 0.05, (101, 1), "gravity")
+    write_map(tmp_path / "costs.yaml", encode_costs(costs), grid, COSTS, "costs")
     data, size, origin = map_server(tmp_path / "costs.yaml")
     assert data.tolist() == [list(range(101))]
     assert (size, *origin) == (0.05, -1.5, 0.25)
     # ROS 1 maps what lies between the thresholds to 1…99: it reads nearly the same, and white is 0 there, too.
-    ratio = (1 - cost_pixels(costs)[1:-1, 0] / 255 - COSTS.free) / (COSTS.occupied - COSTS.free)
+    ratio = (1 - encode_costs(costs)[1:-1, 0] / 255 - COSTS.free) / (COSTS.occupied - COSTS.free)
     assert np.abs(1 + 98 * ratio - np.arange(1, 100)).max() < 1.1
 
 
@@ -43,5 +43,5 @@ def test_costs_are_read_as_they_were_written(tmp_path) -> None:
 def test_a_plans_pixels_are_told_apart(tmp_path, pixel, read) -> None:
     pixels = np.full((2, 3), 205, np.uint8)
     pixels[1, 0] = pixel  # the smallest y, the last x
-    write_map(tmp_path / "map.yaml", pixels, Grid(np.zeros(2), 0.1, (2, 3), "gravity"), PLAN, "a plan")
+    write_map(tmp_path / "map.yaml", pixels, CellGrid(np.zeros(2), 0.1, (2, 3), "gravity"), PLAN, "a plan")
     assert map_server(tmp_path / "map.yaml")[0].tolist() == [[-1, read], [-1, -1], [-1, -1]]

@@ -10,7 +10,7 @@ from test_map_server_files import map_server
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.export import export_map
-from freeocc3d.export.export_frames import placed
+from freeocc3d.export.export_frames import place_voxels
 
 Z_UP = np.eye(4)
 
@@ -39,7 +39,7 @@ def test_every_pixel_of_a_room_without_symmetry(tmp_path) -> None:
     export_map(scan_map, "nav2", tmp_path / "map.yaml", {"max_height": 1.7})
     data, resolution, origin = map_server(tmp_path / "map.yaml")
     assert resolution == pytest.approx(0.1)
-    sampled = placed(scan_map, "gravity").occupancy  # the same lattice shifted by less than half a voxel
+    sampled = place_voxels(scan_map, "gravity").occupancy  # the same lattice shifted by less than half a voxel
     assert sampled.voxel_size == resolution
     for j in range(7):
         for i in range(12):

@@ -12,7 +12,7 @@ from test_export_frames import map_of
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.core.types import FREE, OCCUPIED, Occupancy
 from freeocc3d.export import export_map
-from freeocc3d.export.export_frames import placed
+from freeocc3d.export.export_frames import place_voxels
 
 pyoctomap = pytest.importorskip("pyoctomap")
 
@@ -97,7 +97,7 @@ def test_octomap_reads_every_voxel_and_nothing_else(tmp_path, name, occupancy) -
 def test_voxels_that_are_asked_one_by_one(tmp_path) -> None:
     scan_map = map_of(scattered())
     export_map(scan_map, "octomap", tmp_path / "map.bt", {"frame": "gravity"})
-    tree, there = read(tmp_path / "map.bt"), placed(scan_map, "gravity", origin=np.zeros(3)).occupancy
+    tree, there = read(tmp_path / "map.bt"), place_voxels(scan_map, "gravity", origin=np.zeros(3)).occupancy
     for state in (FREE, OCCUPIED):
         for center in there.centers(there.voxels(state)):
             assert state_at(tree, center) == state

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from freeocc3d.export.octree import DEPTH, KEY_ORIGIN, Leaves, octree
+from freeocc3d.export.octree import DEPTH, KEY_ORIGIN, Leaves, build_octree
 
 
 def leaves(corners, values):
@@ -52,7 +52,7 @@ def test_nodes_are_those_of_a_plain_tree_in_its_order(seed) -> None:
                 cubes[corner, edge] = value
                 parts[edge][0].append(corner)
                 parts[edge][1].append(value)
-    tree = octree([leaves(*parts[edge]) for edge in (1, 2, 4)])
+    tree = build_octree([leaves(*parts[edge]) for edge in (1, 2, 4)])
     expected = plain(cubes)
     np.testing.assert_array_equal(tree.values, [value for value, _ in expected])
     np.testing.assert_array_equal(tree.children, [mask for _, mask in expected])
@@ -62,11 +62,11 @@ def test_nodes_are_those_of_a_plain_tree_in_its_order(seed) -> None:
 
 
 def test_one_voxel_is_a_branch_and_other_colours_are_not_merged() -> None:
-    assert len(octree([leaves([(0, 0, 0)], [1.0])])) == DEPTH + 1
+    assert len(build_octree([leaves([(0, 0, 0)], [1.0])])) == DEPTH + 1
     cube = np.stack(np.meshgrid(*[(0, 1)] * 3), axis=-1).reshape(-1, 3)
-    assert len(octree([leaves(cube, np.ones(8))])) == DEPTH
+    assert len(build_octree([leaves(cube, np.ones(8))])) == DEPTH
     colors = np.zeros((8, 3), np.uint8)
     colors[3] = 80
-    apart = octree([Leaves(cube.astype(np.int32), np.ones(8, np.float32), colors)])
+    apart = build_octree([Leaves(cube.astype(np.int32), np.ones(8, np.float32), colors)])
     assert len(apart) == DEPTH + 1 + 7
     assert apart.colors[0].tolist() == [10, 10, 10]

@@ -8,7 +8,7 @@ from scenes import occupancy_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.export import export_map, ply
-from freeocc3d.occupancy.surface_faces import exposed_faces
+from freeocc3d.occupancy.surface_faces import find_exposed_faces
 
 BLUE, YELLOW = (68, 1, 84), (253, 231, 37)
 """The ends of viridis."""
@@ -65,7 +65,7 @@ def test_surfaces_are_closed_whatever_their_shape() -> None:
     """Each edge is walked as often in one direction as in the other."""
     rng = np.random.default_rng(3)
     occupancy = occupancy_of(np.unique(rng.integers(-10, 10, (400, 3)), axis=0))
-    vertices, quads, rows = exposed_faces(occupancy)
+    vertices, quads, rows = find_exposed_faces(occupancy)
     lattice = np.rint(vertices / 0.1).astype(int)
     edges = np.stack((lattice[quads], lattice[np.roll(quads, -1, axis=1)]), axis=2).reshape(-1, 6)
     forth, count_forth = np.unique(edges, axis=0, return_counts=True)

@@ -89,11 +89,14 @@ def test_at_the_default_coverage_a_wall_reaches_one_half_at_six_tenths_of_a_voxe
     """Whatever the cells: finer ones hold more Gaussians, each of which says less on the lattice."""
     V = 2 * CELL
     g = lifted([wall_frame(2.0 + 0.5 * CELL)], [np.eye(4)], cell=finer * CELL)
-    least = anchors.least_scale(anchors.Options(), finer * CELL, V)
+    least = anchors.compute_least_scale(anchors.Options(), finer * CELL, V)
     wall = float(g.means[0, 2])
     x, y = (np.random.default_rng(0).uniform(-0.5, 0.5, 200) for _ in range(2))
     points = {offset: np.stack((x, y, np.full(200, wall + offset * V)), axis=1) for offset in (0.0, 0.6, 1.0)}
-    alpha = {offset: splat_reference.probability(g, at, splat.Options(), least).mean() for offset, at in points.items()}
+    alpha = {
+        offset: splat_reference.compute_probability_reference(g, at, splat.Options(), least).mean()
+        for offset, at in points.items()
+    }
     assert alpha[0.0] > 0.9
     assert alpha[0.6] == pytest.approx(0.5, abs=0.05)
     assert alpha[1.0] < 0.05
@@ -104,7 +107,7 @@ def test_reanchored_gaussians_follow_their_keyframes_exactly() -> None:
     g = lifted(frames, old)
     moves = [random_pose(10), random_pose(11)]
     new = np.stack([move @ T for move, T in zip(moves, old, strict=True)])
-    moved = anchors.reanchored(g, old, new)
+    moved = anchors.reanchor(g, old, new)
     for k, move in enumerate(moves):
         own = g.anchor_keyframe == k
         np.testing.assert_allclose(moved.means[own], transform(move, g.means[own].astype(float)), atol=1e-4)
@@ -116,7 +119,7 @@ def test_reanchored_gaussians_follow_their_keyframes_exactly() -> None:
 def test_aligned_moves_means_scales_and_rotations_as_the_paper_says() -> None:
     g = lifted([wall_frame(2.0)], [random_pose(0)])
     T = random_pose(5)
-    moved = anchors.aligned(g, 2.0, T[:3, :3], T[:3, 3])
+    moved = anchors.align_gaussians(g, 2.0, T[:3, :3], T[:3, 3])
     np.testing.assert_allclose(moved.means, 2.0 * g.means @ T[:3, :3].T + T[:3, 3], atol=1e-4)
     np.testing.assert_allclose(moved.scales, 2.0 * g.scales)
     covariance = T[:3, :3] @ quats_to_rotations(g.quats_wxyz.astype(float))
@@ -127,7 +130,7 @@ def test_pixels_at_depth_edges_are_dropped() -> None:
     depth = np.full((20, 20), 2.0, np.float32)
     depth[:, 10:] = 3.0
     depth[3, 3] = 0
-    good = depth_edges.away_from_edges(depth, 0.05)
+    good = depth_edges.mask_away_from_edges(depth, 0.05)
     assert not good[:, 9:11].any()
     assert not good[3, 3]
     assert good[:3, :9].all()
@@ -137,8 +140,10 @@ def test_pixels_at_depth_edges_are_dropped() -> None:
 def test_the_compiled_edge_test_agrees_with_plain_numpy() -> None:
     depth = np.random.default_rng(0).uniform(2.0, 2.2, (30, 40)).astype(np.float32)
     depth[np.random.default_rng(1).uniform(size=depth.shape) < 0.2] = 0
-    compiled = [[depth[v, u] > 0 and not depth_edges.at_edge(depth, v, u, 0.05) for u in range(40)] for v in range(30)]
-    np.testing.assert_array_equal(compiled, depth_edges.away_from_edges(depth, 0.05))
+    compiled = [
+        [depth[v, u] > 0 and not depth_edges.is_at_edge(depth, v, u, 0.05) for u in range(40)] for v in range(30)
+    ]
+    np.testing.assert_array_equal(compiled, depth_edges.mask_away_from_edges(depth, 0.05))
 
 
 def test_cells_smaller_than_the_pixels_spacing_keep_the_surface() -> None:

@@ -32,7 +32,7 @@ def test_the_kernel_agrees_with_plain_numpy(own_sigma: bool) -> None:
     points = np.random.default_rng(1).uniform((-1, -1, 1.5), (1, 1, 2.5), (4000, 3))
     directions = np.random.default_rng(2).normal((0, 0, 0.3), 1, points.shape)  # some were measured from behind
     looks = posed(frames, poses)
-    found = denoising.denoised(points, directions, looks, 0.15)
+    found = denoising.denoise(points, directions, looks, 0.15)
     parts = [denoising.look_reference(points, directions, look, 0.15) for look in looks]
     offset, weight, through = (sum(part[i].astype(float) for part in parts) for i in range(3))
     shown = sum((part[1] > 0).astype(int) for part in parts)
@@ -61,7 +61,7 @@ def test_what_most_images_see_through_is_left_out_and_what_none_shows_stays() ->
     poses = np.tile(np.eye(4), (3, 1, 1))
     floating, on_the_wall, behind_the_camera, behind_the_wall = (0, 0, 1.0), (0, 0, 2.005), (0, 0, -1.0), (0, 0, 2.5)
     points = np.array([floating, on_the_wall, behind_the_camera, behind_the_wall])
-    found = denoising.denoised(points, points, posed(frames, poses), 0.05)
+    found = denoising.denoise(points, points, posed(frames, poses), 0.05)
     np.testing.assert_array_equal(found.kept, [False, True, True, True])
     np.testing.assert_array_equal(found.weights > 0, [False, True, False, False])
     np.testing.assert_allclose(found.points[1], (0, 0, 2.0), atol=1e-6)
@@ -73,7 +73,7 @@ def test_the_two_sides_of_a_board_stay_apart() -> None:
     behind[2, 3] = 4.04  # looks back at a board of 4 cm, whose other side is 2 m away
     looks = posed([wall_frame(2.0, 0), wall_frame(2.0, 1)], np.stack((front, behind)))
     points = np.array([(0.1, 0.1, 2.003), (0.1, 0.1, 2.037)])
-    found = denoising.denoised(points, np.array([(0, 0, 1.0), (0, 0, -1.0)]), looks, 0.05)
+    found = denoising.denoise(points, np.array([(0, 0, 1.0), (0, 0, -1.0)]), looks, 0.05)
     np.testing.assert_allclose(found.points[:, 2], (2.0, 2.04), atol=1e-6)
 
 
@@ -92,6 +92,6 @@ def test_a_frame_between_keyframes_is_anchored_to_the_one_it_hangs_on() -> None:
 
 def test_nothing_to_look_at_changes_nothing() -> None:
     points = np.array([(0.0, 0.0, 2.0)])
-    found = denoising.denoised(points, points, iter(()), 0.05)
+    found = denoising.denoise(points, points, iter(()), 0.05)
     np.testing.assert_array_equal(found.points, points)
     assert found.keyframe[0] == -1

@@ -23,19 +23,22 @@ def walls(count: int = 3) -> tuple[list[Frame], np.ndarray]:
     return [wall_frame(2.0 + 0.1 * n, n) for n in range(count)], poses
 
 
-def seen(frames, poses) -> list[rendered_views.View]:
-    return [rendered_views.view_of(frame, T, 160, torch.device("cpu")) for frame, T in zip(frames, poses, strict=True)]
+def seen(frames, poses) -> list[rendered_views.CapturedView]:
+    return [
+        rendered_views.prepare_captured_view(frame, T, 160, torch.device("cpu"))
+        for frame, T in zip(frames, poses, strict=True)
+    ]
 
 
 def fitted(g, views, passes: int = 15, **options):
-    return fitting.fitted(g, views, RASTERIZER, fitting.Options(**options), passes)
+    return fitting.fit_gaussians(g, views, RASTERIZER, fitting.Options(**options), passes)
 
 
 def test_fitting_renders_closer_to_the_images_with_means_where_they_were() -> None:
     frames, poses = walls()
     g, views = lifted(frames, poses), seen(frames, poses)
     after = fitted(g, views)
-    before_db, after_db = (rendered_views.fidelity(x, views, RASTERIZER) for x in (g, after))
+    before_db, after_db = (rendered_views.measure_fidelity(x, views, RASTERIZER) for x in (g, after))
     assert after_db.psnr > before_db.psnr + 1
     assert after_db.depth_l1_m <= before_db.depth_l1_m + 1e-3
     kept = {tuple(mean) for mean in g.means.tolist()}
@@ -63,8 +66,8 @@ def test_free_means_move_and_their_anchors_can_follow() -> None:
     after = fitted(g, seen(frames, poses), means="free")
     still = {tuple(mean) for mean in g.means.tolist()}
     assert sum(tuple(mean) in still for mean in after.means.tolist()) < 0.1 * len(after)
-    followed = anchors.anchored_where_they_are(after, poses)
-    same = anchors.reanchored(followed, poses, poses)
+    followed = anchors.anchor_in_place(after, poses)
+    same = anchors.reanchor(followed, poses, poses)
     np.testing.assert_allclose(same.means, after.means, atol=1e-5)
 
 
@@ -77,7 +80,7 @@ def test_what_lies_beyond_the_depth_does_not_make_gaussians_grow() -> None:
     frames = [replace(frames[0], depth_m=depth, color=color)]
     g = lifted(frames, poses)
     after = fitted(g, seen(frames, poses), passes=30)
-    rendered = rendered_views.render(after, seen(frames, poses)[0], RASTERIZER)
+    rendered = rendered_views.render_gaussians(after, seen(frames, poses)[0], RASTERIZER)
     assert float(rendered.alpha[:, 90:].max()) < 0.2
 
 
@@ -118,7 +121,7 @@ def test_no_passes_views_or_gaussians_change_nothing() -> None:
     assert fitted(g, []) is g
     nothing = random_gaussians(0, 0)
     assert fitted(nothing, seen(frames, poses)) is nothing
-    unseen = rendered_views.fidelity(g, [], RASTERIZER)
+    unseen = rendered_views.measure_fidelity(g, [], RASTERIZER)
     assert unseen.psnr is None
 
 
@@ -145,11 +148,11 @@ def test_a_view_keeps_rays_and_picks_depth() -> None:
     frame = wall_frame(2.0)
     depth = frame.depth_m.copy()
     depth[:, 80:] = 3.0
-    view = rendered_views.view_of(replace(frame, depth_m=depth), np.eye(4), 80, torch.device("cpu"))
+    view = rendered_views.prepare_captured_view(replace(frame, depth_m=depth), np.eye(4), 80, torch.device("cpu"))
     assert view.color.shape == (60, 80, 3)
     assert set(np.unique(view.depth_m.numpy())) == {np.float32(2.0), np.float32(3.0)}
     assert view.camera == CAMERA.resized(80, 60)
-    assert rendered_views.view_of(frame, np.eye(4), 4000, torch.device("cpu")).camera == CAMERA
+    assert rendered_views.prepare_captured_view(frame, np.eye(4), 4000, torch.device("cpu")).camera == CAMERA
 
 
 @pytest.mark.parametrize("wrong", [{"means": "wild"}, {"passes": -1}, {"shape_weight": -0.1}, {"width": 0}])
@@ -164,4 +167,4 @@ def test_isotropic_gaussians_are_spheres_of_their_neighbours_distance() -> None:
     assert (g.scales == g.scales[:, :1]).all()
     inner = np.abs(g.means[:, :2]).max(axis=1) < 0.5
     assert np.median(g.scales[inner]) == pytest.approx(0.04, rel=0.2)
-    assert len(anchors.isotropic(random_gaussians(1, 0))) == 1
+    assert len(anchors.make_isotropic(random_gaussians(1, 0))) == 1

@@ -46,7 +46,7 @@ def test_the_compiled_one_agrees_with_the_oracle(n: int, seed: int) -> None:
     arrays, T = scene(n, seed)
     weights = torch.tensor(np.random.default_rng(9).normal(size=(37, 45, 5)))
     exact = [array.double() for array in arrays]
-    expected, gradients = with_gradients(reference.Reference(), exact, T.double(), weights)
+    expected, gradients = with_gradients(reference.ReferenceRasterizer(), exact, T.double(), weights)
     out, found = with_gradients(cpu.load(), arrays, T, weights)
     torch.testing.assert_close(out.double(), expected, atol=1e-4 * float(expected.abs().max() + 1e-9), rtol=1e-4)
     for name, a, b in zip(NAMES, found, gradients, strict=True):
@@ -57,10 +57,10 @@ def test_the_oracles_gradients_are_finite_differences() -> None:
     arrays, T = scene(12, 3, torch.float64)
     arrays[3] = 0.3 + 0.5 * arrays[3]  # away from where alpha is cut off
     weights = torch.tensor(np.random.default_rng(2).normal(size=(37, 45, 5)))
-    _, gradients = with_gradients(reference.Reference(), arrays, T, weights)
+    _, gradients = with_gradients(reference.ReferenceRasterizer(), arrays, T, weights)
 
     def value(changed) -> float:
-        return float((stacked(reference.Reference().render(*changed, T, CAMERA)) * weights).sum())
+        return float((stacked(reference.ReferenceRasterizer().render(*changed, T, CAMERA)) * weights).sum())
 
     rng = np.random.default_rng(4)
     for number, name in enumerate(NAMES):
@@ -75,7 +75,7 @@ def test_the_oracles_gradients_are_finite_differences() -> None:
         assert min(abs(slope - expected) for slope in slopes) <= 1e-4 * abs(expected) + 1e-6, name
 
 
-@pytest.mark.parametrize("rasterizer", [reference.Reference(), cpu.load()], ids=["reference", "cpu"])
+@pytest.mark.parametrize("rasterizer", [reference.ReferenceRasterizer(), cpu.load()], ids=["reference", "cpu"])
 def test_one_gaussian_on_the_axis_is_what_the_equations_say(rasterizer) -> None:
     camera = Intrinsics(21, 21, 50.0, 50.0, 10.0, 10.0)
     sigma, z, opacity = 0.05, 2.0, 0.8
@@ -96,7 +96,7 @@ def test_one_gaussian_on_the_axis_is_what_the_equations_say(rasterizer) -> None:
     np.testing.assert_allclose(out.image.numpy(), alpha[..., None] * np.float32((0.2, 0.5, 0.9)), atol=1e-6)
 
 
-@pytest.mark.parametrize("rasterizer", [reference.Reference(), cpu.load()], ids=["reference", "cpu"])
+@pytest.mark.parametrize("rasterizer", [reference.ReferenceRasterizer(), cpu.load()], ids=["reference", "cpu"])
 def test_the_nearer_of_two_hides_the_farther_by_its_alpha(rasterizer) -> None:
     camera = Intrinsics(5, 5, 50.0, 50.0, 2.0, 2.0)
     arrays = (
@@ -111,7 +111,7 @@ def test_the_nearer_of_two_hides_the_farther_by_its_alpha(rasterizer) -> None:
     np.testing.assert_allclose(float(out.depth[2, 2]), 0.6 * 1.0 + 0.4 * 0.9 * 3.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("rasterizer", [reference.Reference(), cpu.load()], ids=["reference", "cpu"])
+@pytest.mark.parametrize("rasterizer", [reference.ReferenceRasterizer(), cpu.load()], ids=["reference", "cpu"])
 def test_nothing_in_view_is_a_black_image_with_zero_gradients(rasterizer) -> None:
     arrays, _ = scene(20)
     arrays[0] = torch.tensor([[0.0, 0.0, -5.0]]).repeat(20, 1)
@@ -153,7 +153,7 @@ def test_gsplat_and_the_reference_on_cuda_give_the_same_images() -> None:
     pytest.importorskip("gsplat")
     arrays, T = scene(1500)
     on_gpu = [array.cuda() for array in arrays]
-    expected = stacked(reference.Reference("cuda").render(*on_gpu, T.cuda(), CAMERA))
+    expected = stacked(reference.ReferenceRasterizer("cuda").render(*on_gpu, T.cuda(), CAMERA))
     out = stacked(gsplat.load(gsplat.Options()).render(*on_gpu, T.cuda(), CAMERA))
     # It bounds splats by whole pixels, so that a few at the very edge of alpha are left out.
     assert float((out - expected).abs().mean()) < 1e-3

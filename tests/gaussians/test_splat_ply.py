@@ -7,7 +7,7 @@ import pytest
 from scenes import random_gaussians, write_standard_ply
 
 from freeocc3d.core.errors import FreeOccError
-from freeocc3d.gaussians.point_cloud import write_ply
+from freeocc3d.gaussians.point_cloud import write_gaussian_ply
 from freeocc3d.gaussians.splat_ply import read_standard_ply
 from freeocc3d.gaussians.splat_ply import write_standard_ply as write_ours
 
@@ -49,7 +49,7 @@ def test_files_that_hold_no_gaussians_are_refused(tmp_path: Path) -> None:
     (tmp_path / "points.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{axes}end_header\n0 0 0\n")
     with pytest.raises(FreeOccError, match="lack opacity, scale_0"):
         read_standard_ply(tmp_path / "points.ply")
-    write_ply(random_gaussians(5, seed=0), tmp_path / "own.ply")
+    write_gaussian_ply(random_gaussians(5, seed=0), tmp_path / "own.ply")
     with pytest.raises(FreeOccError, match="map's own file"):
         read_standard_ply(tmp_path / "own.ply")
     whole = write_standard_ply(tmp_path / "whole.ply", random_gaussians(500, seed=0)).read_bytes()

@@ -175,7 +175,7 @@ def test_features_are_unit_and_as_dense_as_asked(folder: Path) -> None:
 @pytest.mark.parametrize(("precision", "least"), [("fp16", 0.999), ("int8", 0.95)])
 def test_other_precisions_stay_near(folder: Path, tmp_path: Path, precision: str, least: float) -> None:
     other = tiny_models.clip_package(tmp_path / precision, precision)
-    assert model_packages.read(other).precision == precision
+    assert model_packages.read_package(other).precision == precision
     shown = frame()
     exact, near = (encoder(path, short_side=48, stride=0).encode(shown).astype(np.float32) for path in (folder, other))
     assert (exact * near).sum(axis=-1).min() > least

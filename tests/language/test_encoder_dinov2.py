@@ -15,7 +15,7 @@ from freeocc3d.core.errors import ConfigError
 from freeocc3d.language.encoders import dinov2
 from freeocc3d.language.model_export.checkpoint_networks import build_text_aligned
 from freeocc3d.language.model_export.package_writer import write_package
-from freeocc3d.language.patch_features import resampled
+from freeocc3d.language.patch_features import resample_patches
 
 
 def head() -> dict[str, torch.Tensor]:
@@ -84,7 +84,7 @@ def test_resampling_equals_pytorchs() -> None:
     for grid in ((11, 9), (5, 7), (20, 28)):
         given = torch.from_numpy(values).permute(2, 0, 1)[None]
         expected = F.interpolate(given, size=grid, mode="bilinear", align_corners=False)[0].permute(1, 2, 0).numpy()
-        assert np.abs(resampled(values, grid) - expected).max() < 1e-5
+        assert np.abs(resample_patches(values, grid) - expected).max() < 1e-5
 
 
 def test_options_out_of_range_are_told() -> None:

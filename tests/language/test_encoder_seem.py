@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from freeocc3d.core.errors import ConfigError
 from freeocc3d.language.encoders import seem
-from freeocc3d.language.model_export.checkpoint_networks import Checkpoint, Network, build_clip
+from freeocc3d.language.model_export.checkpoint_networks import Checkpoint, CheckpointNetwork, build_clip
 from freeocc3d.language.model_export.package_writer import write_package
 
 QUERIES = 5
@@ -44,7 +44,9 @@ def network() -> Masks:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("models") / "tiny-seem"
     words = build_clip(tiny_models.clip(), tiny_models.tokenizer(), [0.5] * 3, [0.25] * 3)
-    image = Network(network(), {"image": torch.zeros(2, 3, 16, 20)}, {"image": (0, 2, 3)}, ("masks", "embeddings"))
+    image = CheckpointNetwork(
+        network(), {"image": torch.zeros(2, 3, 16, 20)}, {"image": (0, 2, 3)}, ("masks", "embeddings")
+    )
     facts = {**words.facts, "patch": 4, "prefix_tokens": 0}
     parts = {"image": image, "text": words.networks["text"]}
     checkpoint = Checkpoint("masks", parts, facts, words.tokenizer)

@@ -323,5 +323,5 @@ def test_a_map_of_a_networks_classes_is_asked_and_refined_without_its_capture(tm
     nothing = made.query("purple unicorn")
     assert not nothing.matched
     assert "red thing" in nothing.note
-    box = box_refinement.around(red.regions[0], 0.08)
-    assert box_refinement.refine(made, box, 0.04, tmp_path / "refined").query("red thing").matched
+    box = box_refinement.enclose_region(red.regions[0], 0.08)
+    assert box_refinement.refine_box(made, box, 0.04, tmp_path / "refined").query("red thing").matched

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from freeocc3d.core.errors import ConfigError, ModelError
 from freeocc3d.language.encoders import trident
-from freeocc3d.language.encoders.trident import correlation, gathering, pooled
+from freeocc3d.language.encoders.trident import correlate_patches, gate_attention, pool_masks
 from freeocc3d.language.model_export.checkpoint_networks import build_backbone, build_sam
 from freeocc3d.language.model_export.package_writer import write_package
 
@@ -151,15 +151,15 @@ def test_features_are_unit_and_cover_any_frame(folders: dict[str, str], size: tu
 
 def test_patches_that_are_all_alike_attend_to_themselves() -> None:
     alike = np.ones((5, 3), np.float32)
-    assert correlation(alike, 1.2, 3.0) == pytest.approx(np.eye(5))
-    assert gathering(np.full((5, 5), 0.2, np.float32), alike, 1.2) == pytest.approx(np.eye(5))
+    assert correlate_patches(alike, 1.2, 3.0) == pytest.approx(np.eye(5))
+    assert gate_attention(np.full((5, 5), 0.2, np.float32), alike, 1.2) == pytest.approx(np.eye(5))
 
 
 def test_attention_rows_sum_to_one() -> None:
     rng = np.random.default_rng(0)
     seen = rng.normal(size=(30, 8)).astype(np.float32)
     attention = rng.random((30, 30)).astype(np.float32)
-    for weights in (correlation(seen, 1.2, 3.0), gathering(attention, seen, 1.2)):
+    for weights in (correlate_patches(seen, 1.2, 3.0), gate_attention(attention, seen, 1.2)):
         assert weights.sum(axis=1) == pytest.approx(1, abs=1e-5)
         assert (weights == 0).any()
 
@@ -177,7 +177,7 @@ def test_pooling_is_the_weighted_mean_of_masks_means() -> None:
             weights = scores * shares[:, i, j]
             if weights.sum() > 0:
                 expected[i, j] = sum(w * m for w, m in zip(weights, means, strict=True)) / weights.sum()
-    assert pooled(features, shares, scores) == pytest.approx(expected, abs=1e-5)
+    assert pool_masks(features, shares, scores) == pytest.approx(expected, abs=1e-5)
 
 
 def test_lacking_and_mistaken_models_are_told(folders: dict[str, str]) -> None:

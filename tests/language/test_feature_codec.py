@@ -102,8 +102,8 @@ def test_cosines_are_those_of_decoded_features(dimension: int, many: bool, monke
     np.testing.assert_allclose(found, expected, atol=2e-3)
     assert not found[:10].any()
     coded = CodedFeatures(codec, codes)
-    np.testing.assert_array_equal(codec_module.cosines(coded[5:50], text), codec.cosines(codes[5:50], text))
-    np.testing.assert_array_equal(codec_module.known(coded), features.any(axis=1))
+    np.testing.assert_array_equal(codec_module.compute_cosines(coded[5:50], text), codec.cosines(codes[5:50], text))
+    np.testing.assert_array_equal(codec_module.mask_known(coded), features.any(axis=1))
     np.testing.assert_array_equal(np.asarray(coded), codec.decode(codes))
     assert coded.shape == features.shape
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from freeocc3d.language import feature_fusion
 from freeocc3d.language.feature_fusion import FeatureFusion
-from freeocc3d.language.visibility import Seen
+from freeocc3d.language.visibility import VisibleGaussians
 
 SHAPE = 12, 16
 WALL, VASE = np.eye(8)[0], np.eye(8)[1]
@@ -19,12 +19,12 @@ def unit(shape: tuple[int, ...], seed: int = 0) -> NDArray[np.float16]:
     return (values / np.linalg.norm(values, axis=-1, keepdims=True)).astype(np.float16)
 
 
-def view(rows: object, seed: int = 0, weights: object = None) -> Seen:
+def view(rows: object, seed: int = 0, weights: object = None) -> VisibleGaussians:
     """A view of some Gaussians at random pixels."""
     rows, rng = np.asarray(rows, np.int32), np.random.default_rng(seed)
     weights = rng.random(len(rows)) + 0.1 if weights is None else np.broadcast_to(weights, len(rows))
     pixels = rng.integers(0, SHAPE[0] * SHAPE[1], len(rows)).astype(np.int32)
-    return Seen(rows, pixels, weights.astype(np.float32), SHAPE)
+    return VisibleGaussians(rows, pixels, weights.astype(np.float32), SHAPE)
 
 
 def half(columns: int, first: object, second: object) -> NDArray[np.float16]:
@@ -34,10 +34,10 @@ def half(columns: int, first: object, second: object) -> NDArray[np.float16]:
     return features
 
 
-def everywhere(count: int = SHAPE[0] * SHAPE[1]) -> Seen:
+def everywhere(count: int = SHAPE[0] * SHAPE[1]) -> VisibleGaussians:
     """A view that shows Gaussian n at pixel n, the first ``count`` of them."""
     numbers = np.arange(count, dtype=np.int32)
-    return Seen(numbers, numbers, np.ones(count, np.float32), SHAPE)
+    return VisibleGaussians(numbers, numbers, np.ones(count, np.float32), SHAPE)
 
 
 def test_the_sum_is_numpys() -> None:

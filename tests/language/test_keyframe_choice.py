@@ -8,38 +8,38 @@ import cv2
 import numpy as np
 import pytest
 
-from freeocc3d.language.keyframe_choice import choose, sharpness
-from freeocc3d.language.visibility import Seen
+from freeocc3d.language.keyframe_choice import choose_keyframes, measure_detail
+from freeocc3d.language.visibility import VisibleGaussians
 
 
-def view(rows: object, weight: float = 1.0) -> Seen:
+def view(rows: object, weight: float = 1.0) -> VisibleGaussians:
     rows = np.asarray(rows, np.int32)
-    return Seen(rows, np.zeros(len(rows), np.int32), np.full(len(rows), weight, np.float32), (4, 4))
+    return VisibleGaussians(rows, np.zeros(len(rows), np.int32), np.full(len(rows), weight, np.float32), (4, 4))
 
 
 def test_new_surface_comes_first() -> None:
     views = [view(range(60)), view(range(58)), view(range(60, 80))]
-    assert choose(views, [1, 1, 1], 80, 1) == [0]
-    assert choose(views, [1, 1, 1], 80, 2) == [0, 2]
+    assert choose_keyframes(views, [1, 1, 1], 80, 1) == [0]
+    assert choose_keyframes(views, [1, 1, 1], 80, 2) == [0, 2]
 
 
 def test_of_two_views_of_the_same_the_near_one_is_taken() -> None:
-    assert choose([view(range(60), 1.0), view(range(60), 4.0)], [1, 1], 60, 1) == [1]
+    assert choose_keyframes([view(range(60), 1.0), view(range(60), 4.0)], [1, 1], 60, 1) == [1]
 
 
 def test_of_two_views_of_the_same_the_sharp_one_is_taken() -> None:
     views = [view(range(50)), view(range(50)), view(range(50, 60))]
-    assert choose(views, [0.2, 1.0, 1.0], 60, 1) == [1]
+    assert choose_keyframes(views, [0.2, 1.0, 1.0], 60, 1) == [1]
 
 
 def test_what_only_a_blurred_view_shows_is_taken_all_the_same() -> None:
-    assert choose([view(range(50)), view(range(50, 60))], [1.0, 0.0], 60, 2) == [0, 1]
-    assert choose([view(range(50)), view(range(40))], [0.0, 0.0], 60, 1) == [0]
+    assert choose_keyframes([view(range(50)), view(range(50, 60))], [1.0, 0.0], 60, 2) == [0, 1]
+    assert choose_keyframes([view(range(50)), view(range(40))], [0.0, 0.0], 60, 1) == [0]
 
 
 def test_what_adds_nothing_is_left_out() -> None:
-    assert choose([view([]), view(range(9)), view(range(5))], [1] * 3, 9, 3) == [1, 2]
-    assert choose([], [], 9, 3) == []
+    assert choose_keyframes([view([]), view(range(9)), view(range(5))], [1] * 3, 9, 3) == [1, 2]
+    assert choose_keyframes([], [], 9, 3) == []
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -51,13 +51,13 @@ def test_greedy_choice_is_near_the_best(seed: int) -> None:
         return float(np.log1p(100 * sum(np.bincount(views[row].rows, minlength=40) for row in rows)).sum())
 
     best = max(shown(rows) for rows in itertools.combinations(range(8), 3))
-    assert shown(choose(views, [1] * 8, 40, 3)) >= (1 - 1 / np.e) * best
+    assert shown(choose_keyframes(views, [1] * 8, 40, 3)) >= (1 - 1 / np.e) * best
 
 
 def test_sharpness_falls_with_blur_and_not_with_brightness() -> None:
     image = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8), (0, 0), 1)
-    sharp = sharpness(image)
-    assert sharpness(cv2.GaussianBlur(image, (0, 0), 2)) < 0.3 * sharp
-    assert sharpness(cv2.blur(image, (9, 1))) < 0.7 * sharp
-    assert sharpness(image // 2) == pytest.approx(sharp, rel=0.1)
-    assert sharpness(np.zeros((240, 320, 3), np.uint8)) == 0
+    sharp = measure_detail(image)
+    assert measure_detail(cv2.GaussianBlur(image, (0, 0), 2)) < 0.3 * sharp
+    assert measure_detail(cv2.blur(image, (9, 1))) < 0.7 * sharp
+    assert measure_detail(image // 2) == pytest.approx(sharp, rel=0.1)
+    assert measure_detail(np.zeros((240, 320, 3), np.uint8)) == 0

@@ -14,7 +14,7 @@ from freeocc3d.core.errors import CaptureError, ConfigError, FrameError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import Frame
 from freeocc3d.language.encoders.base import Encoder
-from freeocc3d.language.lifting import Options, chosen_keyframes, lift
+from freeocc3d.language.lifting import Options, choose_encoded_keyframes, lift_features
 
 WALL = gaussians([(x, y, 2.0) for x in np.linspace(-1, 1, 20) for y in np.linspace(-0.8, 0.8, 20)], 0.02)
 
@@ -64,7 +64,7 @@ def poses(count: int) -> NDArray[np.float64]:
 
 
 def test_features_come_from_where_the_gaussians_project_to() -> None:
-    features = lift(WALL, frames(0, 2, 4), poses(3), Halves())
+    features = lift_features(WALL, frames(0, 2, 4), poses(3), Halves())
     seen = features.any(axis=1)
     left = WALL.means[:, 0] < 0
     assert seen.mean() > 0.5
@@ -74,12 +74,12 @@ def test_features_come_from_where_the_gaussians_project_to() -> None:
 
 def test_a_broken_frame_is_left_out_with_a_warning_and_others_faults_are_told() -> None:
     told = Warnings()
-    assert lift(WALL, frames(7, 2), poses(2), Halves(), None, told).any()
+    assert lift_features(WALL, frames(7, 2), poses(2), Halves(), None, told).any()
     assert told.said == ["Frame 7 is broken."]
-    assert np.isfinite(lift(WALL, frames(9, 2), poses(2), Halves(), None, told)).all()
+    assert np.isfinite(lift_features(WALL, frames(9, 2), poses(2), Halves(), None, told)).all()
     assert "not finite for frame 9" in told.said[1]
     with pytest.raises(CaptureError):
-        lift(WALL, frames(8), poses(1), Halves())
+        lift_features(WALL, frames(8), poses(1), Halves())
 
 
 @pytest.mark.parametrize(("keyframes", "count"), [(0.5, 3), (2.0, 2), (0.01, 1), (1.0, 6), (100.0, 6)])
@@ -87,9 +87,9 @@ def test_the_budget_is_a_share_or_a_number(keyframes: float, count: int) -> None
     views = frames(0, 1, 2, 3, 4, 5)
     encoder = Halves()
     options = Options(keyframes=keyframes)
-    lift(WALL, views, poses(6), encoder, options)
+    lift_features(WALL, views, poses(6), encoder, options)
     assert len(encoder.asked) == count
-    assert encoder.asked == chosen_keyframes(WALL, views, poses(6), options)
+    assert encoder.asked == choose_encoded_keyframes(WALL, views, poses(6), options)
     if count <= 3:
         assert not any(index % 2 for index in encoder.asked)  # the sharp ones
 

@@ -127,7 +127,7 @@ def write_open_clip(folder: Path, quick: bool) -> Path:
 def test_open_clip_checkpoints_equal_their_own_forward_pass(tmp_path: Path, quick: bool) -> None:
     source = write_open_clip(tmp_path / "source", quick)
     write_package(read_checkpoint(str(source), None, None, None), tmp_path / "m", "m", "s", "l")
-    package = model_packages.read(tmp_path / "m")
+    package = model_packages.read_package(tmp_path / "m")
     assert (package.dimension, package.mean, package.logit_scale) == (24, (0.5, 0.4, 0.3), pytest.approx(100, abs=0.01))
     given = np.random.default_rng(0).normal(size=(2, 3, 32, 32)).astype(np.float32)
     words = TextNetwork(package)
@@ -155,8 +155,8 @@ def test_the_command_exports_a_clip_of_transformers(tmp_path: Path) -> None:
     (source / "README.md").write_text("---\nlicense: mit\n---\n# A model\n")
     said = run(source, "-o", "tiny", "--precision", "int8", FREEOCC3D_MODELS=str(tmp_path / "models"))
     assert "clip, 24 dimensions, int8" in said
-    package = model_packages.read(tmp_path / "models" / "tiny")
-    model_packages.verify(package)
+    package = model_packages.read_package(tmp_path / "models" / "tiny")
+    model_packages.verify_files(package)
     assert (package.licence, package.source, package.input_size) == ("mit", str(source), 32)
     assert "exists: choose another" in run(source, "-o", tmp_path / "models" / "tiny", code=1)
 
@@ -173,7 +173,7 @@ def test_dino_and_dinov2_checkpoints_are_backbones(tmp_path: Path) -> None:
         checkpoint = read_checkpoint(str(tmp_path / name), None, None, None)
         write_package(checkpoint, made, name, "s", "l")
         given = np.random.default_rng(1).normal(size=(2, 3, 3 * patch, 6 * patch)).astype(np.float32)
-        (features,) = model_packages.read(made).session("image").run(["features"], {"image": given})
+        (features,) = model_packages.read_package(made).session("image").run(["features"], {"image": given})
         options = {"interpolate_pos_encoding": True} if name == "dino" else {}
         with torch.no_grad():
             expected = model(torch.from_numpy(given), **options).last_hidden_state[:, 1:].numpy()
@@ -185,7 +185,7 @@ def test_sam_equals_transformers_forward_pass(tmp_path: Path) -> None:
     tiny_models.sam().save_pretrained(tmp_path / "source")
     checkpoint = read_checkpoint(str(tmp_path / "source"), None, None, None)
     write_package(checkpoint, tmp_path / "m", "m", "s", "l")
-    package = model_packages.read(tmp_path / "m")
+    package = model_packages.read_package(tmp_path / "m")
     given, points = torch.randn(1, 3, 64, 64), 64 * torch.rand(1, 7, 1, 2)
     features, attention = package.session("image").run(["features", "attention"], {"image": given.numpy()})
     masks, scores = package.session("masks").run(

@@ -123,17 +123,17 @@ def server(tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
 
 
 def test_a_package_is_pulled_whole(server: Hub, home: Path) -> None:
-    folder = model_hub.pull(REPOSITORY)
+    folder = model_hub.pull_package(REPOSITORY)
     assert folder == home / "tiny"
-    model_packages.verify(model_packages.read(folder))
+    model_packages.verify_files(model_packages.read_package(folder))
     assert {path.name for path in folder.iterdir()} == {"manifest.yaml", "image.onnx", "text.onnx", "tokenizer.json"}
     assert {path.name for path in home.iterdir()} == {"tiny"}
 
 
 def test_what_is_there_is_not_fetched_again(server: Hub) -> None:
-    model_hub.pull(REPOSITORY)
+    model_hub.pull_package(REPOSITORY)
     before = len(server.requested)
-    model_hub.pull(REPOSITORY)
+    model_hub.pull_package(REPOSITORY)
     assert len(server.requested) == before
 
 
@@ -143,12 +143,12 @@ def test_an_interrupted_pull_goes_on_where_it_stopped(server: Hub, home: Path) -
     write_manifest(server.folder)
     server.cut["text.onnx"] = 3 * large
     with pytest.raises(ModelError, match=r"answered 503 when asked for someone/tiny"):
-        model_hub.pull(REPOSITORY)
+        model_hub.pull_package(REPOSITORY)
     assert not (home / "tiny").exists()
     (kept,) = (path.stat().st_size for path in (home / "tiny.partial").glob("*.incomplete"))
     assert 0 < kept <= 3 * large
     server.cut, server.down, server.requested = {}, False, []
-    model_packages.verify(model_packages.read(model_hub.pull(REPOSITORY)))
+    model_packages.verify_files(model_packages.read_package(model_hub.pull_package(REPOSITORY)))
     assert server.requested[0] == ("text.onnx", f"bytes={kept}-")
     assert "image.onnx" not in dict(server.requested)  # it was whole already
 
@@ -156,31 +156,31 @@ def test_an_interrupted_pull_goes_on_where_it_stopped(server: Hub, home: Path) -
 def test_content_that_differs_from_its_hash_is_dropped(server: Hub, home: Path) -> None:
     server.spoilt.add("image.onnx")
     with pytest.raises(ModelError, match=r"image\.onnx of someone/tiny is not what the hub's hash says"):
-        model_hub.pull(REPOSITORY)
+        model_hub.pull_package(REPOSITORY)
     assert not (home / "tiny").exists()
     assert not list((home / "tiny.partial").glob("image.onnx*"))
     server.spoilt.clear()
-    model_packages.verify(model_packages.read(model_hub.pull(REPOSITORY)))
+    model_packages.verify_files(model_packages.read_package(model_hub.pull_package(REPOSITORY)))
 
 
 def test_what_differs_from_the_manifest_is_no_package(server: Hub, home: Path) -> None:
     (server.folder / "text.onnx").write_bytes(b"exchanged on the hub, its own hash too")
     with pytest.raises(ModelError, match=r"text\.onnx is damaged"):
-        model_hub.pull(REPOSITORY)
+        model_hub.pull_package(REPOSITORY)
     assert not (home / "tiny").exists()
 
 
 def test_a_manifest_that_lists_what_is_not_there(server: Hub) -> None:
     (server.folder / "text.onnx").unlink()
     with pytest.raises(ModelError, match=r"someone/tiny lacks text\.onnx, which its manifest lists"):
-        model_hub.pull(REPOSITORY)
+        model_hub.pull_package(REPOSITORY)
 
 
 def test_a_manifest_cannot_reach_out_of_its_folder(server: Hub, home: Path) -> None:
     text = (server.folder / "manifest.yaml").read_text().replace("text.onnx", "../text.onnx")
     (server.folder / "manifest.yaml").write_text(text)
     with pytest.raises(ModelError, match="is not the plain name of a file"):
-        model_hub.pull(REPOSITORY)
+        model_hub.pull_package(REPOSITORY)
 
 
 def test_a_checkpoint_is_pulled_without_what_could_run_code(server: Hub, home: Path) -> None:
@@ -189,10 +189,10 @@ def test_a_checkpoint_is_pulled_without_what_could_run_code(server: Hub, home: P
     (server.folder / "config.json").write_text("{}")
     (server.folder / "model.safetensors").write_bytes(b"weights")
     (server.folder / "modeling.py").write_text("import os")
-    folder = model_hub.pull(REPOSITORY)
+    folder = model_hub.pull_package(REPOSITORY)
     assert folder == home / ".checkpoints" / "tiny"
     assert {path.name for path in folder.iterdir()} == {"config.json", "model.safetensors", "tokenizer.json"}
-    assert not model_packages.installed()
+    assert not model_packages.list_installed()
 
 
 def test_pickled_weights_are_refused(server: Hub) -> None:
@@ -200,7 +200,7 @@ def test_pickled_weights_are_refused(server: Hub) -> None:
         if path.suffix != ".bin":
             path.unlink()
     with pytest.raises(ModelError, match=r"neither a model package .* nor weights as safetensors"):
-        model_hub.pull(REPOSITORY)
+        model_hub.pull_package(REPOSITORY)
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_pickled_weights_are_refused(server: Hub) -> None:
 )
 def test_names_that_are_none(server: Hub, name: str, message: str) -> None:
     with pytest.raises(ModelError, match=message):
-        model_hub.pull(name)
+        model_hub.pull_package(name)
 
 
 def test_no_network_is_told_in_a_sentence(

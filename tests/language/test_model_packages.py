@@ -51,7 +51,7 @@ def write_manifest(folder: Path, **changes: Any) -> None:
         "format": 1, "name": folder.name, "kind": "dense", "dimension": 8, "mean": [0.5] * 3, "std": [0.5] * 3,
         "patch": 14, "input_size": 224, "prefix_tokens": 0, "logit_scale": 100, "precision": "fp32", "licence": "none",
         "source": "a test", "parts": parts,
-        "files": {file: model_packages.sha256(folder / file) for file in parts.values()}, **changes,
+        "files": {file: model_packages.hash_file(folder / file) for file in parts.values()}, **changes,
     }  # fmt: skip
     (folder / "manifest.yaml").write_text(yaml.safe_dump(manifest), encoding="utf-8")
 
@@ -63,8 +63,8 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_package_is_read_verified_and_run(tmp_path: Path) -> None:
-    package = model_packages.read(dense_package(tmp_path / "tiny"))
-    model_packages.verify(package)
+    package = model_packages.read_package(dense_package(tmp_path / "tiny"))
+    model_packages.verify_files(package)
     assert (package.name, package.kind, package.dimension, package.logit_scale) == ("tiny", "dense", 8, 100.0)
     assert package.bytes == sum(path.stat().st_size for path in package.folder.iterdir() if path.stem != "manifest")
     assert package.session("image").run(["features"], {"image": np.zeros((1, 3, 28, 28), np.float32)})[0].shape[-1] == 8
@@ -75,7 +75,7 @@ def test_a_manifest_may_be_json(tmp_path: Path) -> None:
     manifest = yaml.safe_load((folder / "manifest.yaml").read_text())
     (folder / "manifest.yaml").unlink()
     (folder / "manifest.json").write_text(json.dumps(manifest))
-    assert model_packages.read(folder).dimension == 8
+    assert model_packages.read_package(folder).dimension == 8
 
 
 def test_a_wrong_hash_is_told(tmp_path: Path) -> None:
@@ -83,8 +83,8 @@ def test_a_wrong_hash_is_told(tmp_path: Path) -> None:
     content = bytearray((folder / "text.onnx").read_bytes())
     content[-5] ^= 1
     (folder / "text.onnx").write_bytes(content)
-    package = model_packages.read(folder)
-    for check in (lambda: model_packages.verify(package), lambda: package.session("text")):
+    package = model_packages.read_package(folder)
+    for check in (lambda: model_packages.verify_files(package), lambda: package.session("text")):
         with pytest.raises(ModelError, match=r"text\.onnx is damaged: its sha256 is .*…, the manifest says"):
             check()
     package.session("image")
@@ -95,7 +95,7 @@ def test_what_is_not_onnx_is_told(tmp_path: Path) -> None:
     (folder / "image.onnx").write_bytes(b"\x80\x04a pickle, perhaps")
     write_manifest(folder)
     with pytest.raises(ModelError, match=r"image\.onnx is not an ONNX network"):
-        model_packages.read(folder).session("image")
+        model_packages.read_package(folder).session("image")
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_other_inputs_and_outputs_are_told(tmp_path: Path, inputs: Any, outputs:
     graph(folder / "image.onnx", inputs, outputs)
     write_manifest(folder)
     with pytest.raises(ModelError, match=message):
-        model_packages.read(folder).session("image")
+        model_packages.read_package(folder).session("image")
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_other_inputs_and_outputs_are_told(tmp_path: Path, inputs: Any, outputs:
 def test_unusable_manifests_are_told(tmp_path: Path, changes: Any, message: str) -> None:
     folder = dense_package(tmp_path / "tiny", **changes)
     with pytest.raises(ModelError, match=message) as caught:
-        model_packages.read(folder)
+        model_packages.read_package(folder)
     assert "manifest.yaml" in str(caught.value)
 
 
@@ -153,7 +153,7 @@ def test_no_file_lies_outside_of_its_folder(tmp_path: Path, name: str) -> None:
     parts = {"image": "image.onnx", "text": name, "tokenizer": "tokenizer.json"}
     folder = dense_package(tmp_path / "tiny", parts=parts, files=dict.fromkeys(parts.values(), "0" * 64))
     with pytest.raises(ModelError, match="is not the plain name of a file in its folder"):
-        model_packages.read(folder)
+        model_packages.read_package(folder)
 
 
 @pytest.mark.parametrize("name", ["text.pt", "text.bin", "text.pkl", "text"])
@@ -161,42 +161,42 @@ def test_other_formats_are_no_part_of_a_package(tmp_path: Path, name: str) -> No
     parts = {"image": "image.onnx", "text": name, "tokenizer": "tokenizer.json"}
     folder = dense_package(tmp_path / "tiny", parts=parts, files=dict.fromkeys(parts.values(), "0" * 64))
     with pytest.raises(ModelError, match=r"is not a file of \.onnx, \.safetensors"):
-        model_packages.read(folder)
+        model_packages.read_package(folder)
 
 
 def test_manifests_run_nothing(tmp_path: Path) -> None:
     folder = dense_package(tmp_path / "tiny")
     (folder / "manifest.yaml").write_text("!!python/object/apply:os.system ['true']\n")
     with pytest.raises(ModelError, match=r"manifest\.yaml cannot be read"):
-        model_packages.read(folder)
+        model_packages.read_package(folder)
     (folder / "manifest.yaml").write_text("a: " + "x" * (1 << 20))
     with pytest.raises(ModelError, match="more than a megabyte"):
-        model_packages.read(folder)
+        model_packages.read_package(folder)
 
 
 def test_what_is_lacking_is_told(tmp_path: Path, home: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(ModelError, match="lacks a manifest"):
-        model_packages.read(tmp_path / "empty")
+        model_packages.read_package(tmp_path / "empty")
     folder = dense_package(tmp_path / "tiny")
     (folder / "text.onnx").unlink()
     with pytest.raises(ModelError, match=r"lacks its text\.onnx"):
-        model_packages.read(folder)
+        model_packages.read_package(folder)
 
 
 def test_packages_are_found_by_folder_and_by_name(tmp_path: Path, home: Path) -> None:
     with pytest.raises(ModelError, match="neither as a folder nor by name"):
-        model_packages.find("tiny", ("dense",), "language.dinov2.model")
+        model_packages.find_model("tiny", ("dense",), "language.dinov2.model")
     dense_package(home / "tiny")
-    assert model_packages.find("tiny", ("dense",), "x").folder == home / "tiny"
-    assert model_packages.find(str(home / "tiny"), ("dense",), "x").name == "tiny"
+    assert model_packages.find_model("tiny", ("dense",), "x").folder == home / "tiny"
+    assert model_packages.find_model(str(home / "tiny"), ("dense",), "x").name == "tiny"
     with pytest.raises(ModelError, match=r"There is no model 'tinny' \(did you mean 'tiny'\?\)"):
-        model_packages.find("tinny", ("dense",), "x")
+        model_packages.find_model("tinny", ("dense",), "x")
     with pytest.raises(ModelError, match=r"language\.clip\.model needs a model of kind clip; .* is of kind dense"):
-        model_packages.find("tiny", ("clip",), "language.clip.model")
+        model_packages.find_model("tiny", ("clip",), "language.clip.model")
     (tmp_path / "beside").mkdir()
     with pytest.raises(ModelError, match=r"There is no model '\.\./beside'"):
-        model_packages.find("../beside", ("dense",), "x")
+        model_packages.find_model("../beside", ("dense",), "x")
 
 
 def test_the_command_lists_and_verifies(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

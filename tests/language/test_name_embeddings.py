@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from freeocc3d.core.errors import ConfigError
 from freeocc3d.language.name_embeddings import NameEmbeddings
-from freeocc3d.language.synonyms import SYNONYMS, key_of
+from freeocc3d.language.synonyms import SYNONYMS, make_key
 
 
 def unit(values: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -44,7 +44,7 @@ def test_names_mean_their_nearest_class_where_csls_says_so() -> None:
     found = NameEmbeddings(names, embeddings).meaning(classes)
     scaled = csls(embeddings)[:, :60]
     means = scaled.max(axis=1) >= 0.04
-    assert found == {key_of(names[w]): int(scaled[w].argmax()) for w in np.flatnonzero(means)}
+    assert found == {make_key(names[w]): int(scaled[w].argmax()) for w in np.flatnonzero(means)}
     assert 65 < len(found) < 100
 
 
@@ -61,8 +61,8 @@ def test_real_embeddings_find_synonyms_and_leave_others_alone() -> None:
     """The vocabulary's groups of synonyms are the judge: of two names of a group one is taken as a class. Raw cosines
     cannot do this: one that finds as many synonyms takes more names of other things."""
     real = NameEmbeddings.read(models_folder() / "clip_text_names.npz")
-    row = {key_of(name): n for n, name in reversed(list(enumerate(real.names)))}
-    groups = [[key_of(word) for word in group if key_of(word) in row] for group in SYNONYMS]
+    row = {make_key(name): n for n, name in reversed(list(enumerate(real.names)))}
+    groups = [[make_key(word) for word in group if make_key(word) in row] for group in SYNONYMS]
     pairs = [(group[0], other) for group in groups for other in group[1:] if len(group) > 1]
     right = sum(real.meaning([a]).get(b) == 0 for a, b in pairs)
     assert len(pairs) > 10

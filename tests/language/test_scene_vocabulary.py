@@ -15,7 +15,7 @@ from vision_servers import chat, saying, send, serving
 from freeocc3d.core.errors import ConfigError
 from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.language import scene_vocabulary
-from freeocc3d.language.scene_vocabulary import Namer, Options, aggregated, load, parse
+from freeocc3d.language.scene_vocabulary import Namer, Options, aggregate_names, load_namer, parse_names
 from freeocc3d.language.vision_server import VisionServer
 
 MANY = [f"thing {chr(97 + n % 26)}{chr(97 + n // 26 % 26)}{chr(97 + n // 676)}" for n in range(10_000)]
@@ -67,7 +67,7 @@ def named(maker: Namer, path: Path, count: int = 4) -> tuple[dict[str, Any], lis
     ],
 )  # fmt: skip
 def test_names_in_answers(text: str, names: list[str] | None) -> None:
-    assert parse(text) == names
+    assert parse_names(text) == names
 
 
 def test_names_are_counted_over_keyframes_and_the_most_frequent_stand_first(tmp_path: Path) -> None:
@@ -149,20 +149,20 @@ def test_kept_answers_that_cannot_be_read_are_asked_for_again(tmp_path: Path, te
 
 
 def test_no_endpoint_no_questions() -> None:
-    assert load(Options()) is None
+    assert load_namer(Options()) is None
 
 
 def test_the_key_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     options = Options(endpoint="http://localhost/v1", model="m", api_key_env="SOME_KEY")
     monkeypatch.delenv("SOME_KEY", raising=False)
     with pytest.raises(ConfigError, match=r"SOME_KEY.*is not set"):
-        load(options)
+        load_namer(options)
     monkeypatch.setenv("SOME_KEY", "a\nb")
     with pytest.raises(ConfigError, match="not plain text") as caught:
-        load(options)
+        load_namer(options)
     assert "a\nb" not in str(caught.value)
     monkeypatch.setenv("SOME_KEY", " secret ")
-    made = load(options)
+    made = load_namer(options)
     assert made is not None
     assert made.server.key == "secret"
 
@@ -183,4 +183,4 @@ def test_options_out_of_range_are_refused(bad: dict[str, Any], told: str) -> Non
 
 
 def test_no_answers_make_an_empty_vocabulary() -> None:
-    assert aggregated({}, "m") == {"model": "m", "keyframes": [], "names": {}}
+    assert aggregate_names({}, "m") == {"model": "m", "keyframes": [], "names": {}}

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from freeocc3d.language.synonyms import INCLUDES, SYNONYMS, matching_names, narrower, normal, synonyms, wider
+from freeocc3d.language.synonyms import (
+    INCLUDES,
+    SYNONYMS,
+    find_narrower,
+    find_synonyms,
+    find_wider,
+    match_names,
+    normalize_phrase,
+)
 
 HOUSE = [
     "bed", "nightstand", "chair", "carpet", "coffee table", "dining table", "side table", "desk", "door", "door handle",
@@ -15,7 +23,7 @@ HOUSE = [
 
 def found(phrase: str, names: list[str] | None = None) -> set[str]:
     names = HOUSE if names is None else names
-    return {names[row] for row in matching_names(phrase, names)[0]}
+    return {names[row] for row in match_names(phrase, names)[0]}
 
 
 @pytest.mark.parametrize(
@@ -35,33 +43,33 @@ def found(phrase: str, names: list[str] | None = None) -> set[str]:
     ],
 )
 def test_normal(phrase: str, expected: str) -> None:
-    assert normal(phrase) == expected
+    assert normalize_phrase(phrase) == expected
 
 
 def test_normal_forms_are_their_own() -> None:
     for word in {w for group in SYNONYMS for w in group} | set(INCLUDES):
-        assert normal(normal(word)) == normal(word)
+        assert normalize_phrase(normalize_phrase(word)) == normalize_phrase(word)
 
 
 def test_synonyms_are_symmetric() -> None:
     for group in SYNONYMS:
         for word in group:
-            assert {normal(member) for member in group} <= synonyms(word)
-            for other in synonyms(word):
-                assert normal(word) in synonyms(other)
+            assert {normalize_phrase(member) for member in group} <= find_synonyms(word)
+            for other in find_synonyms(word):
+                assert normalize_phrase(word) in find_synonyms(other)
 
 
 def test_no_word_stands_in_two_groups() -> None:
-    words = [normal(word).replace(" ", "") for group in SYNONYMS for word in group]
+    words = [normalize_phrase(word).replace(" ", "") for group in SYNONYMS for word in group]
     assert len(words) == len(set(words))
 
 
 def test_wider_words_know_their_narrower_ones_and_no_circle_is_closed() -> None:
     for wide, inner in INCLUDES.items():
         for word in inner:
-            assert normal(wide) in wider(word)
-            assert normal(word) in narrower(wide)
-        assert normal(wide) not in narrower(wide)
+            assert normalize_phrase(wide) in find_wider(word)
+            assert normalize_phrase(word) in find_narrower(wide)
+        assert normalize_phrase(wide) not in find_narrower(wide)
 
 
 @pytest.mark.parametrize(
@@ -96,14 +104,14 @@ def test_phrases_find_the_classes_that_people_mean(phrase: str, names: set[str])
 
 @pytest.mark.parametrize("phrase", ["unicorn", "", "   ", "§$%", "handle bar", "wallpaper", "red", "on the"])
 def test_other_phrases_find_nothing(phrase: str) -> None:
-    assert matching_names(phrase, HOUSE) == ([], "")
+    assert match_names(phrase, HOUSE) == ([], "")
 
 
 @pytest.mark.parametrize(
     ("phrase", "part"), [("the red chair", "chair"), ("large dining tables", "dining table"), ("couch", "couch")]
 )
 def test_the_part_that_was_understood(phrase: str, part: str) -> None:
-    assert matching_names(phrase, HOUSE)[1] == part
+    assert match_names(phrase, HOUSE)[1] == part
 
 
 def test_a_class_of_the_very_name_comes_before_its_synonyms() -> None:
@@ -119,4 +127,4 @@ def test_class_names_of_other_data_sets() -> None:
 
 
 def test_a_phrase_of_thousands_of_words() -> None:
-    assert matching_names("very " * 5000 + "sofa", HOUSE) == ([], "")
+    assert match_names("very " * 5000 + "sofa", HOUSE) == ([], "")

@@ -106,7 +106,7 @@ def test_texts_are_cut_to_what_clip_takes_and_padded_to_the_longest() -> None:
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> model_packages.Package:
-    return model_packages.read(tiny_models.clip_package(tmp_path_factory.mktemp("models") / "tiny-clip"))
+    return model_packages.read_package(tiny_models.clip_package(tmp_path_factory.mktemp("models") / "tiny-clip"))
 
 
 @pytest.fixture
@@ -215,7 +215,9 @@ def test_siglips_texts_are_lowered_stripped_and_of_one_length(tmp_path: Path, ho
     model = tiny_models.siglip()
     checkpoint = build_siglip(model, tiny_models.tokenizer(), [0.5] * 3, [0.5] * 3)
     write_package(checkpoint, made, made.name, "random weights", "none")
-    found = clip.load_text(state(model_packages.read(made), templates=("{}",))).encode_words(["Red, CHAIR!", "a" * 300])
+    found = clip.load_text(state(model_packages.read_package(made), templates=("{}",))).encode_words(
+        ["Red, CHAIR!", "a" * 300]
+    )
     tokens = [
         encoding.ids
         for encoding in Tokenizer.from_file(str(made / "tokenizer.json")).encode_batch(["red chair", "a" * 300])

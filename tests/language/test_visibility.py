@@ -9,7 +9,7 @@ from scenes import CAMERA, gaussians, random_gaussians
 
 from freeocc3d.core.types import Frame
 from freeocc3d.language.lifting import Options
-from freeocc3d.language.visibility import Seen, seen, seen_reference
+from freeocc3d.language.visibility import VisibleGaussians, find_visible, find_visible_reference
 
 FLAT = Options(border=0.0)
 
@@ -32,11 +32,11 @@ def pose(seed: int) -> NDArray[np.float64]:
 
 def is_seen(z: float, depth_m: object, scale: float = 0.01, options: Options = FLAT) -> bool:
     """Whether one Gaussian on the optical axis is seen in a depth image."""
-    return len(seen(gaussians((0.0, 0.0, z), scale), frame(depth_m), np.eye(4), options).rows) == 1
+    return len(find_visible(gaussians((0.0, 0.0, z), scale), frame(depth_m), np.eye(4), options).rows) == 1
 
 
 def weight(z: float, depth_m: object, options: Options | None = None, x: float = 0.0) -> float:
-    found = seen(
+    found = find_visible(
         gaussians((x, 0.0, z), 0.01), frame(depth_m), np.eye(4), options or Options(visible_within=10.0, border=0.0)
     )
     return float(found.weights[0])
@@ -50,8 +50,8 @@ def test_kernel_agrees_with_numpy(seed: int, measured: float) -> None:
     depth = 2.0 + rng.normal(0, 0.3, (CAMERA.height, CAMERA.width))
     depth[rng.random(depth.shape) >= measured] = 0
     options = Options(visible_within=0.3, visible_share=0.1)
-    found = seen(cloud, frame(depth), pose(seed), options)
-    pixels, weights = seen_reference(cloud, frame(depth), pose(seed), options)
+    found = find_visible(cloud, frame(depth), pose(seed), options)
+    pixels, weights = find_visible_reference(cloud, frame(depth), pose(seed), options)
     ours = np.zeros(len(cloud))
     ours[found.rows] = found.weights
     assert 100 < np.count_nonzero(weights) < 2500
@@ -69,9 +69,9 @@ def test_hidden_and_outside_are_not_seen() -> None:
 
 def test_where_nothing_is_measured_the_rendered_depth_decides() -> None:
     cloud = gaussians([(0.0, 0.0, 2.0), (0.0, 0.0, 3.0), (0.5, 0.0, 3.0)], 0.02)
-    np.testing.assert_array_equal(seen(cloud, frame(0.0), np.eye(4), FLAT).rows, [0, 2])
+    np.testing.assert_array_equal(find_visible(cloud, frame(0.0), np.eye(4), FLAT).rows, [0, 2])
     # a measured depth is not overruled: what it shows through a Gaussian is seen
-    np.testing.assert_array_equal(seen(cloud, frame(3.0), np.eye(4), FLAT).rows, [1, 2])
+    np.testing.assert_array_equal(find_visible(cloud, frame(3.0), np.eye(4), FLAT).rows, [1, 2])
 
 
 def test_tolerance_grows_with_depth_and_with_the_gaussian() -> None:
@@ -85,7 +85,7 @@ def test_a_gaussians_extent_counts_along_the_ray_alone() -> None:
     flat = (0.5, 0.5, 0.001)
     for quat, expected in (((1, 0, 0, 0), False), ((np.sqrt(0.5), 0, np.sqrt(0.5), 0), True)):
         cloud = gaussians((0.0, 0.0, 2.0), flat, quats=quat)
-        assert bool(len(seen(cloud, frame(2.2), np.eye(4), FLAT).rows)) == expected
+        assert bool(len(find_visible(cloud, frame(2.2), np.eye(4), FLAT).rows)) == expected
 
 
 def test_near_views_count_more() -> None:
@@ -111,5 +111,7 @@ def test_cells_are_those_that_the_pixels_lie_in() -> None:
     """Pixel borders and cell borders, for images whose size is no multiple of the features'."""
     row, column = (axis.reshape(-1) for axis in np.mgrid[0:120:7, 0:160:3])
     pixels = (row * 160 + column).astype(np.int32)
-    view = Seen(np.arange(len(pixels), dtype=np.int32), pixels, np.ones(len(pixels), np.float32), (120, 160))
+    view = VisibleGaussians(
+        np.arange(len(pixels), dtype=np.int32), pixels, np.ones(len(pixels), np.float32), (120, 160)
+    )
     np.testing.assert_array_equal(view.cells((7, 9)), row * 7 // 120 * 9 + column * 9 // 160)

@@ -13,7 +13,7 @@ import pytest
 from vision_servers import Answer, chat, saying, send, serving
 
 from freeocc3d.core.errors import ConfigError
-from freeocc3d.language.vision_server import ServerError, VisionServer, address, one_line
+from freeocc3d.language.vision_server import ServerError, VisionServer, resolve_address, shorten_to_line
 
 JPEG = cv2.imencode(".jpg", np.full((8, 12, 3), 200, np.uint8))[1].tobytes()
 KEY = "sk-geheim-0123456789"
@@ -71,7 +71,7 @@ def test_a_local_server_is_asked_without_a_proxy(monkeypatch: pytest.MonkeyPatch
     ],
 )
 def test_addresses(endpoint: str, expected: str) -> None:
-    assert address(endpoint) == expected
+    assert resolve_address(endpoint) == expected
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_addresses(endpoint: str, expected: str) -> None:
 )
 def test_what_is_no_address_is_refused(endpoint: str, told: str) -> None:
     with pytest.raises(ConfigError, match=told) as caught:
-        address(endpoint)
+        resolve_address(endpoint)
     assert "secret" not in str(caught.value)
 
 
@@ -228,4 +228,4 @@ def test_texts_of_answers(body: bytes, text: str) -> None:
 
 
 def test_one_line_is_fit_to_be_shown() -> None:
-    assert one_line("a\n\tb\x1b[31m  c\u202e" + 100 * "d", 9) == "a b [31m "[:9]
+    assert shorten_to_line("a\n\tb\x1b[31m  c\u202e" + 100 * "d", 9) == "a b [31m "[:9]

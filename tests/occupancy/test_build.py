@@ -66,7 +66,7 @@ def test_an_empty_map_has_no_voxels() -> None:
 
 
 def test_unknown_features_stay_zero_and_known_ones_become_unit() -> None:
-    rows = build.normalized(np.array([[0, 0, 0], [3, 4, 0]], np.float32))
+    rows = build.normalize_rows(np.array([[0, 0, 0], [3, 4, 0]], np.float32))
     np.testing.assert_allclose(rows.astype(float), [[0, 0, 0], [0.6, 0.8, 0]], atol=1e-3)
 
 

@@ -18,7 +18,7 @@ OPTIONS = carve.Options()
 def evidence_of(frame: Frame, T=None, options: carve.Options = OPTIONS):
     """Counts of one image over the blocks that it looks into, and the voxel centres in the world."""
     T = np.eye(4) if T is None else T
-    evidence = carve.Evidence(ORIGIN, V, options)
+    evidence = carve.DepthEvidence(ORIGIN, V, options)
     packed = evidence.add(frame, T)
     np.testing.assert_array_equal(packed, evidence.packed)
     local = np.stack((np.arange(512) // 64, np.arange(512) // 8 % 8, np.arange(512) % 8), axis=1)
@@ -66,7 +66,7 @@ def test_missing_depth_says_nothing() -> None:
     left = centers[..., 0] < -0.1
     assert free[left].sum() == hits[left].sum() == 0
     empty = Frame(0, 0.0, frame.color, np.zeros_like(frame.depth_m), CAMERA)
-    assert len(carve.Evidence(ORIGIN, V, OPTIONS).add(empty, np.eye(4))) == 0
+    assert len(carve.DepthEvidence(ORIGIN, V, OPTIONS).add(empty, np.eye(4))) == 0
 
 
 def test_wide_patches_without_depth_may_be_seen_through_up_to_a_distance() -> None:
@@ -83,7 +83,7 @@ def test_wide_patches_without_depth_may_be_seen_through_up_to_a_distance() -> No
     assert (free[z > 4.0 - 0.5 * V] == 0).all()
     assert (free[measured & (z > 2.0 - 0.5 * V)] == 0).all()  # behind the wall, through the hole or not
     assert (hits[np.abs(z - 2.0) > 1.5 * V] == 0).all()  # a missing measurement ends nowhere
-    evidence = carve.Evidence(ORIGIN, V, options)
+    evidence = carve.DepthEvidence(ORIGIN, V, options)
     evidence.add(frame, np.eye(4))
     evidence.remove(frame, np.eye(4))
     assert not evidence.free.any()
@@ -117,10 +117,10 @@ def test_no_block_is_missed_however_small_blocks_are(sigma: float | None) -> Non
     frame = wall_frame(4.0)
     if sigma is not None:
         frame = replace(frame, depth_sigma_m=np.full_like(frame.depth_m, sigma))
-        behind = carve.Evidence(ORIGIN, 0.02, OPTIONS).visible_blocks(frame, np.eye(4))
+        behind = carve.DepthEvidence(ORIGIN, 0.02, OPTIONS).visible_blocks(frame, np.eye(4))
         assert voxel_blocks.unpack(behind)[:, 2].max() == int((4.0 + 3 * sigma) / 0.16)
     for voxel_size in (0.08, 0.02):
-        found = set(carve.Evidence(ORIGIN, voxel_size, OPTIONS).visible_blocks(frame, np.eye(4)).tolist())
+        found = set(carve.DepthEvidence(ORIGIN, voxel_size, OPTIONS).visible_blocks(frame, np.eye(4)).tolist())
         edge = 8 * voxel_size
         keys = np.stack(np.meshgrid(*[np.arange(-8, 8)] * 2, np.arange(1, int(3.8 / edge))), axis=-1).reshape(-1, 3)
         middles = (keys + 0.5) * edge
@@ -141,8 +141,8 @@ def looks(count: int) -> list[tuple[Frame, np.ndarray]]:
     return [(wall_frame(1.5 + 0.2 * n, n, seed=n), T) for n, T in enumerate(poses)]
 
 
-def counted(images) -> carve.Evidence:
-    evidence = carve.Evidence(ORIGIN, V, OPTIONS)
+def counted(images) -> carve.DepthEvidence:
+    evidence = carve.DepthEvidence(ORIGIN, V, OPTIONS)
     for frame, T in images:
         evidence.add(frame, T)
     return evidence
@@ -173,10 +173,10 @@ def test_an_image_that_is_taken_out_again_leaves_nothing_behind() -> None:
 
 def test_visible_blocks_hold_every_voxel_that_an_image_says_something_about() -> None:
     for frame, T in looks(4):
-        few = carve.Evidence(ORIGIN, V, OPTIONS)
+        few = carve.DepthEvidence(ORIGIN, V, OPTIONS)
         packed = few.add(frame, T)
         around = (voxel_blocks.unpack(packed)[:, None] + np.indices((3, 3, 3)).reshape(3, -1).T - 1).reshape(-1, 3)
-        wide = carve.Evidence(ORIGIN, V, OPTIONS)
+        wide = carve.DepthEvidence(ORIGIN, V, OPTIONS)
         wide._make_room(np.unique(voxel_blocks.pack(around)))
         wide._count(wide.packed, frame, T, 1)
         for narrow, broad in ((few.free, wide.free), (few.hits, wide.hits)):
@@ -186,12 +186,12 @@ def test_visible_blocks_hold_every_voxel_that_an_image_says_something_about() ->
 def test_log_odds_are_the_sensor_models_and_noise_widens_it() -> None:
     options = carve.Options()
     free, hits = np.array([[4, 0, 2]], np.uint16), np.array([[0, 3, 1]], np.uint16)
-    np.testing.assert_allclose(carve.log_odds(free, hits, options), [[-1.6, 2.55, 0.05]], rtol=1e-5)
+    np.testing.assert_allclose(carve.compute_log_odds(free, hits, options), [[-1.6, 2.55, 0.05]], rtol=1e-5)
     logit = np.log(0.7 / 0.3), np.log(0.4 / 0.6)
     np.testing.assert_allclose((options.hit, -options.miss), logit, atol=0.01)
     thickness = []
     for depth in (1.0, 6.0):
-        evidence = carve.Evidence(np.zeros(3), 0.08, options)
+        evidence = carve.DepthEvidence(np.zeros(3), 0.08, options)
         evidence.add(wall_frame(depth), np.eye(4))
         hit = np.argwhere(evidence.hits > 0)
         layers = voxel_blocks.unpack(evidence.packed)[hit[:, 0], 2] * 8 + hit[:, 1] % 8

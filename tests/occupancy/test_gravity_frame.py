@@ -5,7 +5,7 @@ import pytest
 from scenes import gaussians
 
 from freeocc3d.core.transforms import invert, is_rigid, quats_to_rotations, transform
-from freeocc3d.occupancy.gravity_frame import first_camera_frame, floor_height, gravity_frame
+from freeocc3d.occupancy.gravity_frame import compute_first_camera_frame, estimate_floor_height, estimate_gravity_frame
 
 
 def room(seed=0, table=1500, floor=3000, noise=0.004):
@@ -54,7 +54,7 @@ def moved(scene, poses, seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_floor_walls_and_heading_are_found_in_any_frame(seed) -> None:
     scene, poses, T = moved(room(seed), cameras(), seed)
-    found = gravity_frame(poses, scene) @ T  # from the room's own frame
+    found = estimate_gravity_frame(poses, scene) @ T  # from the room's own frame
     assert is_rigid(found)
     assert np.degrees(np.arccos(found[2, 2])) < 0.15
     floor = transform(found, np.array([(0.0, 0, 0), (4, 0, 0), (0, 6, 0), (4, 6, 0)]))
@@ -66,14 +66,14 @@ def test_floor_walls_and_heading_are_found_in_any_frame(seed) -> None:
 
 
 def test_a_table_larger_than_the_visible_floor_is_no_floor() -> None:
-    found = gravity_frame(cameras(), room(table=5000, floor=2000))
+    found = estimate_gravity_frame(cameras(), room(table=5000, floor=2000))
     assert abs(transform(found, np.array((2.0, 3, 0)))[2]) < 0.02
 
 
 def test_the_first_camera_is_the_origin_and_looks_along_x() -> None:
     scene, poses, _ = moved(room(), cameras(), 3)
-    T_gravity_map = gravity_frame(poses, scene)
-    T = first_camera_frame(T_gravity_map, poses[0])
+    T_gravity_map = estimate_gravity_frame(poses, scene)
+    T = compute_first_camera_frame(T_gravity_map, poses[0])
     assert is_rigid(T)
     np.testing.assert_allclose(transform(T, poses[0][:3, 3]), 0, atol=1e-9)
     looks = T[:3, :3] @ poses[0][:3, 2]
@@ -83,12 +83,12 @@ def test_the_first_camera_is_the_origin_and_looks_along_x() -> None:
 
 
 def test_without_a_floor_or_anything_there_is_a_frame_still() -> None:
-    assert floor_height(np.array((2.0, 3.0)), 1.5) is None
+    assert estimate_floor_height(np.array((2.0, 3.0)), 1.5) is None
     nothing = gaussians(np.zeros((0, 3)), np.zeros((0, 3)))
     for poses in (np.zeros((0, 4, 4)), np.eye(4)[None]):
-        found = gravity_frame(poses, nothing)
+        found = estimate_gravity_frame(poses, nothing)
         assert is_rigid(found)
         np.testing.assert_allclose(found[2, :3], (0, -1, 0), atol=1e-6)
     down = np.eye(4)
     down[:3, :3] = np.diag((1.0, -1.0, -1.0))  # looks straight down, z up
-    assert is_rigid(gravity_frame(down[None], room()))
+    assert is_rigid(estimate_gravity_frame(down[None], room()))

@@ -36,7 +36,7 @@ class Scene:
 
     def move(self, n: int, T: np.ndarray) -> None:
         own = self.gaussians[n]
-        self.gaussians[n] = anchors.reanchored(own, self.T[n][None], T[None])
+        self.gaussians[n] = anchors.reanchor(own, self.T[n][None], T[None])
         self.T[n] = T
         self.map.move(n, self.frames[n], T, self.gaussians[n])
 
@@ -80,7 +80,7 @@ def test_only_the_blocks_that_a_keyframe_touches_are_made_again(monkeypatch: pyt
     everything = scene.map.update()
     made = []
     monkeypatch.setattr(
-        build, "of_blocks", lambda packed, *a, of=build.of_blocks: made.append(packed) or of(packed, *a)
+        build, "build_blocks", lambda packed, *a, of=build.of_blocks: made.append(packed) or of(packed, *a)
     )
     scene.add(5)
     after = scene.map.update()

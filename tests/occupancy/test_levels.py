@@ -32,8 +32,8 @@ def some_map(keys: np.ndarray, block_levels: np.ndarray, seed: int = 0) -> Occup
 @pytest.fixture
 def mixed() -> Occupancy:
     """A block, one that is cut into eight, and one of these into eight again; at negative indices, too."""
-    cut = levels.children(np.array([(-1, 0, 2)]))
-    cut_again = levels.children(cut[3:4])
+    cut = levels.subdivide_keys(np.array([(-1, 0, 2)]))
+    cut_again = levels.subdivide_keys(cut[3:4])
     keys = np.concatenate(([(0, 0, 0)], np.delete(cut, 3, axis=0), cut_again))
     return some_map(keys, np.array([0] + 7 * [1] + 8 * [2]))
 
@@ -59,7 +59,7 @@ def test_corners_edges_and_centres(mixed: Occupancy) -> None:
 
 
 def test_cut_to_the_finest_every_part_says_what_the_whole_says(mixed: Occupancy) -> None:
-    fine = levels.uniform(mixed, 2)
+    fine = levels.make_uniform(mixed, 2)
     assert fine.voxel_size == 0.02
     assert not fine.deepest
     assert states(fine) == states(mixed)
@@ -70,7 +70,7 @@ def test_cut_to_the_finest_every_part_says_what_the_whole_says(mixed: Occupancy)
 
 @pytest.mark.parametrize("level", [0, 1])
 def test_put_together_occupied_wins_over_unknown_over_free(mixed: Occupancy, level: int) -> None:
-    made = levels.uniform(mixed, level)
+    made = levels.make_uniform(mixed, level)
     edge = 4 >> level
     parts: dict[tuple[int, ...], list[int]] = {}
     for cell, state in states(mixed).items():
@@ -81,12 +81,12 @@ def test_put_together_occupied_wins_over_unknown_over_free(mixed: Occupancy, lev
 
 
 def test_colours_of_parts_are_averaged() -> None:
-    keys = levels.children(np.array([(0, 0, 0)]))
+    keys = levels.subdivide_keys(np.array([(0, 0, 0)]))
     parts = some_map(keys, np.ones(8))
     state = np.full((8, 512), FREE, np.uint8)
     state[0, [0, 1]] = OCCUPIED  # both in voxel (0, 0, 0) of the whole
     colors = np.array([(10, 20, 30), (30, 40, 50)], np.uint8)
-    made = levels.uniform(parts.replace(state=state, colors=colors, features=np.eye(2, dtype=np.float16)), 0)
+    made = levels.make_uniform(parts.replace(state=state, colors=colors, features=np.eye(2, dtype=np.float16)), 0)
     np.testing.assert_array_equal(made.occupied_voxels(), [(0, 0, 0)])
     np.testing.assert_array_equal(made.colors, [(20, 30, 40)])
     np.testing.assert_allclose(made.features, [(0.5**0.5, 0.5**0.5)], atol=1e-3)
@@ -94,7 +94,7 @@ def test_colours_of_parts_are_averaged() -> None:
 
 def test_a_map_of_one_size_stays_what_it_is() -> None:
     one = some_map(np.array([(0, 0, 0), (3, -1, 2)]), np.zeros(2))
-    assert levels.uniform(one, 0).replace(levels=one.levels).state is one.state
+    assert levels.make_uniform(one, 0).replace(levels=one.levels).state is one.state
     assert len(to_voxel_block_grid(one).hashmap().active_buf_indices()) == 2
 
 

@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from freeocc3d.core.transforms import quats_to_rotations, transform
 from freeocc3d.core.types import FREE, OCCUPIED
-from freeocc3d.occupancy.resampling import resampled
+from freeocc3d.occupancy.resampling import resample_occupancy
 
 
 def rigid(quat, t=(0, 0, 0)):
@@ -23,7 +23,7 @@ def test_a_quarter_turn_and_whole_voxels_move_every_voxel_as_it_is() -> None:
     colors = rng.integers(0, 256, (200, 3))
     old = occupancy_of(voxels[:200], colors=colors, free=voxels[200:], origin=(0.5, -0.2, 0.1))
     T = rigid((1, 0, 0, 1), (0.3, -0.4, 1.0))
-    new, rows = resampled(old, T, np.array((0.0, 0.0, 0.1)))
+    new, rows = resample_occupancy(old, T, np.array((0.0, 0.0, 0.1)))
     for state in (OCCUPIED, FREE):
         expected = transform(T, old.centers(old.voxels(state)))
         found = new.centers(new.voxels(state))
@@ -41,7 +41,7 @@ def test_a_wall_has_no_holes_and_moves_less_than_a_voxel(seed) -> None:
     sides = np.concatenate([wall + (0, 0, z) for z in (-3, -2, -1, 1, 2, 3)])
     old = occupancy_of(wall, free=sides)
     T = rigid(np.random.default_rng(seed).normal(size=4), (0.01, 0.02, 0.03))
-    new, _ = resampled(old, T, np.zeros(3))
+    new, _ = resample_occupancy(old, T, np.zeros(3))
     occupied, free = new.occupied_voxels(), new.voxels(FREE)
     # Nothing gets through: free space on both sides is not connected by faces within the slab.
     low = np.minimum(occupied.min(axis=0), free.min(axis=0))
@@ -57,5 +57,5 @@ def test_a_wall_has_no_holes_and_moves_less_than_a_voxel(seed) -> None:
 
 
 def test_an_empty_map_stays_empty() -> None:
-    new, rows = resampled(occupancy_of([]), np.eye(4), np.zeros(3))
+    new, rows = resample_occupancy(occupancy_of([]), np.eye(4), np.zeros(3))
     assert len(new.keys) == len(rows) == 0

@@ -11,7 +11,7 @@ from freeocc3d.core.errors import ConfigError, DependencyError
 from freeocc3d.core.transforms import quats_to_rotations
 from freeocc3d.core.types import Gaussians
 from freeocc3d.occupancy import splat, splat_reference, splat_torch, voxel_blocks
-from freeocc3d.occupancy.gaussian_mass import box_masses
+from freeocc3d.occupancy.gaussian_mass import integrate_boxes
 
 V = 0.08
 LOCAL = np.stack((np.arange(512) // 64, np.arange(512) // 8 % 8, np.arange(512) % 8), axis=1)
@@ -23,7 +23,7 @@ def project(g: Gaussians, origin=(0.0, 0.0, 0.0), least=0.0, **options):
     bins = splat.bin_gaussians(g, origin, splat.Options(voxel_size=V, **options), least_scale=least)
     keys = voxel_blocks.unpack(bins.packed)
     centers = origin + ((keys[:, None] * 8 + LOCAL).reshape(-1, 3) + 0.5) * V
-    return bins, keys, splat.probability(bins, keys), centers
+    return bins, keys, splat.compute_probability(bins, keys), centers
 
 
 def alpha_at(g: Gaussians, point, **options) -> float:
@@ -82,7 +82,7 @@ def test_released_fills_the_box_around_a_gaussian_evenly() -> None:
 def test_probability_equals_the_reference_on_random_gaussians(origin, least, projection) -> None:
     g = random_gaussians(400, seed=1)
     _, _, alpha, centers = project(g, origin, least, projection=projection)
-    expected = splat_reference.probability(g, centers, splat.Options(projection=projection), least)
+    expected = splat_reference.compute_probability_reference(g, centers, splat.Options(projection=projection), least)
     np.testing.assert_allclose(alpha.reshape(-1), expected, atol=2e-6)
     assert expected.max() > 0.6
 
@@ -115,7 +115,7 @@ def test_mass_within_voxels_equals_quadrature() -> None:
     g.scales[:] = V * np.array([0.1, 0.3, 1.0, 2.0])[rng.integers(0, 4, (8, 3))]
     options = splat.Options(voxel_size=V, projection="integrated")
     _, _, alpha, centers = project(g, projection="integrated")
-    expected = splat_reference.probability(g, centers, options)
+    expected = splat_reference.compute_probability_reference(g, centers, options)
     np.testing.assert_allclose(alpha.reshape(-1), expected, atol=5e-5)
     assert expected.max() > 0.5
 
@@ -124,9 +124,9 @@ def test_mass_along_the_axes_is_in_closed_form_and_sums_to_one() -> None:
     mass, key = np.zeros((8, 8, 8)), np.zeros(3, np.int32)
     mean = np.array([4.2, 3.7, 4.0], np.float32)
     for covariance in ((0.3, 0.0, 0.0, 0.2, 0.0, 0.1), (0.3, 0.1, 0.05, 0.2, -0.05, 0.1)):
-        box_masses(mean, np.array(covariance, np.float32), key, 0, 0, 0, 8, 8, 8, mass)
+        integrate_boxes(mean, np.array(covariance, np.float32), key, 0, 0, 0, 8, 8, 8, mass)
         assert mass.sum() == pytest.approx(1.0, abs=1e-5)
-    box_masses(mean, np.array((0.25, 0, 0, 0.25, 0, 0.25), np.float32), key, 4, 3, 4, 5, 4, 5, mass)
+    integrate_boxes(mean, np.array((0.25, 0, 0, 0.25, 0, 0.25), np.float32), key, 4, 3, 4, 5, 4, 5, mass)
     halves = [
         math.erf(b / math.sqrt(0.5)) - math.erf(a / math.sqrt(0.5)) for a, b in ((-0.2, 0.8), (-0.7, 0.3), (0, 1))
     ]
@@ -139,7 +139,7 @@ def test_mass_of_sheets_and_needles_at_any_angle_sums_to_one(flat) -> None:
     for R in quats_to_rotations(random_gaussians(40, seed=9).quats_wxyz.astype(float)):
         S = R @ np.diag(np.array(flat) ** 2) @ R.T
         covariance = S[np.triu_indices(3)].astype(np.float32)
-        box_masses(np.full(3, 4.1, np.float32), covariance, key, 0, 0, 0, 8, 8, 8, mass)
+        integrate_boxes(np.full(3, 4.1, np.float32), covariance, key, 0, 0, 0, 8, 8, 8, mass)
         assert mass.min() >= 0
         assert mass.sum() == pytest.approx(1.0, abs=1e-5)
 
@@ -167,9 +167,9 @@ def test_posterior_mean_equals_the_reference(projection) -> None:
     slots = np.full(alpha.shape, -1, np.int32)
     slots[wanted] = np.arange(wanted.sum())
     values = np.random.default_rng(5).normal(size=(len(g), 9)).astype(np.float32)
-    mean = splat.posterior_mean(bins, keys, slots, values)
+    mean = splat.compute_posterior_mean(bins, keys, slots, values)
     options = splat.Options(projection=projection)
-    expected = splat_reference.posterior_mean(g, centers[wanted.reshape(-1)], values, options)
+    expected = splat_reference.compute_posterior_mean_reference(g, centers[wanted.reshape(-1)], values, options)
     np.testing.assert_allclose(mean, expected, atol=2e-5 if projection == "probabilistic" else 2e-4)
 
 
@@ -181,8 +181,8 @@ def test_values_of_half_precision_are_taken_as_they_are() -> None:
     halves = np.random.default_rng(5).normal(size=(len(g), 9)).astype(np.float16)
     halves[:, :3] *= np.float16(1e-4)  # some without a whole mantissa
     halves[::7, 3] = -255
-    expected = splat.posterior_mean(bins, keys, slots, halves.astype(np.float32))
-    np.testing.assert_allclose(splat.posterior_mean(bins, keys, slots, halves), expected, rtol=1e-6)
+    expected = splat.compute_posterior_mean(bins, keys, slots, halves.astype(np.float32))
+    np.testing.assert_allclose(splat.compute_posterior_mean(bins, keys, slots, halves), expected, rtol=1e-6)
 
 
 def test_posterior_prefers_the_narrow_the_near_and_the_opaque() -> None:
@@ -191,7 +191,7 @@ def test_posterior_prefers_the_narrow_the_near_and_the_opaque() -> None:
     bins, keys, alpha, centers = project(g)
     slots = np.full(alpha.shape, -1, np.int32)
     slots.reshape(-1)[np.linalg.norm(centers - center, axis=1).argmin()] = 0
-    mean = splat.posterior_mean(bins, keys, slots, np.eye(2, dtype=np.float32))
+    mean = splat.compute_posterior_mean(bins, keys, slots, np.eye(2, dtype=np.float32))
     weights = np.array([0.5 / 0.02**3, 1.0 / 0.06**3 * np.exp(-0.5 * (0.03 / 0.06) ** 2)])
     np.testing.assert_allclose(mean[0], weights / weights.sum(), rtol=1e-4)
 
@@ -219,13 +219,15 @@ def test_torch_projects_as_the_kernels_do(device: str, projection: str, monkeypa
     bins, keys, alpha, _ = project(g, (0.3, -1.2, 0.0), 0.03, projection=projection)
     there = replace(bins, device=device)
     monkeypatch.setattr(splat_torch, "_PAIRS", 1000)
-    np.testing.assert_allclose(splat.probability(there, keys), alpha, atol=3e-6)
+    np.testing.assert_allclose(splat.compute_probability(there, keys), alpha, atol=3e-6)
     slots = np.full(alpha.shape, -1, np.int32)
     wanted = alpha > 0.3
     slots[wanted] = np.arange(wanted.sum())
     values = np.random.default_rng(5).normal(size=(len(g), 20)).astype(np.float32)
     np.testing.assert_allclose(
-        splat.posterior_mean(there, keys, slots, values), splat.posterior_mean(bins, keys, slots, values), atol=3e-5
+        splat.compute_posterior_mean(there, keys, slots, values),
+        splat.compute_posterior_mean(bins, keys, slots, values),
+        atol=3e-5,
     )
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from freeocc3d.capture.readers.synthetic import camera_on_the_walk
 from freeocc3d.core.transforms import quats_to_rotations
-from freeocc3d.occupancy.up_direction import estimate_up, turned_back
+from freeocc3d.occupancy.up_direction import estimate_up, turn_back
 
 
 def turned(seed: int) -> np.ndarray:
@@ -60,9 +60,9 @@ def test_images_that_were_turned_to_one_size_do_not_turn_up() -> None:
     given = rolled(T, 90.0 * quarters)
     turned_left = int(np.flatnonzero(quarters == 1)[0])
     np.testing.assert_allclose(-given[turned_left, :3, 0], -T[turned_left, :3, 1], atol=1e-12)
-    np.testing.assert_allclose(turned_back(given, quarters), T, atol=1e-12)
+    np.testing.assert_allclose(turn_back(given, quarters), T, atol=1e-12)
     points = np.zeros((0, 3))
-    assert estimate_up(turned_back(given, quarters), points) @ estimate_up(T, points) > 1 - 1e-12
+    assert estimate_up(turn_back(given, quarters), points) @ estimate_up(T, points) > 1 - 1e-12
     assert estimate_up(given, points) @ estimate_up(T, points) < 0.99, "what the turned images alone would say"
 
 

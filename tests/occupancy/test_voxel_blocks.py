@@ -22,9 +22,9 @@ def test_packed_key_is_pack_of_one() -> None:
 def test_table_finds_what_is_there_and_nothing_else() -> None:
     packed = np.unique(voxel_blocks.pack(np.random.default_rng(1).integers(-50, 50, (5000, 3))))
     table, rows = hash_table.build_table(packed, len(packed))
-    assert [hash_table.find(table, rows, key) for key in packed.tolist()] == list(range(len(packed)))
+    assert [hash_table.find_row(table, rows, key) for key in packed.tolist()] == list(range(len(packed)))
     absent = voxel_blocks.pack(np.array([[60, 0, 0], [0, -51, 3]]))
-    assert [hash_table.find(table, rows, key) for key in absent.tolist()] == [-1, -1]
+    assert [hash_table.find_row(table, rows, key) for key in absent.tolist()] == [-1, -1]
 
 
 def test_touched_blocks_of_boxes_are_those_that_a_plain_loop_lists() -> None:
@@ -36,14 +36,14 @@ def test_touched_blocks_of_boxes_are_those_that_a_plain_loop_lists() -> None:
         if all(x <= y for x, y in zip(a, b, strict=True)):
             ranges = [range(x >> 3, (y >> 3) + 1) for x, y in zip(a, b, strict=True)]
             expected |= {(i, j, k) for i in ranges[0] for j in ranges[1] for k in ranges[2]}
-    found = voxel_blocks.unpack(voxel_blocks.touched_blocks(lo, hi))
+    found = voxel_blocks.unpack(voxel_blocks.find_touched_blocks(lo, hi))
     assert len(found) == len(expected)
     assert {tuple(key) for key in found.tolist()} == expected
 
 
 def test_blocks_along_a_ray_connect_the_camera_with_the_surface() -> None:
     keys = voxel_blocks.unpack(
-        voxel_blocks.blocks_along_rays(np.array([[3.0, 0.1, 0.1]]), np.array([0.1, 0.1, 0.1]), np.zeros(3), 0.08)
+        voxel_blocks.find_blocks_along_rays(np.array([[3.0, 0.1, 0.1]]), np.array([0.1, 0.1, 0.1]), np.zeros(3), 0.08)
     )
     assert sorted(map(tuple, keys.tolist())) == [(i, 0, 0) for i in range(5)]
 
@@ -52,7 +52,7 @@ def test_blocks_along_rays_are_those_that_a_fine_walk_meets() -> None:
     rng = np.random.default_rng(3)
     points, center, origin = rng.uniform(-4, 4, (60, 3)), np.array([0.13, -0.2, 0.37]), np.array([-0.3, 0.1, 0.2])
     points[:20, rng.integers(0, 3, 20)] = center[0]  # some run along an axis
-    found = voxel_blocks.blocks_along_rays(points, center, origin, 0.05)
+    found = voxel_blocks.find_blocks_along_rays(points, center, origin, 0.05)
     assert (np.diff(found) > 0).all()
     samples = center + (points - center)[:, None] * np.linspace(0, 1, 20_001)[None, :, None]
     met = np.unique(voxel_blocks.pack(np.floor((samples.reshape(-1, 3) - origin) / 0.4).astype(int)))

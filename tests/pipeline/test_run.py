@@ -94,10 +94,12 @@ def test_fitting_while_frames_come_in_keeps_what_was_fitted(tmp_path) -> None:
     mapper.refine()
     current = mapper.update_gaussians()
     views = mapper.views(mapper.trajectory())
-    before, after = (rendered_views.fidelity(g, views, mapper.rasterizer) for g in (mapper.anchor_gaussians(), current))
+    before, after = (
+        rendered_views.measure_fidelity(g, views, mapper.rasterizer) for g in (mapper.anchor_gaussians(), current)
+    )
     assert after.psnr_measured > before.psnr_measured + 0.5
     oldest_before, oldest_after = (
-        rendered_views.fidelity(g, views[:1], mapper.rasterizer) for g in (mapper.anchor_gaussians(), current)
+        rendered_views.measure_fidelity(g, views[:1], mapper.rasterizer) for g in (mapper.anchor_gaussians(), current)
     )
     assert oldest_after.psnr_measured > oldest_before.psnr_measured
     world = mapper.trajectory().T_world_keyframe[current.anchor_keyframe]

@@ -73,8 +73,8 @@ def test_a_video_becomes_a_map_whose_scale_is_said_to_be_unknown_and_can_be_give
     assert np.median(scan_map.gaussians.scales[:, 0]) == pytest.approx(0.7 * cell, rel=1e-3)
     assert not any("what camera" in text for text in scan_map.report["warnings"])
     assert scan_map.trajectory.has_pose.all()
-    assert scaling.by_poses(scan_map, str(scan / "metric.txt")) == pytest.approx(UNIT_M, rel=1e-3)
-    assert scaling.by_camera_height(scan_map, 1.5) == pytest.approx(UNIT_M, rel=0.06)
+    assert scaling.scale_by_poses(scan_map, str(scan / "metric.txt")) == pytest.approx(UNIT_M, rel=1e-3)
+    assert scaling.scale_by_camera_height(scan_map, 1.5) == pytest.approx(UNIT_M, rel=0.06)
 
 
 def test_with_a_scale_given_from_the_start_the_map_is_metric(scan: Path, tmp_path: Path) -> None:

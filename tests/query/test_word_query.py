@@ -17,7 +17,7 @@ from freeocc3d.core.errors import ConfigError, FreeOccError, MapError
 from freeocc3d.core.types import BLOCK, FREE, OCCUPIED, Occupancy
 from freeocc3d.language.encoders.base import TextEncoder, TextFeatures
 from freeocc3d.language.encoders.labels import LabelWords
-from freeocc3d.occupancy.connected_components import connected
+from freeocc3d.occupancy.connected_components import label_components
 from freeocc3d.query import word_query as asking
 from freeocc3d.query.word_query import Options, query, similarity, to_json, to_text
 
@@ -78,7 +78,7 @@ def test_components_are_those_of_flooding(seed: int) -> None:
     rng = np.random.default_rng(seed)
     voxels = np.unique(rng.integers(-12, 12, (400, 3)), axis=0).astype(np.int32)
     rng.shuffle(voxels)
-    component = connected(voxels)
+    component = label_components(voxels)
     assert {frozenset(np.flatnonzero(component == c)) for c in np.unique(component)} == components_by_flooding(voxels)
 
 
@@ -90,27 +90,27 @@ def test_compiled_components_are_the_same(seed: int) -> None:
     voxels = np.unique(rng.integers(-12, 12, (2000, 3)) + (300_000, -5, 0), axis=0).astype(np.int32)
     if seed % 2:
         rng.shuffle(voxels)
-    component = component_labels.connected(voxels)
+    component = component_labels.label_lattice(voxels)
     assert component is not None
     found = {frozenset(np.flatnonzero(component == c)) for c in np.unique(component)}
     assert found == components_by_flooding(voxels)
     assert component[np.unique(component, return_index=True)[1]].tolist() == list(range(len(found)))
     apart = (voxels[:40] * 100).astype(np.int32)
-    assert component_labels.connected(apart) is None
-    assert len(np.unique(connected(apart))) == 40
+    assert component_labels.label_lattice(apart) is None
+    assert len(np.unique(label_components(apart))) == 40
 
 
 def test_each_of_26_neighbours_connects_and_no_other_does() -> None:
     for step in product((-2, -1, 0, 1, 2), repeat=3):
         if any(step):
             touching = max(map(abs, step)) == 1
-            component = connected(np.array([(0, 0, 0), step], np.int32))
+            component = label_components(np.array([(0, 0, 0), step], np.int32))
             assert (component[0] == component[1]) == touching, step
 
 
 def test_components_far_from_the_origin() -> None:
     voxels = np.array([(-500_000, 400_000, -3), (-499_999, 399_999, -4), (500_000, 0, 0)], np.int32)
-    component = connected(voxels)
+    component = label_components(voxels)
     assert component[0] == component[1] != component[2]
 
 

@@ -9,7 +9,7 @@ from scenes import random_gaussians
 
 import freeocc3d
 from freeocc3d.core.errors import MapError
-from freeocc3d.gaussians.point_cloud import from_point_cloud, read_ply, to_point_cloud, write_ply
+from freeocc3d.gaussians.point_cloud import from_point_cloud, read_gaussian_ply, to_point_cloud, write_gaussian_ply
 from freeocc3d.query.conditions import Where
 from freeocc3d.storage import store
 from freeocc3d.storage.keyframes import Keyframes
@@ -73,8 +73,8 @@ def test_a_place_to_stand_is_told_where_lengths_are_metres(saved, monkeypatch) -
 
 def test_gaussians_survive_the_point_cloud_and_the_file_exactly(tmp_path) -> None:
     g = random_gaussians(50, seed=0)
-    write_ply(g, tmp_path / "g.ply")
-    for again in (from_point_cloud(to_point_cloud(g)), read_ply(tmp_path / "g.ply")):
+    write_gaussian_ply(g, tmp_path / "g.ply")
+    for again in (from_point_cloud(to_point_cloud(g)), read_gaussian_ply(tmp_path / "g.ply")):
         for name in g.__dataclass_fields__:
             np.testing.assert_array_equal(getattr(again, name), getattr(g, name))
             assert getattr(again, name).dtype == getattr(g, name).dtype

@@ -8,10 +8,10 @@ from scenes import CAMERA, wall_frame
 from scipy.linalg import expm
 
 from freeocc3d.capture import open_capture
-from freeocc3d.core.transforms import apart, invert, quats_to_rotations
+from freeocc3d.core.transforms import invert, measure_pose_difference, quats_to_rotations
 from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.tracking.rgbd import dense_alignment, orb_features
-from freeocc3d.tracking.rgbd.alignment_views import View, view_of
+from freeocc3d.tracking.rgbd.alignment_views import AlignmentView, prepare_alignment_view
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def relative(capture, source: int, target: int) -> np.ndarray:
     return invert(capture.pose(target)) @ capture.pose(source)
 
 
-def with_pyramid(view: View) -> tuple:
+def with_pyramid(view: AlignmentView) -> tuple:
     return view.points, view.normals, view.gray[0]
 
 
@@ -48,7 +48,7 @@ def test_a_plane_is_fitted_exactly_where_the_views_camera_says(width) -> None:
     v, u = np.mgrid[: camera.height, : camera.width]
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     depth = (2.0 / (1.0 + 0.4 * x - 0.3 * y)).astype(np.float32)  # the plane z + 0.4 x - 0.3 y = 2
-    view = view_of(Frame(0, 0.0, np.zeros((*depth.shape, 3), np.uint8), depth, camera))
+    view = prepare_alignment_view(Frame(0, 0.0, np.zeros((*depth.shape, 3), np.uint8), depth, camera))
     assert view.covered > 0.95
     seen = view.points[..., 2] > 0
     np.testing.assert_allclose(view.points[seen] @ (0.4, -0.3, 1.0), 2.0, atol=1e-4)
@@ -62,12 +62,12 @@ def test_a_plane_is_fitted_exactly_where_the_views_camera_says(width) -> None:
 
 
 def test_fitting_takes_noise_away_and_keeps_edges() -> None:
-    flat = view_of(wall_frame(2.0, seed=1))
+    flat = prepare_alignment_view(wall_frame(2.0, seed=1))
     raw = wall_frame(2.0, seed=1).depth_m
     assert flat.points[..., 2][flat.points[..., 2] > 0].std() < 0.5 * raw.std()
     depth = np.full((120, 160), 2.0, np.float32)
     depth[:, 80:] = 3.0
-    view = view_of(Frame(0, 0.0, np.zeros((120, 160, 3), np.uint8), depth, CAMERA))
+    view = prepare_alignment_view(Frame(0, 0.0, np.zeros((120, 160, 3), np.uint8), depth, CAMERA))
     z = view.points[..., 2]
     assert set(np.unique(z.round(3)).tolist()) <= {0.0, 2.0, 3.0}
 
@@ -76,10 +76,10 @@ def test_holes_and_depth_that_is_missing_altogether() -> None:
     frame = wall_frame(2.0)
     depth = frame.depth_m.copy()
     depth[:, :80] = 0
-    half = view_of(replace(frame, depth_m=depth))
+    half = prepare_alignment_view(replace(frame, depth_m=depth))
     assert 0.4 < half.covered < 0.55
     assert (half.points[half.points[..., 2] == 0] == 0).all()
-    assert view_of(replace(frame, depth_m=np.zeros_like(depth))).covered == 0
+    assert prepare_alignment_view(replace(frame, depth_m=np.zeros_like(depth))).covered == 0
 
 
 # Alignment
@@ -88,9 +88,9 @@ def test_holes_and_depth_that_is_missing_altogether() -> None:
 @pytest.mark.parametrize(("source", "target"), [(1, 0), (13, 12), (31, 30), (47, 45)])
 def test_the_pose_of_a_view_in_another_is_found(room, source, target) -> None:
     true = relative(room, source, target)
-    a, b = view_of(room[source]), view_of(room[target])
-    aligned = dense_alignment.align(a, b, small_pose() @ true)
-    metres, degrees = apart(true, aligned.T_target_source)
+    a, b = prepare_alignment_view(room[source]), prepare_alignment_view(room[target])
+    aligned = dense_alignment.align_views(a, b, small_pose() @ true)
+    metres, degrees = measure_pose_difference(true, aligned.T_target_source)
     assert metres < 0.003
     assert degrees < 0.1
     assert aligned.determined
@@ -101,10 +101,10 @@ def test_the_pose_of_a_view_in_another_is_found(room, source, target) -> None:
 def test_another_exposure_moves_nothing(room) -> None:
     true = relative(room, 13, 12)
     darker = replace(room[13], color=(0.6 * room[13].color + 10).astype(np.uint8))
-    b = view_of(room[12])
-    plain = dense_alignment.align(view_of(room[13]), b, true)
-    dark = dense_alignment.align(view_of(darker), b, true)
-    metres, degrees = apart(plain.T_target_source, dark.T_target_source)
+    b = prepare_alignment_view(room[12])
+    plain = dense_alignment.align_views(prepare_alignment_view(room[13]), b, true)
+    dark = dense_alignment.align_views(prepare_alignment_view(darker), b, true)
+    metres, degrees = measure_pose_difference(plain.T_target_source, dark.T_target_source)
     assert metres < 5e-4
     assert degrees < 0.02
 
@@ -115,9 +115,11 @@ def test_holes_are_not_counted_as_disagreement(room) -> None:
     depth = target.depth_m.copy()
     depth[::2] = 0
     depth[:, : depth.shape[1] // 2] = 0
-    aligned = dense_alignment.align(view_of(room[13]), view_of(replace(target, depth_m=depth)), true)
+    aligned = dense_alignment.align_views(
+        prepare_alignment_view(room[13]), prepare_alignment_view(replace(target, depth_m=depth)), true
+    )
     assert aligned.inliers > 0.9
-    assert max(apart(true, aligned.T_target_source)) < 0.2
+    assert max(measure_pose_difference(true, aligned.T_target_source)) < 0.2
 
 
 def test_a_bare_wall_tells_its_distance_and_not_a_slide_along_it() -> None:
@@ -129,7 +131,7 @@ def test_a_bare_wall_tells_its_distance_and_not_a_slide_along_it() -> None:
     ]
     guess = np.eye(4)
     guess[:3, 3] = 0.03, -0.02, 0.0
-    aligned = dense_alignment.align(view_of(blank[1]), view_of(blank[0]), guess)
+    aligned = dense_alignment.align_views(prepare_alignment_view(blank[1]), prepare_alignment_view(blank[0]), guess)
     assert not aligned.determined
     assert np.isnan(aligned.correlation)
     np.testing.assert_allclose(aligned.T_target_source[:3, 3], (0.03, -0.02, -0.05), atol=0.004)
@@ -137,15 +139,17 @@ def test_a_bare_wall_tells_its_distance_and_not_a_slide_along_it() -> None:
 
 
 def test_what_is_wrong_has_few_inliers_or_looks_different(room) -> None:
-    a, b = view_of(room[30]), view_of(room[0])
-    aligned = dense_alignment.align(a, b, np.eye(4))
+    a, b = prepare_alignment_view(room[30]), prepare_alignment_view(room[0])
+    aligned = dense_alignment.align_views(a, b, np.eye(4))
     assert aligned.inliers < 0.6 or aligned.correlation < 0.8 or aligned.overlap < 0.3
 
 
 def test_results_are_rigid_and_the_guess_is_left_alone(room) -> None:
     guess = small_pose() @ relative(room, 13, 12)
     kept = guess.copy()
-    T = dense_alignment.align(view_of(room[13]), view_of(room[12]), guess).T_target_source
+    T = dense_alignment.align_views(
+        prepare_alignment_view(room[13]), prepare_alignment_view(room[12]), guess
+    ).T_target_source
     np.testing.assert_array_equal(guess, kept)
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
 
@@ -199,13 +203,13 @@ def reference(source, target, T, brightness, scales, photometric, stride):
 
 @pytest.mark.parametrize("stride", [1, 2])
 def test_normal_equations_are_those_of_a_plain_computation(room, stride) -> None:
-    a, b = view_of(room[13]), view_of(room[12])
+    a, b = prepare_alignment_view(room[13]), prepare_alignment_view(room[12])
     T = small_pose(0.5, 0.01) @ relative(room, 13, 12)
     brightness, scales = np.array((0.9, 0.05)), np.array((2.0, 4.0))
     H, g, counts = reference(a, b, T, brightness, scales, 0.2, stride)
     H8, g8, stats = np.zeros((8, 8)), np.zeros(8), np.zeros(dense_alignment.STATS)
     given = scales.copy()
-    dense_alignment.linearise(
+    dense_alignment.linearize(
         *with_pyramid(a), *with_pyramid(b), b.camera, T, stride, brightness, given, 0.2, H8, g8, stats
     )
     np.testing.assert_allclose(stats[:5], counts, atol=2)
@@ -218,7 +222,7 @@ def test_gain_and_offset_are_eliminated_as_a_full_solution_would() -> None:
     rng = np.random.default_rng(0)
     A = rng.normal(size=(30, 8))
     H, g = A.T @ A, rng.normal(size=8)
-    H6, g6 = dense_alignment.marginal(H.copy(), g.copy())
+    H6, g6 = dense_alignment.eliminate_brightness(H.copy(), g.copy())
     np.testing.assert_allclose(np.linalg.solve(H6, g6), np.linalg.solve(H, g)[:6], rtol=1e-6)
 
 
@@ -229,17 +233,17 @@ def test_a_step_is_the_exponential_map() -> None:
     twist[:3, 3] = xi[3:]
     T = small_pose(20, 0.5)
     moved = T.copy()
-    dense_alignment.move(moved, xi)
+    dense_alignment.apply_twist(moved, xi)
     np.testing.assert_allclose(moved, expm(twist) @ T, atol=1e-9)
 
 
 def test_directions_without_information_are_left_out_and_told() -> None:
     H = np.diag((4.0, 4.0, 4.0, 1.0, 1.0, 1.0)) * 1e5
-    kept, _, determined = dense_alignment.constrained(H, np.ones(6))
+    kept, _, determined = dense_alignment.remove_undetermined(H, np.ones(6))
     assert determined
     np.testing.assert_allclose(kept, H, rtol=2e-3)
     H[3, 3] = 50.0  # what noise in the normals of a wall pretends
-    kept, gradient, determined = dense_alignment.constrained(H, np.ones(6))
+    kept, gradient, determined = dense_alignment.remove_undetermined(H, np.ones(6))
     assert not determined
     assert kept[3, 3] == 0
     assert gradient[3] == 0
@@ -255,11 +259,11 @@ def test_reprojection_is_the_derivative_of_its_error() -> None:
     moved = points @ T[:3, :3].T + T[:3, 3]
     rays = (moved[:, :2] / moved[:, 2:] + rng.normal(0, 1e-4, (40, 2))).astype(np.float32)
     H, g = np.zeros((6, 6)), np.zeros(6)
-    assert orb_features.reprojection(points, rays, T, 500.0, H, g) == (40, 40)
+    assert orb_features.add_reprojection(points, rays, T, 500.0, H, g) == (40, 40)
 
     def errors(xi) -> np.ndarray:
         there = T.copy()
-        dense_alignment.move(there, xi)
+        dense_alignment.apply_twist(there, xi)
         x = points @ there[:3, :3].T + there[:3, 3]
         return 500.0 * (x[:, :2] / x[:, 2:] - rays).ravel()
 
@@ -270,23 +274,23 @@ def test_reprojection_is_the_derivative_of_its_error() -> None:
 
 def test_features_find_a_pose_that_is_far_away(room) -> None:
     a, b = room[17], room[12]
-    view_a, view_b = view_of(a), view_of(b)
-    fa, fb = orb_features.detect(a), orb_features.detect(b)
-    rows = orb_features.match(fa, fb)
-    points = orb_features.lift(fa.rays(a.intrinsics), view_a)[rows[:, 0]]
+    view_a, view_b = prepare_alignment_view(a), prepare_alignment_view(b)
+    fa, fb = orb_features.detect_features(a), orb_features.detect_features(b)
+    rows = orb_features.match_binary(fa, fb)
+    points = orb_features.lift_rays(fa.rays(a.intrinsics), view_a)[rows[:, 0]]
     known = points[:, 2] > 0
-    found = orb_features.pose(points[known], fb.rays(b.intrinsics)[rows[known, 1]], 1.0 / b.intrinsics.fx)
+    found = orb_features.estimate_pose(points[known], fb.rays(b.intrinsics)[rows[known, 1]], 1.0 / b.intrinsics.fx)
     assert found is not None
-    metres, degrees = apart(relative(room, 17, 12), found[0])
+    metres, degrees = measure_pose_difference(relative(room, 17, 12), found[0])
     assert metres < 0.08
     assert degrees < 2
-    aligned = dense_alignment.align(view_a, view_b, found[0])
-    assert apart(relative(room, 17, 12), aligned.T_target_source)[0] < 0.005
+    aligned = dense_alignment.align_views(view_a, view_b, found[0])
+    assert measure_pose_difference(relative(room, 17, 12), aligned.T_target_source)[0] < 0.005
 
 
 def test_an_image_without_corners_has_no_features() -> None:
     frame = Frame(0, 0.0, np.full((120, 160, 3), 90, np.uint8), np.full((120, 160), 2, np.float32), CAMERA)
-    none = orb_features.detect(frame)
+    none = orb_features.detect_features(frame)
     assert none.pixels.shape == (0, 2)
-    assert orb_features.match(none, none).shape == (0, 2)
-    assert orb_features.pose(np.zeros((0, 3), np.float32), np.zeros((0, 2), np.float32), 0.01) is None
+    assert orb_features.match_binary(none, none).shape == (0, 2)
+    assert orb_features.estimate_pose(np.zeros((0, 3), np.float32), np.zeros((0, 2), np.float32), 0.01) is None

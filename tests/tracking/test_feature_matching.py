@@ -10,8 +10,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 from freeocc3d.core.errors import ModelError
 from freeocc3d.tracking.sfm import pair_selection
-from freeocc3d.tracking.sfm.feature_matching import _nearest, _nearest_reference, match
-from freeocc3d.tracking.sfm.local_features import Sift, detector
+from freeocc3d.tracking.sfm.feature_matching import _nearest, _nearest_reference, match_descriptors
+from freeocc3d.tracking.sfm.local_features import Sift, load_detector
 
 
 def unit(rows: np.ndarray) -> np.ndarray:
@@ -31,13 +31,13 @@ def test_matches_are_mutual_and_unrivalled() -> None:
     a = unit(rng.normal(size=(30, 64)))
     order = rng.permutation(30)
     b = unit(a[order] + 0.02 * rng.normal(size=a.shape))
-    rows = match(a, b, 0.8)
+    rows = match_descriptors(a, b, 0.8)
     assert len(rows) == 30
     np.testing.assert_array_equal(order[rows[:, 1]], rows[:, 0])
     doubled = np.concatenate((b, unit(b[:1] + 0.001)))  # now two are as near to one
-    assert order[0] not in match(a, doubled, 0.8)[:, 0]
-    assert order[0] in match(a, doubled, 1.0)[:, 0]
-    assert len(match(a, b[:1], 0.8)) == 0
+    assert order[0] not in match_descriptors(a, doubled, 0.8)[:, 0]
+    assert order[0] in match_descriptors(a, doubled, 1.0)[:, 0]
+    assert len(match_descriptors(a, b[:1], 0.8)) == 0
 
 
 def images_on_a_line(count: int) -> list[np.ndarray]:
@@ -49,15 +49,15 @@ def images_on_a_line(count: int) -> list[np.ndarray]:
 
 
 def test_a_video_is_told_from_photographs_and_loops_are_proposed() -> None:
-    alike = pair_selection.similarity(images_on_a_line(40))
-    assert pair_selection.in_order(alike)
+    alike = pair_selection.compare_images(images_on_a_line(40))
+    assert pair_selection.is_sequence(alike)
     mixed = np.random.default_rng(3).permutation(40)
-    assert not pair_selection.in_order(alike[mixed][:, mixed])
-    pairs = {tuple(pair) for pair in pair_selection.pairs(alike, 2, 2).tolist()}
+    assert not pair_selection.is_sequence(alike[mixed][:, mixed])
+    pairs = {tuple(pair) for pair in pair_selection.choose_pairs(alike, 2, 2).tolist()}
     assert {(n, n + 1) for n in range(39)} | {(n, n + 2) for n in range(38)} <= pairs
     assert (0, 39) in pairs
     assert all(i < j for i, j in pairs)
-    assert len(pair_selection.pairs(alike, 0, 39)) == 40 * 39 // 2
+    assert len(pair_selection.choose_pairs(alike, 0, 39)) == 40 * 39 // 2
 
 
 def test_sift_puts_features_where_things_are() -> None:
@@ -116,22 +116,22 @@ def write_detector(path: Path, size: tuple[int, int] = (120, 160), described: st
 
 
 def test_features_of_a_network_match_between_shifted_images(tmp_path: Path) -> None:
-    detect = detector(str(write_detector(tmp_path / "corners.onnx")))
+    detect = load_detector(str(write_detector(tmp_path / "corners.onnx")))
     rng = np.random.default_rng(4)
     texture = cv2.GaussianBlur(rng.integers(0, 256, (140, 180), np.uint8), (0, 0), 1.5)
     first, second = (np.repeat(texture[y : y + 120, x : x + 160, None], 3, 2) for y, x in ((0, 0), (6, 10)))
     a, b = detect(first), detect(second)
     assert a.descriptors.dtype == np.float32
-    rows = match(a.descriptors, b.descriptors, detect.ratio)
+    rows = match_descriptors(a.descriptors, b.descriptors, detect.ratio)
     moved = a.pixels[rows[:, 0]] - b.pixels[rows[:, 1]]
     assert (np.abs(moved - (10, 6)).max(axis=1) < 0.5).sum() > 25
 
 
 def test_networks_that_find_no_features_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no network"):
-        detector(str(tmp_path / "missing.onnx"))
+        load_detector(str(tmp_path / "missing.onnx"))
     with pytest.raises(ModelError, match="keypoints and descriptors"):
-        detector(str(write_detector(tmp_path / "other.onnx", described="logits")))
+        load_detector(str(write_detector(tmp_path / "other.onnx", described="logits")))
     (tmp_path / "text.onnx").write_text("no network")
     with pytest.raises(ModelError, match="not an ONNX network"):
-        detector(str(tmp_path / "text.onnx"))
+        load_detector(str(tmp_path / "text.onnx"))

@@ -8,7 +8,7 @@ from freeocc3d.capture import open_capture
 from freeocc3d.capture.base import Capture, Options
 from freeocc3d.capture.focal_correction import Reregistered
 from freeocc3d.core.errors import ConfigError
-from freeocc3d.tracking.rgbd.focal_calibration import color_focal
+from freeocc3d.tracking.rgbd.focal_calibration import estimate_color_focal
 
 ROOM = {"synthetic": {"frames": 120, "width": 320, "height": 240, "noise": True}}
 
@@ -19,26 +19,26 @@ def room() -> Capture:
 
 
 def test_a_capture_that_fits_is_left_alone(room) -> None:
-    assert color_focal(room, range(len(room))) == 1.0
+    assert estimate_color_focal(room, range(len(room))) == 1.0
 
 
 @pytest.mark.parametrize("ratio", [0.9, 1.1])
 def test_a_wrong_focal_length_is_found(room, ratio) -> None:
     """Colour seen as by a camera with 1 / ratio of the focal length has to be brought back by ratio."""
     wrong = Reregistered(room, 1 / ratio)
-    found = color_focal(wrong, range(len(room)))
+    found = estimate_color_focal(wrong, range(len(room)))
     assert found == pytest.approx(ratio, abs=0.015)
 
 
 @pytest.mark.parametrize(("name", "ratio"), [("7scenes-kitchen", 0.903), ("house/bedroom", 1.0), ("house/living", 1.0)])
 def test_real_captures(name, ratio) -> None:
     capture = open_capture(data_folder() / name)
-    assert color_focal(capture, range(len(capture))) == pytest.approx(ratio, abs=0.012 if ratio != 1 else 0)
+    assert estimate_color_focal(capture, range(len(capture))) == pytest.approx(ratio, abs=0.012 if ratio != 1 else 0)
 
 
 def test_too_little_to_tell_changes_nothing(tmp_path) -> None:
     capture = open_capture(write_seven_scenes(tmp_path / "scan", 5))
-    assert color_focal(capture, range(5)) == 1.0
+    assert estimate_color_focal(capture, range(5)) == 1.0
 
 
 def test_depth_poses_and_names_stay_and_colour_moves(room) -> None:

@@ -5,11 +5,11 @@ import pytest
 from helpers import data_folder
 
 from freeocc3d.capture import open_capture
-from freeocc3d.core.transforms import apart, invert, quats_to_rotations
+from freeocc3d.core.transforms import invert, measure_pose_difference, quats_to_rotations
 from freeocc3d.tracking import pose_graph
 from freeocc3d.tracking.pose_graph import Edge
 from freeocc3d.tracking.rgbd import joint_refinement, loop_closures, place_recognition
-from freeocc3d.tracking.rgbd.keyframe_registration import keyframe_view
+from freeocc3d.tracking.rgbd.keyframe_registration import prepare_keyframe_view
 
 FRAMES = range(0, 60, 4)
 
@@ -22,7 +22,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def views(room):
-    return [keyframe_view(room[i]) for i in FRAMES]
+    return [prepare_keyframe_view(room[i]) for i in FRAMES]
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def disturbed(poses, degrees: float, metres: float, seed: int = 0) -> list:
 
 
 def worst(poses, true) -> tuple[float, float]:
-    off = np.array([apart(a, b) for a, b in zip(poses, true, strict=True)])
+    off = np.array([measure_pose_difference(a, b) for a, b in zip(poses, true, strict=True)])
     return tuple(off.max(axis=0))
 
 
@@ -57,7 +57,7 @@ def test_similar_places_are_told_from_others(views) -> None:
     vocabulary = place_recognition.Vocabulary(described)
     histograms = np.stack([vocabulary.histogram(d) for d in described])
     assert [int(h.sum()) for h in histograms] == [len(d) for d in described]
-    alike = place_recognition.similarity(histograms)
+    alike = place_recognition.compare_histograms(histograms)
     np.testing.assert_allclose(np.diag(alike), 1.0, atol=1e-5)
     np.testing.assert_allclose(alike, alike.T, atol=1e-6)
     neighbours = np.diag(alike, 1)
@@ -71,7 +71,7 @@ def test_a_frame_without_features_is_like_none() -> None:
     none = vocabulary.histogram(np.zeros((0, 32), np.uint8))
     assert none.sum() == 0
     assert (
-        place_recognition.similarity(
+        place_recognition.compare_histograms(
             np.stack((none, vocabulary.histogram(rng.integers(0, 256, (50, 32), dtype=np.uint8))))
         )[0, 1]
         == 0
@@ -83,11 +83,11 @@ def test_a_frame_without_features_is_like_none() -> None:
 
 def test_the_way_round_a_room_is_closed(views, true) -> None:
     count = len(views)
-    found = loop_closures.find(views, [0] * count, true)
+    found = loop_closures.find_closures(views, [0] * count, true)
     spans = {(edge.source, edge.target) for edge in found}
     assert any(a - b > count // 2 for a, b in spans), "the end sees the start again"
     for edge in found:
-        metres, degrees = apart(invert(true[edge.target]) @ true[edge.source], edge.T_target_source)
+        metres, degrees = measure_pose_difference(invert(true[edge.target]) @ true[edge.source], edge.T_target_source)
         assert metres < 0.03
         assert degrees < 1.0
         assert edge.uncertain
@@ -96,10 +96,10 @@ def test_the_way_round_a_room_is_closed(views, true) -> None:
 def test_other_places_are_not_closed() -> None:
     house = data_folder() / "house"
     shown = [open_capture(house / name) for name in ("bedroom", "living")]
-    keyframes = [keyframe_view(capture[i]) for capture in shown for i in range(0, 260, 20)]
+    keyframes = [prepare_keyframe_view(capture[i]) for capture in shown for i in range(0, 260, 20)]
     submap = [0] * 13 + [1] * 13
     poses = [capture.pose(i) for capture in shown for i in range(0, 260, 20)]
-    found = loop_closures.find(keyframes, submap, poses)
+    found = loop_closures.find_closures(keyframes, submap, poses)
     assert all(submap[edge.source] == submap[edge.target] for edge in found)
 
 
@@ -109,7 +109,7 @@ def test_other_places_are_not_closed() -> None:
 def test_disturbed_poses_fall_into_place_together(views, true) -> None:
     start = disturbed(true, 1.0, 0.03)
     assert worst(start, true)[0] > 0.03
-    refined = joint_refinement.refine(views, start)
+    refined = joint_refinement.refine_poses(views, start)
     metres, degrees = worst(refined, true)
     assert metres < 0.01
     assert degrees < 0.25
@@ -118,11 +118,11 @@ def test_disturbed_poses_fall_into_place_together(views, true) -> None:
 
 
 def test_one_keyframe_needs_no_refinement(views, true) -> None:
-    np.testing.assert_array_equal(joint_refinement.refine(views[:1], true[:1])[0], true[0])
+    np.testing.assert_array_equal(joint_refinement.refine_poses(views[:1], true[:1])[0], true[0])
 
 
 def test_each_keyframe_is_paired_with_a_bounded_number_of_others(views, true) -> None:
-    pairs = joint_refinement.overlapping_pairs(views, true, neighbours=3, least=0.35)
+    pairs = joint_refinement.find_overlapping_pairs(views, true, neighbours=3, least=0.35)
     assert {(n, n - 1) for n in range(1, len(views))} <= set(pairs)
     counts = np.bincount([source for source, _ in pairs])
     assert counts.max() <= 4
@@ -154,7 +154,7 @@ def test_one_wrong_closure_does_not_bend_a_map(wrong) -> None:
     information = np.diag([1e4] * 6)
     good = [Edge(k + 5, k, invert(true[k]) @ true[k + 5], information, uncertain=True) for k in range(4)]
     bad = Edge(8, 2, invert(true[2]) @ true[8] @ wrong, information, uncertain=True)
-    placed = pose_graph.optimize_piece(true, [*edges, *good, bad], range(10))
+    placed = pose_graph.optimize_component(true, [*edges, *good, bad], range(10))
     assert worst(placed, [invert(true[0]) @ T for T in true] if np.allclose(placed[0], np.eye(4)) else true)[0] < 0.02
 
 
@@ -174,10 +174,12 @@ def test_two_submaps_are_tied_by_closures_that_agree() -> None:
         ([one, wrong, other, within], [one, other, within]),
         ([certain, wrong], [certain]),
     ):
-        found = pose_graph.agreeing(poses, submap, edges)
+        found = pose_graph.drop_unsupported_closures(poses, submap, edges)
         assert found == kept
         tied = any(edge is not within for edge in kept)
-        assert pose_graph.pieces(submap, found) == ([[0, 1, 2, 3, 4]] if tied else [[0, 1, 2], [3, 4]])
+        assert pose_graph.find_connected_components(submap, found) == (
+            [[0, 1, 2, 3, 4]] if tied else [[0, 1, 2], [3, 4]]
+        )
 
 
 def test_a_tied_submap_is_laid_where_its_closures_say() -> None:
@@ -187,6 +189,6 @@ def test_a_tied_submap_is_laid_where_its_closures_say() -> None:
     away = motion(120, 4.0)
     poses = true[:5] + [away @ T for T in true[5:]]
     ties = [Edge(k, k - 2, invert(true[k - 2]) @ true[k], information, uncertain=True) for k in (5, 6)]
-    placed = pose_graph.optimize_piece(poses, [*own, *ties], range(10))
+    placed = pose_graph.optimize_component(poses, [*own, *ties], range(10))
     relative = [invert(placed[0]) @ T for T in placed]
     assert worst(relative, [invert(true[0]) @ T for T in true])[0] < 1e-3

@@ -9,7 +9,7 @@ from scenes import wall_frame
 
 from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import ConfigError
-from freeocc3d.core.transforms import apart, invert
+from freeocc3d.core.transforms import invert, measure_pose_difference
 from freeocc3d.core.types import Frame, Trajectory
 from freeocc3d.tracking import pose_graph
 from freeocc3d.tracking.pose_graph import Edge
@@ -37,7 +37,9 @@ def worst(trajectory: Trajectory, capture, indices, gaps: bool = True) -> tuple[
     gaps: those that were interpolated as well."""
     rows = np.flatnonzero(trajectory.has_pose if gaps else trajectory.has_pose & (trajectory.status != "interpolated"))
     T_here_there = trajectory.T_world_cam[rows[0]] @ invert(capture.pose(indices[rows[0]]))
-    off = [apart(T_here_there @ capture.pose(indices[row]), trajectory.T_world_cam[row]) for row in rows]
+    off = [
+        measure_pose_difference(T_here_there @ capture.pose(indices[row]), trajectory.T_world_cam[row]) for row in rows
+    ]
     return tuple(np.array(off).max(axis=0))
 
 
@@ -237,10 +239,10 @@ def test_one_wrong_closure_does_not_bend_a_real_path(bedroom) -> None:
     for n, i in enumerate(range(0, 261, 6)):
         t.track(replace(bedroom[i], index=n))
     path, odometry = [T.copy() for T in t.records.T_world_keyframe], list(t.edges)
-    closures = loop_closures.find(t.keyframes, t.records.submap, path)
+    closures = loop_closures.find_closures(t.keyframes, t.records.submap, path)
     assert len(closures) > 5
     rows = range(len(path))
-    right = pose_graph.optimize_piece(path, [*odometry, *closures], rows)
+    right = pose_graph.optimize_component(path, [*odometry, *closures], rows)
     rng = np.random.default_rng(0)
     for _ in range(60):
         target, source = sorted(rng.choice(len(path), 2, replace=False).tolist())
@@ -248,8 +250,8 @@ def test_one_wrong_closure_does_not_bend_a_real_path(bedroom) -> None:
         away[:3, 3] = rng.choice((0.15, 0.4, 1.5)) * rng.normal(size=3) / np.sqrt(3)
         T = invert(path[target]) @ path[source] @ away
         wrong = Edge(source, target, T, closures[0].information, uncertain=True)
-        placed = pose_graph.optimize_piece(path, [*odometry, wrong, *closures], rows)
-        off = max(apart(a, b)[0] for a, b in zip(placed, right, strict=True))
+        placed = pose_graph.optimize_component(path, [*odometry, wrong, *closures], rows)
+        off = max(measure_pose_difference(a, b)[0] for a, b in zip(placed, right, strict=True))
         if np.linalg.norm(away[:3, 3]) > 0.2:
             assert off < 1e-3
         assert off < 0.12  # what is wrong by little may be shared out along the path

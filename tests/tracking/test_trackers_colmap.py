@@ -49,7 +49,7 @@ def reconstructed(
     images: Any, camera: Intrinsics, folder: Path, known: bool = True, progress: Progress | None = None, **recipe: Any
 ) -> Reconstruction:
     capture = Photographs(images, camera, known)
-    return structure_from_motion.reconstruct(
+    return structure_from_motion.reconstruct_poses(
         capture, range(len(images)), folder, Recipe(**recipe), progress or Progress()
     )
 
@@ -134,21 +134,23 @@ def test_an_interrupted_run_goes_on(stage: str, tmp_path: Path, monkeypatch: pyt
             return super().__getitem__(index)
 
     listener = Listener()
-    found = structure_from_motion.reconstruct(Counted(images, camera), range(len(images)), tmp_path, Recipe(), listener)
+    found = structure_from_motion.reconstruct_poses(
+        Counted(images, camera), range(len(images)), tmp_path, Recipe(), listener
+    )
     assert found.has_pose.all()
     assert len(decoded) == (15 if stage == "features" else 0)
     again = Listener()
-    structure_from_motion.reconstruct(Counted(images, camera), range(len(images)), tmp_path, Recipe(), again)
+    structure_from_motion.reconstruct_poses(Counted(images, camera), range(len(images)), tmp_path, Recipe(), again)
     assert again.stages == []
 
 
 def test_images_that_a_model_lacks_are_tried_again(room: tuple[Reconstruction, Path], tmp_path: Path) -> None:
     _, folder = room
-    model = mapping.incremental(folder / "database.db", tmp_path, False, lambda: None)[0]
+    model = mapping.map_incrementally(folder / "database.db", tmp_path, False, lambda: None)[0]
     for frame_id in (3, 9):
         pycolmap.ObservationManager(model).deregister_frame(frame_id)
     assert model.num_reg_images() == 14
-    assert mapping.continued(folder / "database.db", tmp_path, False, model).num_reg_images() == 16
+    assert mapping.continue_mapping(folder / "database.db", tmp_path, False, model).num_reg_images() == 16
 
 
 def test_two_scenes_become_one_map_and_frames_apart(tmp_path: Path) -> None:

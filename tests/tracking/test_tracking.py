@@ -12,7 +12,7 @@ from freeocc3d.core.types import Frame
 from freeocc3d.settings import registry
 from freeocc3d.tracking import pose_graph
 from freeocc3d.tracking.base import Tracker
-from freeocc3d.tracking.overlap import DepthView, mutual_overlap, overlap, sample_points
+from freeocc3d.tracking.overlap import DepthView, measure_mutual_overlap, measure_overlap, sample_points
 from freeocc3d.tracking.pose_graph import Edge
 from freeocc3d.tracking.records import Records
 
@@ -94,15 +94,15 @@ def test_the_pose_graph_spreads_a_loops_error_and_survives_a_wrong_edge() -> Non
 def test_overlap_falls_when_the_camera_turns_away_and_when_it_steps_back() -> None:
     frame = wall_frame(2.0)
     view = DepthView(frame.depth_m, frame.intrinsics, sample_points(frame.depth_m, frame.intrinsics))
-    assert overlap(view.points, np.eye(4), view) == 1.0
-    assert overlap(view.points, motion(180, 0), view) == 0.0
-    assert 0.3 < overlap(view.points, motion(0, 1.0), view) < 0.7
+    assert measure_overlap(view.points, np.eye(4), view) == 1.0
+    assert measure_overlap(view.points, motion(180, 0), view) == 0.0
+    assert 0.3 < measure_overlap(view.points, motion(0, 1.0), view) < 0.7
     behind = wall_frame(3.0)
     far = DepthView(behind.depth_m, behind.intrinsics, sample_points(behind.depth_m, behind.intrinsics))
     T_far_near = np.eye(4)
     T_far_near[2, 3] = 1.0
-    assert overlap(view.points, T_far_near, far) == 1.0
-    assert mutual_overlap(view, far, T_far_near) < 0.6
+    assert measure_overlap(view.points, T_far_near, far) == 1.0
+    assert measure_mutual_overlap(view, far, T_far_near) < 0.6
 
 
 def test_records_tell_submaps_and_which_closures_hold() -> None:

@@ -12,7 +12,14 @@ from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.transforms import quats_to_rotations
 from freeocc3d.core.tum_files import write_tum
 from freeocc3d.core.types import Trajectory
-from freeocc3d.tracking.trajectory_alignment import Alignment, Poses, align, estimated_poses, read_poses, true_poses
+from freeocc3d.tracking.trajectory_alignment import (
+    Poses,
+    TrajectoryAlignment,
+    align_trajectories,
+    read_poses,
+    read_true_poses,
+    select_estimated_poses,
+)
 
 
 def poses(T_world_cam: NDArray[np.float64]) -> Poses:
@@ -34,7 +41,7 @@ def test_alignment_recovers_the_similarity_between_two_worlds() -> None:
     T_other_true = random_poses(1, seed=1)[0]
     estimated = T_other_true @ true
     estimated[:, :3, 3] *= 0.5
-    found = align(poses(estimated), poses(true), "sim3")
+    found = align_trajectories(poses(estimated), poses(true), "sim3")
     assert found.scale == pytest.approx(2.0)
     np.testing.assert_allclose(found.rotation, T_other_true[:3, :3].T, atol=1e-9)
     np.testing.assert_allclose(found.to_true(estimated[:, :3, 3]), true[:, :3, 3], atol=1e-9)
@@ -46,7 +53,7 @@ def test_without_scale_a_wrong_scale_stays_an_error() -> None:
     true = random_poses(40, seed=0)
     estimated = true.copy()
     estimated[:, :3, 3] *= 0.9
-    found = align(poses(estimated), poses(true))
+    found = align_trajectories(poses(estimated), poses(true))
     assert found.scale == 1.0
     spread = np.sqrt(((true[:, :3, 3] - true[:, :3, 3].mean(axis=0)) ** 2).sum(axis=1).mean())
     left = np.linalg.norm(found.to_true(estimated[:, :3, 3]) - true[:, :3, 3], axis=1)
@@ -54,10 +61,10 @@ def test_without_scale_a_wrong_scale_stays_an_error() -> None:
 
 
 def test_none_leaves_the_worlds_as_they_are() -> None:
-    found = align(poses(random_poses(5, seed=0)), poses(random_poses(5, seed=1)), "none")
+    found = align_trajectories(poses(random_poses(5, seed=0)), poses(random_poses(5, seed=1)), "none")
     np.testing.assert_array_equal(found.to_true(np.eye(3)), np.eye(3))
     with pytest.raises(FreeOccError, match="se3, sim3, none"):
-        align(poses(random_poses(5, seed=0)), poses(random_poses(5, seed=1)), "sim2")
+        align_trajectories(poses(random_poses(5, seed=0)), poses(random_poses(5, seed=1)), "sim2")
 
 
 def test_poses_belong_together_by_time() -> None:
@@ -74,14 +81,14 @@ def test_poses_belong_together_by_time() -> None:
 def test_only_frames_with_a_pose_in_both_count() -> None:
     true, estimated = random_poses(10, seed=2), random_poses(10, seed=2)
     estimated[0, :3, 3] += 100.0
-    found = align(Poses(np.arange(10.0)[:-1], estimated[:-1]), Poses(np.arange(10.0)[1:], true[1:]))
+    found = align_trajectories(Poses(np.arange(10.0)[:-1], estimated[:-1]), Poses(np.arange(10.0)[1:], true[1:]))
     np.testing.assert_allclose(found.rotation, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(found.translation, 0, atol=1e-9)
 
 
 def test_too_few_matching_frames_are_refused() -> None:
     with pytest.raises(FreeOccError, match="at least 3"):
-        align(poses(random_poses(5, seed=3)), poses(random_poses(2, seed=3)))
+        align_trajectories(poses(random_poses(5, seed=3)), poses(random_poses(2, seed=3)))
 
 
 @pytest.mark.parametrize("jitter_m", [0.0, 0.001])
@@ -90,15 +97,15 @@ def test_a_camera_that_moved_along_a_line_is_refused(jitter_m: float) -> None:
     line[:, 0, 3] = 0.3 * np.arange(10)
     line[:, :3, 3] += np.random.default_rng(0).normal(0, jitter_m, (10, 3))
     with pytest.raises(FreeOccError, match="line"):
-        align(poses(line), poses(random_poses(10, seed=0)))
+        align_trajectories(poses(line), poses(random_poses(10, seed=0)))
     with pytest.raises(FreeOccError, match="line"):
-        align(poses(random_poses(10, seed=0)), poses(line))
+        align_trajectories(poses(random_poses(10, seed=0)), poses(line))
 
 
 def test_inputs_are_left_as_they_are() -> None:
     true, estimated = random_poses(6, seed=4), random_poses(6, seed=5)
     copies = true.copy(), estimated.copy()
-    align(poses(estimated), poses(true), "sim3").poses(estimated)
+    align_trajectories(poses(estimated), poses(true), "sim3").poses(estimated)
     np.testing.assert_array_equal(true, copies[0])
     np.testing.assert_array_equal(estimated, copies[1])
 
@@ -106,7 +113,7 @@ def test_inputs_are_left_as_they_are() -> None:
 def test_true_poses_are_the_captures(tmp_path: Path) -> None:
     folder = write_seven_scenes(tmp_path / "scan", 4)
     (folder / "frame-000002.pose.txt").unlink()
-    found = true_poses(open_capture(folder))
+    found = read_true_poses(open_capture(folder))
     assert found.timestamps.tolist() == [0.0, 1.0, 3.0]
     np.testing.assert_allclose(found.T_world_cam[2], pose_matrix(3), atol=1e-6)
     np.testing.assert_allclose(read_poses(folder).T_world_cam, found.T_world_cam)
@@ -114,14 +121,14 @@ def test_true_poses_are_the_captures(tmp_path: Path) -> None:
 
 def test_a_capture_without_poses_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FreeOccError, match="no poses"):
-        true_poses(open_capture(write_seven_scenes(tmp_path / "scan", 3, poses=False)))
+        read_true_poses(open_capture(write_seven_scenes(tmp_path / "scan", 3, poses=False)))
 
 
 def test_frames_without_a_pose_are_left_out() -> None:
     T = random_poses(4, seed=0)
     T[1] = np.nan
     trajectory = Trajectory(np.arange(4.0), T, np.zeros(0, np.int32), np.full(4, "tracked"), np.ones(4, np.float32))
-    assert estimated_poses(trajectory).timestamps.tolist() == [0.0, 2.0, 3.0]
+    assert select_estimated_poses(trajectory).timestamps.tolist() == [0.0, 2.0, 3.0]
 
 
 @pytest.mark.parametrize("columns", [8, 12, 16])
@@ -147,6 +154,6 @@ def test_files_that_are_no_trajectory_are_refused(tmp_path: Path, text: str) -> 
 
 
 def test_the_json_form_is_plain() -> None:
-    assert Alignment.identity().to_json() == {
+    assert TrajectoryAlignment.identity().to_json() == {
         "scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]
     }  # fmt: skip

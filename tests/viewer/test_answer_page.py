@@ -49,7 +49,7 @@ def decoded(source: str) -> np.ndarray:
 
 def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = room.query_words(["red", "<b>blue</b>", "unicorn"])
-    answer_page.query_page(room, results, tmp_path / "q.html")
+    answer_page.write_query_page(room, results, tmp_path / "q.html")
     text = (tmp_path / "q.html").read_text(encoding="utf-8")
     read = Strict()
     read.feed(text)
@@ -70,12 +70,12 @@ def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path, monkeyp
         assert crop.shape[1] <= 320
         assert f"box {' '.join(map(str, view.box))}" in text
     with pytest.raises(ExportError, match="--overwrite"):
-        answer_page.query_page(room, results, tmp_path / "q.html")
-    answer_page.query_page(room, results, tmp_path / "q.html", overwrite=True)
+        answer_page.write_query_page(room, results, tmp_path / "q.html")
+    answer_page.write_query_page(room, results, tmp_path / "q.html", overwrite=True)
     assert (tmp_path / "q.html").read_text(encoding="utf-8") == text
     assert "Metres in the map" in text
     monkeypatch.setitem(room.manifest, "scale", {"metric": False, "by": "unknown", "factor": 1.0})
-    answer_page.query_page(room, results, tmp_path / "q.html", overwrite=True)
+    answer_page.write_query_page(room, results, tmp_path / "q.html", overwrite=True)
     text = (tmp_path / "q.html").read_text(encoding="utf-8")
     assert "lengths are not metres" in text
     assert " l</td>" not in text
@@ -102,8 +102,8 @@ def test_without_a_display_the_page_says_so(room: Map, tmp_path: Path, monkeypat
     def lacking(*_: object) -> bytes:
         raise DependencyError("Pictures need a display.")
 
-    monkeypatch.setattr(answer_page, "query_png", lacking)
-    answer_page.query_page(room, room.query_words(["unicorn"]), tmp_path / "q.html")
+    monkeypatch.setattr(answer_page, "draw_query", lacking)
+    answer_page.write_query_page(room, room.query_words(["unicorn"]), tmp_path / "q.html")
     text = (tmp_path / "q.html").read_text(encoding="utf-8")
     assert "The map is not drawn: Pictures need a display." in text
     assert not re.findall("<img", text)
@@ -121,5 +121,5 @@ def test_an_empty_map_has_no_page(room: Map, tmp_path: Path, monkeypatch: pytest
     assert empty.query_classes(["red"])[0].regions == []
     assert empty.query_image(np.full((8, 8, 3), 200, np.uint8)).note == "The map has no occupied voxels."
     with pytest.raises(ExportError, match="has no occupied voxel to draw"):
-        answer_page.query_page(empty, [result], tmp_path / "q.html")
+        answer_page.write_query_page(empty, [result], tmp_path / "q.html")
     assert list(tmp_path.iterdir()) == []

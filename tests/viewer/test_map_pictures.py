@@ -11,8 +11,8 @@ from freeocc3d.core.errors import ExportError
 from freeocc3d.core.types import Trajectory
 from freeocc3d.query.regions import Region
 from freeocc3d.viewer import map_pictures
-from freeocc3d.viewer.palette import HIGHLIGHTS, class_colors
-from freeocc3d.viewer.scene_rendering import cut_height, lengthwise
+from freeocc3d.viewer.palette import HIGHLIGHTS, assign_class_colors
+from freeocc3d.viewer.scene_rendering import choose_cut_height, turn_lengthwise
 
 
 def room_map(tmp_path):
@@ -51,20 +51,20 @@ def shown(path, color, tolerance=30) -> int:
 
 def test_a_map_picture_looks_into_the_room_from_both_sides(tmp_path) -> None:
     room = room_map(tmp_path)
-    map_pictures.map_picture(room, tmp_path / "map.png")
+    map_pictures.write_map_picture(room, tmp_path / "map.png")
     assert shown(tmp_path / "map.png", (215, 20, 20), 60) > 500  # the block on the floor
     assert shown(tmp_path / "map.png", (150, 120, 90)) > 20_000  # the floor
     assert shown(tmp_path / "map.png", (20, 220, 220)) == 0  # the ceiling is cut away
     first = (tmp_path / "map.png").read_bytes()
-    map_pictures.map_picture(room, tmp_path / "again.png")
+    map_pictures.write_map_picture(room, tmp_path / "again.png")
     assert (tmp_path / "again.png").read_bytes() == first
 
 
 def test_walls_lie_along_the_picture_though_the_least_box_around_the_map_does_not() -> None:
     diamond = np.array([(0, 0, 0), (2, 3, 0), (3, 2, 0), (5, 5, 1.0)])
-    np.testing.assert_array_equal(lengthwise(np.eye(3), diamond), np.eye(3))
+    np.testing.assert_array_equal(turn_lengthwise(np.eye(3), diamond), np.eye(3))
     long = diamond * (1, 2, 1)
-    R = lengthwise(np.eye(3), long)
+    R = turn_lengthwise(np.eye(3), long)
     np.testing.assert_array_equal(np.ptp(long @ R.T, axis=0), (10, 5, 1))
     assert np.linalg.det(R) == 1
 
@@ -79,19 +79,19 @@ def test_a_match_is_in_the_view_however_far_off(tmp_path) -> None:
     corner = room.occupancy.origin + voxels[rows].min(axis=0) * size
     region = Region(1.0, 1.0, corner + size, corner, corner + size * np.array((2, 1, 1)), 2 * size**3, rows)
     result = SimpleNamespace(word="far", regions=[region])
-    map_pictures.query_picture(room, [result], tmp_path / "far.png")
+    map_pictures.write_query_picture(room, [result], tmp_path / "far.png")
     view = cv2.imread(str(tmp_path / "far.png"))[56:-56, :800, ::-1].astype(int)
     assert (np.abs(view - HIGHLIGHTS[0]).max(axis=-1) < 40).any()
 
 
 def test_by_class_and_height(tmp_path) -> None:
     room = room_map(tmp_path)
-    map_pictures.map_picture(room, tmp_path / "class.png", by="class")
-    assert shown(tmp_path / "class.png", class_colors(["red"])[1], 45) > 500
-    map_pictures.map_picture(room, tmp_path / "height.png", by="height")
+    map_pictures.write_map_picture(room, tmp_path / "class.png", by="class")
+    assert shown(tmp_path / "class.png", assign_class_colors(["red"])[1], 45) > 500
+    map_pictures.write_map_picture(room, tmp_path / "height.png", by="height")
     assert shown(tmp_path / "height.png", (68, 1, 84), 40) > 10_000  # the floor has viridis' darkest colour
     with pytest.raises(ExportError, match="rgb, class or height"):
-        map_pictures.map_picture(room, tmp_path / "x.png", by="colour")
+        map_pictures.write_map_picture(room, tmp_path / "x.png", by="colour")
 
 
 def test_a_query_picture_shows_matches_strongly_and_nothing_else(tmp_path) -> None:
@@ -101,8 +101,8 @@ def test_a_query_picture_shows_matches_strongly_and_nothing_else(tmp_path) -> No
     region = Region(0.9, 0.9, box + 0.15, box, box + 0.3, 0.027, rows)
     found = SimpleNamespace(word="red", regions=[region])
     nothing = SimpleNamespace(word="unicorn", regions=[])
-    map_pictures.query_picture(room, [found], tmp_path / "found.png")
-    map_pictures.query_picture(room, [nothing], tmp_path / "nothing.png")
+    map_pictures.write_query_picture(room, [found], tmp_path / "found.png")
+    map_pictures.write_query_picture(room, [nothing], tmp_path / "nothing.png")
     legend = 16 * 17
     assert shown(tmp_path / "found.png", HIGHLIGHTS[0], 40) > legend + 500
     assert shown(tmp_path / "nothing.png", HIGHLIGHTS[0], 40) <= 1.2 * legend
@@ -111,19 +111,19 @@ def test_a_query_picture_shows_matches_strongly_and_nothing_else(tmp_path) -> No
 def test_an_empty_map_and_an_unwritable_place_are_told(tmp_path) -> None:
     room = room_map(tmp_path)
     with pytest.raises(ExportError, match="Cannot write"):
-        map_pictures.map_picture(room, tmp_path / "missing" / "map.png")
+        map_pictures.write_map_picture(room, tmp_path / "missing" / "map.png")
     with pytest.raises(ExportError, match=r"map\.png in place of"):
-        map_pictures.map_picture(room, tmp_path / "map.jpg")
+        map_pictures.write_map_picture(room, tmp_path / "map.jpg")
     room.occupancy = occupancy_of([])
     with pytest.raises(ExportError, match="no occupied voxel"):
-        map_pictures.map_picture(room, tmp_path / "map.png")
+        map_pictures.write_map_picture(room, tmp_path / "map.png")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_match_above_the_cut_is_drawn(tmp_path, monkeypatch) -> None:
     room = room_map(tmp_path)
     height = room.occupancy.centers(room.occupancy.occupied_voxels()) @ room.up
-    below = height <= cut_height(height, room.occupancy.voxel_size)
+    below = height <= choose_cut_height(height, room.occupancy.voxel_size)
     above = np.flatnonzero(~below)[:40]
     monkeypatch.setattr(map_pictures, "_corners", lambda box: np.zeros((8, 3)))
 
@@ -131,7 +131,7 @@ def test_a_match_above_the_cut_is_drawn(tmp_path, monkeypatch) -> None:
         """Pixels of the voxels: boxes are drawn as points."""
         region = Region(0.7, 0.9, np.zeros(3), np.zeros(3), np.zeros(3), 0.04, rows)
         found = SimpleNamespace(word="lamp", regions=[region])
-        map_pictures.query_picture(room, [found], tmp_path / "lamp.png", overwrite=True)
+        map_pictures.write_query_picture(room, [found], tmp_path / "lamp.png", overwrite=True)
         return shown(tmp_path / "lamp.png", HIGHLIGHTS[0], 40) - 16 * 17
 
     assert strong(above) > 2000
@@ -162,4 +162,4 @@ def test_an_empty_map_is_refused_however_it_is_coloured(tmp_path, by) -> None:
     room = room_map(tmp_path)
     room.occupancy = occupancy_of([])
     with pytest.raises(ExportError, match="no occupied voxel"):
-        map_pictures.map_picture(room, tmp_path / "map.png", by)
+        map_pictures.write_map_picture(room, tmp_path / "map.png", by)

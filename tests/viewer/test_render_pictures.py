@@ -14,9 +14,11 @@ from freeocc3d.viewer import render_pictures
 
 def test_a_view_is_drawn_beside_what_was_captured(tmp_path: Path) -> None:
     frame = wall_frame(2.0)
-    view = rendered_views.view_of(frame, np.eye(4), 320, torch.device("cpu"))
+    view = rendered_views.prepare_captured_view(frame, np.eye(4), 320, torch.device("cpu"))
     rows = [(7, view), (9, view)]
-    render_pictures.render_picture(tmp_path / "g.png", lifted([frame], [np.eye(4)]), rows, cpu.load(), Path("scan"))
+    render_pictures.write_render_picture(
+        tmp_path / "g.png", lifted([frame], [np.eye(4)]), rows, cpu.load(), Path("scan")
+    )
     picture = cv2.imread(str(tmp_path / "g.png"))
     assert picture.shape[1] == 4 * 408 + 8
     top = 56 + 30
@@ -29,8 +31,8 @@ def test_a_view_is_drawn_beside_what_was_captured(tmp_path: Path) -> None:
 def test_a_view_without_depth_is_drawn_all_the_same(tmp_path: Path) -> None:
     frame = wall_frame(2.0)
     turned = np.diag((-1.0, 1.0, -1.0, 1.0))  # away from the wall
-    blank = rendered_views.view_of(wall_frame(0.0), turned, 320, torch.device("cpu"))
-    render_pictures.render_picture(
+    blank = rendered_views.prepare_captured_view(wall_frame(0.0), turned, 320, torch.device("cpu"))
+    render_pictures.write_render_picture(
         tmp_path / "g.png", lifted([frame], [np.eye(4)]), [(0, blank)], cpu.load(), Path("scan")
     )
     assert cv2.imread(str(tmp_path / "g.png")) is not None

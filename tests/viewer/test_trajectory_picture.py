@@ -34,7 +34,7 @@ def trajectory(status: list[str]) -> Trajectory:
 def drawn(
     path: Path, submaps: list[Submap], status: list[str], points=((0, 0, 2), (1, 0, 2), (0.5, 0.2, 3))
 ) -> np.ndarray:
-    trajectory_picture.path_picture(path, submaps, trajectory(status), gaussians(points, 0.02), UP, Path("scan"))
+    trajectory_picture.write_path_picture(path, submaps, trajectory(status), gaussians(points, 0.02), UP, Path("scan"))
     picture = cv2.imread(str(path))[:, :, ::-1]
     assert picture.shape == (trajectory_picture.SIZE[1], trajectory_picture.SIZE[0], 3)
     return picture

@@ -10,8 +10,8 @@ from ...core.errors import CaptureError
 from ...core.transforms import invert
 from ..base import Options
 from ..colmap_models import colmap_folder, colmap_lens, read_colmap_model
-from ..posed_images import PosedImage, PosedImages, inside, nominal_scale
-from .photos import natural
+from ..posed_images import PosedImage, PosedImages, compute_nominal_scale, resolve_inside
+from .photos import make_natural_key
 
 REQUIRES: tuple[str, ...] = ("pycolmap",)
 
@@ -38,11 +38,11 @@ class Reader(PosedImages):
             if image.has_pose:
                 T_cam_world = np.eye(4)
                 T_cam_world[:3] = image.cam_from_world().matrix()
-                file = inside(path / "images", image.name, folder)
+                file = resolve_inside(path / "images", image.name, folder)
                 posed.append(PosedImage(file, None, lenses[image.camera_id], invert(T_cam_world)))
-        posed.sort(key=lambda view: natural(view.image))
+        posed.sort(key=lambda view: make_natural_key(view.image))
         points = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
-        super().__init__(path, options, posed, options.scale or nominal_scale(posed, points))
+        super().__init__(path, options, posed, options.scale or compute_nominal_scale(posed, points))
         self.metric_poses = options.scale is not None
 
     @classmethod

@@ -18,9 +18,9 @@ from ...core.types import Intrinsics
 from ..base import Options
 from ..camera_files import Calibration, read_json
 from ..lenses import BROWN_MODELS, PINHOLE_MODELS, Lens, lens_of
-from ..posed_images import PosedImage, PosedImages, inside, nominal_scale
+from ..posed_images import PosedImage, PosedImages, compute_nominal_scale, resolve_inside
 from ..trajectory_files import read_trajectory
-from .photos import natural, read_header
+from .photos import make_natural_key, read_header
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -48,17 +48,17 @@ class Reader(PosedImages):
         poses = read_trajectory(file).T_world_cam  # checks that there are frames with paths and poses
         posed = []
         for frame, T_world_cam in zip(content["frames"], poses, strict=True):
-            image = inside(path, str(frame["file_path"]), file)
+            image = resolve_inside(path, str(frame["file_path"]), file)
             if not image.suffix:  # as in NeRF's synthetic scenes
                 image = image.with_suffix(".png")
             depth = frame.get("depth_file_path") if options.depth else None
-            depth_path = None if depth is None else inside(path, str(depth), file)
+            depth_path = None if depth is None else resolve_inside(path, str(depth), file)
             posed.append(PosedImage(image, depth_path, _lens({**content, **frame}, image, file), T_world_cam))
-        posed.sort(key=lambda view: natural(view.image))
+        posed.sort(key=lambda view: make_natural_key(view.image))
         comes_with_depth = any("depth_file_path" in frame for frame in content["frames"])
         scale = options.scale
         if scale is None and not comes_with_depth and (points := content.get("ply_file_path")):
-            scale = nominal_scale(posed, _read_points(inside(path, str(points), file)))
+            scale = compute_nominal_scale(posed, _read_points(resolve_inside(path, str(points), file)))
         super().__init__(path, options, posed, scale)
         self.metric_poses = comes_with_depth or options.scale is not None
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...core.errors import CaptureError, FrameError
 from ...core.types import Frame, Intrinsics
 from ..base import Capture, Options
-from ..camera_files import DIAGONAL_35MM, equivalent, given, reduced, usual
+from ..camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
 from ..image_files import Size, read_color
 
 REQUIRES: tuple[str, ...] = ("PIL",)
@@ -63,7 +63,7 @@ class Reader(Capture):
 
     def __init__(self, path: Path, options: Options):
         super().__init__(path, options)
-        paths = images_in(path)
+        paths = list_images(path)
         if len(paths) < 2:
             raise CaptureError(_too_few(path, paths))
         images = [(image, read_header(image)) for image in paths]
@@ -75,22 +75,25 @@ class Reader(Capture):
             self.warnings = (_left_out(path, odd, len(images), self._size),)
         self._paths, headers = [image for image, _ in images], [header for _, header in images]
         self._headers = headers
-        stated, lens = given(options), _focal([header for header in headers if header is not None], self._size)
-        camera = stated.camera(self._size) if stated else lens or usual(self._size)
+        stated, lens = (
+            read_given_calibration(options),
+            _focal([header for header in headers if header is not None], self._size),
+        )
+        camera = stated.camera(self._size) if stated else lens or guess_camera(self._size)
         self.intrinsics_known, self.focal_stated = stated is not None, stated is not None or lens is not None
-        self.intrinsics: Intrinsics = reduced(camera, options.max_size)
+        self.intrinsics: Intrinsics = reduce_camera(camera, options.max_size)
         self.timestamps = _times(headers)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        found = images_in(path)
+        found = list_images(path)
         return bool(found or _unreadable(path)) and not any("depth" in image.name.lower() for image in found)
 
     def __getitem__(self, index: int) -> Frame:
         if not 0 <= index < len(self):
             raise IndexError(f"Frame {index} of {len(self)} images.")
         path, header, camera = self._paths[index], self._headers[index], self.intrinsics
-        color = upright(read_color(path), header.orientation if header else 1)
+        color = apply_orientation(read_color(path), header.orientation if header else 1)
         color = np.ascontiguousarray(np.rot90(color, self.turned(index)))
         height, width = color.shape[:2]
         if (width, height) != self._size:
@@ -115,17 +118,17 @@ class Reader(Capture):
         return 1 if self._size[0] > self._size[1] or header.orientation in (3, 4) else -1
 
 
-def images_in(folder: Path) -> list[Path]:
+def list_images(folder: Path) -> list[Path]:
     """The images of a folder, or of its ``images/`` if it has none itself, in natural order: 2 before 10."""
     for place in (folder, folder / "images"):
         paths = list(place.iterdir()) if place.is_dir() else []
         found = [path for path in paths if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
         if found:
-            return sorted(found, key=natural)
+            return sorted(found, key=make_natural_key)
     return []
 
 
-def natural(path: Path) -> list[tuple[int, str]]:
+def make_natural_key(path: Path) -> list[tuple[int, str]]:
     """Sort key by which numbers in names count as numbers."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.as_posix().lower())]
 
@@ -147,7 +150,7 @@ def read_header(path: Path) -> Header | None:
     return Header(size, orientation, _stated_focal(inner, width, height), _stated_time(inner))
 
 
-def upright(image: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+def apply_orientation(image: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
     """(H, W, 3) stored, to as it was seen. orientation: EXIF's (CIPA DC-008, tag 274)."""
     if orientation >= 5:
         image = image.transpose(1, 0, 2)  # 5; the others are 5 and then 2, 3 or 4
@@ -158,7 +161,7 @@ def upright(image: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
 def _stated_focal(exif: Any, width: int, height: int) -> float | None:
     """Focal length over the image's diagonal."""
     try:
-        if exif.get(_FOCAL_35MM) and (camera := equivalent(float(exif[_FOCAL_35MM]), (width, height))):
+        if exif.get(_FOCAL_35MM) and (camera := convert_35mm(float(exif[_FOCAL_35MM]), (width, height))):
             return camera.fx / float(np.hypot(width, height))
         pixels_per_mm = float(exif[_PLANE_RESOLUTION]) / _UNIT_MM[int(exif.get(_PLANE_UNIT, 2))]
         focal = float(exif[_FOCAL]) * pixels_per_mm * width / float(exif.get(_WIDTH, width))
@@ -191,7 +194,7 @@ def _focal(headers: Sequence[Header], size: Size) -> Intrinsics | None:
     if 2 * len(stated) <= len(headers):
         return None
     low, middle, high = np.percentile(stated, (10, 50, 90))
-    return None if high - low > SAME_LENS * middle else equivalent(float(middle) * DIAGONAL_35MM, size)
+    return None if high - low > SAME_LENS * middle else convert_35mm(float(middle) * DIAGONAL_35MM, size)
 
 
 def _common_size(folder: Path, headers: Sequence[Header]) -> Size:

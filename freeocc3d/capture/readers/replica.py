@@ -12,10 +12,18 @@ from numpy.typing import NDArray
 from ...core.errors import CaptureError
 from ...core.transforms import is_rigid
 from ..base import Options
-from ..camera_files import Calibration, given, read_class_names, read_json, read_text, seen_at, usual
-from ..depth_registration import Grid
-from ..image_files import holds, numbered
-from ..image_pairs import ImagePairs, pair
+from ..camera_files import (
+    Calibration,
+    guess_camera,
+    read_class_names,
+    read_given_calibration,
+    read_json,
+    read_text,
+    rescale_camera,
+)
+from ..depth_registration import PixelGrid
+from ..image_files import has_file, list_numbered
+from ..image_pairs import ImagePairs, pair_files
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -38,17 +46,17 @@ class Reader(ImagePairs):
 
     def __init__(self, path: Path, options: Options):
         results = path / "results"
-        pairs = pair(numbered(results, COLOR), numbered(results, DEPTH), results, options)
+        pairs = pair_files(list_numbered(results, COLOR), list_numbered(results, DEPTH), results, options)
         calibration, units_per_metre = _parameters(path, options)
-        camera = calibration.camera(pairs.color_size) if calibration else usual(pairs.color_size)
-        grid = Grid(camera, seen_at(camera, pairs.depth_size))
+        camera = calibration.camera(pairs.color_size) if calibration else guess_camera(pairs.color_size)
+        grid = PixelGrid(camera, rescale_camera(camera, pairs.depth_size))
         super().__init__(path, options, pairs, grid, units_per_metre)
         self.intrinsics_known = self.focal_stated = calibration is not None
         self.classes = read_class_names(path / "classes.json")
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        return holds(path / "results", COLOR)
+        return has_file(path / "results", COLOR)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """Raises CaptureError if traj.txt is there but its lines cannot be assigned to the frames."""
@@ -64,7 +72,7 @@ class Reader(ImagePairs):
 
     @functools.cached_property
     def _class_files(self) -> dict[int, Path]:
-        return numbered(self.path / "semantic_class", CLASSES)
+        return list_numbered(self.path / "semantic_class", CLASSES)
 
     @functools.cached_property
     def _trajectory(self) -> NDArray[np.float64] | None:
@@ -84,7 +92,7 @@ class Reader(ImagePairs):
 
 def _parameters(path: Path, options: Options) -> tuple[Calibration | None, float]:
     """Colour camera, None if it is unknown and depth is not read, and depth units per metre. Raises CaptureError."""
-    override = given(options)
+    override = read_given_calibration(options)
     file = next((f for f in (path / "cam_params.json", path.parent / "cam_params.json") if f.is_file()), None)
     if file is None:
         if override is None and options.depth:

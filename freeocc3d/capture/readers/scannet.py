@@ -13,10 +13,18 @@ from ...core.errors import CaptureError
 from ...core.transforms import invert
 from ...core.types import Intrinsics
 from ..base import Options
-from ..camera_files import given, read_class_names, read_intrinsics, read_pose, read_rigid, seen_at, usual
-from ..depth_registration import Grid
-from ..image_files import holds, numbered
-from ..image_pairs import ImagePairs, Pairs, pair
+from ..camera_files import (
+    guess_camera,
+    read_class_names,
+    read_given_calibration,
+    read_intrinsics,
+    read_pose,
+    read_rigid,
+    rescale_camera,
+)
+from ..depth_registration import PixelGrid
+from ..image_files import has_file, list_numbered
+from ..image_pairs import ImagePairs, Pairs, pair_files
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -49,7 +57,7 @@ class Reader(ImagePairs):
     layout = "color/N.jpg (or .png) with depth/N.png and intrinsic/intrinsic_color.txt"
 
     def __init__(self, path: Path, options: Options):
-        pairs = pair(numbered(path / "color", COLOR), numbered(path / "depth", IMAGE), path, options)
+        pairs = pair_files(list_numbered(path / "color", COLOR), list_numbered(path / "depth", IMAGE), path, options)
         grid, self.intrinsics_known = _grid(path, options, pairs)
         self.focal_stated = self.intrinsics_known
         super().__init__(path, options, pairs, grid, units_per_metre=1000.0)
@@ -57,7 +65,7 @@ class Reader(ImagePairs):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        return holds(path / "color", COLOR)
+        return has_file(path / "color", COLOR)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         path = self._pose_files.get(self._pairs.numbers[index])
@@ -68,28 +76,28 @@ class Reader(ImagePairs):
 
     @functools.cached_property
     def _pose_files(self) -> dict[int, Path]:
-        return numbered(self.path / "pose", POSE)
+        return list_numbered(self.path / "pose", POSE)
 
     @functools.cached_property
     def _class_files(self) -> dict[int, Path]:
-        return numbered(self.path / "label-filt", IMAGE)
+        return list_numbered(self.path / "label-filt", IMAGE)
 
 
-def _grid(path: Path, options: Options, pairs: Pairs) -> tuple[Grid, bool]:
+def _grid(path: Path, options: Options, pairs: Pairs) -> tuple[PixelGrid, bool]:
     """The frames' pixel grid, and whether anything says what the colour camera is. Raises CaptureError."""
     if options.depth:
         color, depth = _cameras(path, options, pairs)
-        return Grid(color, depth, _T_color_depth(path)), True
+        return PixelGrid(color, depth, _T_color_depth(path)), True
     file = _first(path, (*COLOR_CAMERA, *ONE_CAMERA))
-    stated = given(options) or (read_intrinsics(file) if file else None)
-    camera = stated.camera(pairs.color_size) if stated else usual(pairs.color_size)
-    return Grid(camera, camera), stated is not None
+    stated = read_given_calibration(options) or (read_intrinsics(file) if file else None)
+    camera = stated.camera(pairs.color_size) if stated else guess_camera(pairs.color_size)
+    return PixelGrid(camera, camera), stated is not None
 
 
 def _cameras(path: Path, options: Options, pairs: Pairs) -> tuple[Intrinsics, Intrinsics]:
     """The colour and the depth camera. Raises CaptureError if nothing states either."""
     color_file, depth_file = _first(path, (*COLOR_CAMERA, *ONE_CAMERA)), _first(path, DEPTH_CAMERA)
-    color = given(options) or (read_intrinsics(color_file) if color_file else None)
+    color = read_given_calibration(options) or (read_intrinsics(color_file) if color_file else None)
     depth = read_intrinsics(depth_file) if depth_file else None
     if color is None and depth is None:
         raise CaptureError(f"{path} has no {COLOR_CAMERA[0]}: add it, or give capture.intrinsics.")
@@ -97,8 +105,8 @@ def _cameras(path: Path, options: Options, pairs: Pairs) -> tuple[Intrinsics, In
     depth_camera = depth.camera(pairs.depth_size) if depth else None
     if color_camera is None:
         assert depth_camera is not None
-        return seen_at(depth_camera, pairs.color_size), depth_camera
-    return color_camera, depth_camera or seen_at(color_camera, pairs.depth_size)
+        return rescale_camera(depth_camera, pairs.color_size), depth_camera
+    return color_camera, depth_camera or rescale_camera(color_camera, pairs.depth_size)
 
 
 def _T_color_depth(path: Path) -> NDArray[np.float64] | None:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import Options
-from ..camera_files import Calibration, given, read_intrinsics, read_pose, seen_at
-from ..depth_registration import Grid
-from ..image_files import holds, numbered
-from ..image_pairs import ImagePairs, pair
+from ..camera_files import Calibration, read_given_calibration, read_intrinsics, read_pose, rescale_camera
+from ..depth_registration import PixelGrid
+from ..image_files import has_file, list_numbered
+from ..image_pairs import ImagePairs, pair_files
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -31,17 +31,17 @@ class Reader(ImagePairs):
     layout = "frame-N.color.png (or .jpg) with frame-N.depth.png"
 
     def __init__(self, path: Path, options: Options):
-        pairs = pair(numbered(path, COLOR), numbered(path, DEPTH), path, options)
+        pairs = pair_files(list_numbered(path, COLOR), list_numbered(path, DEPTH), path, options)
         stated = path / "camera-intrinsics.txt"
-        calibration = given(options) or (read_intrinsics(stated) if stated.is_file() else KINECT)
+        calibration = read_given_calibration(options) or (read_intrinsics(stated) if stated.is_file() else KINECT)
         camera = calibration.camera(pairs.color_size)
-        grid = Grid(camera, seen_at(camera, pairs.depth_size))
+        grid = PixelGrid(camera, rescale_camera(camera, pairs.depth_size))
         super().__init__(path, options, pairs, grid, units_per_metre=1000.0)
         self.intrinsics_known = options.depth or options.intrinsics is not None
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        return holds(path, COLOR)
+        return has_file(path, COLOR)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         image = self._pairs.color[index] or self._pairs.depth[index]

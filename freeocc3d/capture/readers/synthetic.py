@@ -18,7 +18,7 @@ from ...core.transforms import back_project, depth_sigma, invert
 from ...core.types import FREE, UNKNOWN, Frame, Intrinsics
 from ...settings.registry import require_positive
 from .. import base, builtin_room
-from ..camera_files import given
+from ..camera_files import read_given_calibration
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 
@@ -84,7 +84,7 @@ class Reader(base.Capture):
         self.classes = builtin_room.CLASSES
         focal = _FOCAL_PER_WIDTH * own.width
         self.camera = Intrinsics(own.width, own.height, focal, focal, (own.width - 1) / 2, (own.height - 1) / 2)
-        stated = given(options)
+        stated = read_given_calibration(options)
         self.intrinsics = stated.camera((own.width, own.height)) if stated else self.camera
         self._lock = threading.Lock()
 
@@ -161,7 +161,7 @@ class Reader(base.Capture):
 
     @functools.cached_property
     def _room(self) -> builtin_room.Room:
-        return builtin_room.furnished()
+        return builtin_room.build_room()
 
     @functools.cached_property
     def _scene(self) -> Any:

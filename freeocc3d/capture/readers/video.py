@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ...core.errors import CaptureError, FrameError
 from ...core.types import Frame, Intrinsics
 from ..base import Capture, Options
-from ..camera_files import equivalent, given, reduced, usual
+from ..camera_files import convert_35mm, guess_camera, read_given_calibration, reduce_camera
 from ..image_files import Size
 
 REQUIRES: tuple[str, ...] = ("av",)
@@ -50,11 +50,11 @@ class Reader(Capture):
         self._decoder = _Decoder(path)
         self.timestamps = np.asarray(self._decoder.keys * float(self._decoder.time_base), np.float64)
         size = self._decoder.upright_size
-        lens = equivalent(self._decoder.focal_35mm, size)
-        stated = given(options)
-        camera = stated.camera(size) if stated else lens or usual(size)
+        lens = convert_35mm(self._decoder.focal_35mm, size)
+        stated = read_given_calibration(options)
+        camera = stated.camera(size) if stated else lens or guess_camera(size)
         self.intrinsics_known, self.focal_stated = stated is not None, stated is not None or lens is not None
-        self.intrinsics: Intrinsics = reduced(camera, options.max_size)
+        self.intrinsics: Intrinsics = reduce_camera(camera, options.max_size)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

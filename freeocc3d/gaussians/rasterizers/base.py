@@ -61,7 +61,7 @@ class Rasterizer(Protocol):
         ...
 
 
-def slope_limits(camera: Intrinsics) -> tuple[float, float, float, float]:
+def compute_slope_limits(camera: Intrinsics) -> tuple[float, float, float, float]:
     """Least and greatest x/z, then y/z, at which J is taken (``BEYOND``)."""
     beside, above = BEYOND * camera.width / camera.fx, BEYOND * camera.height / camera.fy
     return (

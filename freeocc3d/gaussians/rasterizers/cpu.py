@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...core.types import Intrinsics
-from .base import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR, TRANSMITTANCE_MIN, Rendered, slope_limits
+from .base import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR, TRANSMITTANCE_MIN, Rendered, compute_slope_limits
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -31,7 +31,7 @@ _GRADIENTS = 10
 Array = NDArray[np.float32]
 
 
-class Cpu:
+class CpuRasterizer:
     """Splats are sorted by depth once, then listed by the tiles that they reach; a tile is composited nearest first
     until it is opaque. The backward pass composites again, and each thread adds up gradients of its own.
 
@@ -61,7 +61,7 @@ class _Render(torch.autograd.Function):
         means, scales, quats, opacities, colors = (_array(tensor) for tensor in arguments[:5])
         T, camera = _array(arguments[5]), arguments[6]
         pinhole = np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32)
-        limits = np.array(slope_limits(camera), np.float32)
+        limits = np.array(compute_slope_limits(camera), np.float32)
         splats, box = _project(means, scales, quats, opacities, colors, T, pinhole, limits, camera.width, camera.height)
         rows = np.flatnonzero(box[:, 0] <= box[:, 1])
         rows = _nearest_first(rows, splats[rows, _Z].view(np.uint32))
@@ -515,6 +515,6 @@ def _part_backward(
             d_means[g, i] = T[0, i] * cam_x + T[1, i] * cam_y + T[2, i] * cam_z
 
 
-def load() -> Cpu:
+def load() -> CpuRasterizer:
     """The rasterizer."""
-    return Cpu()
+    return CpuRasterizer()

@@ -22,7 +22,7 @@ class Options:
     """A CUDA device of torch's."""
 
 
-class Gsplat:
+class GsplatRasterizer:
     """Source: V. Ye et al., gsplat: An Open-Source Library for Gaussian Splatting, JMLR 2025."""
 
     def __init__(self, device: str):
@@ -62,10 +62,10 @@ class Gsplat:
         return Rendered(out[0, ..., :3], out[0, ..., 3], alpha[0, ..., 0])
 
 
-def load(options: Options) -> Gsplat:
+def load(options: Options) -> GsplatRasterizer:
     """The rasterizer on a CUDA device. Raises DependencyError where there is none."""
     if not torch.cuda.is_available():
         raise DependencyError(
             "The rasterizer 'gsplat' needs an NVIDIA GPU and a torch built for CUDA: use fitting.rasterizer=cpu."
         )
-    return Gsplat(options.device)
+    return GsplatRasterizer(options.device)

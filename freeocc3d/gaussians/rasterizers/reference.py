@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ...core.types import Intrinsics
-from .base import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR, TRANSMITTANCE_MIN, Rendered, slope_limits
+from .base import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR, TRANSMITTANCE_MIN, Rendered, compute_slope_limits
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -23,7 +23,7 @@ class Options:
     """A device of torch's: "cpu", "cuda:0"…"""
 
 
-class Reference:
+class ReferenceRasterizer:
     """Pixels are rendered in tiles, so that memory holds; within a tile every Gaussian that reaches it is evaluated at
     every pixel."""
 
@@ -41,7 +41,7 @@ class Reference:
         camera: Intrinsics,
     ) -> Rendered:
         """See ``base.Rasterizer``; float64 arrays are rendered in float64."""
-        center, covariance, z = project(means, scales, quats_wxyz, T_cam_world, camera)
+        center, covariance, z = project_gaussians(means, scales, quats_wxyz, T_cam_world, camera)
         with torch.no_grad():
             # alpha >= ALPHA_MIN within this box, and nowhere else.
             reach = torch.sqrt(2 * torch.log((opacities / ALPHA_MIN).clamp(min=1)))[:, None]
@@ -73,14 +73,14 @@ class Reference:
         return Rendered(out[..., :3], out[..., 3], out[..., 4])
 
 
-def project(
+def project_gaussians(
     means: Tensor, scales: Tensor, quats_wxyz: Tensor, T_cam_world: Tensor, camera: Intrinsics
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels (N, 2) of the means, covariances (N, 2, 2) in pixels^2, camera-frame z (N,)."""
     R = T_cam_world[:3, :3]
     x, y, z = (means @ R.T + T_cam_world[:3, 3]).unbind(1)
     safe = torch.where(z > NEAR, z, torch.ones_like(z))
-    x_low, x_high, y_low, y_high = slope_limits(camera)
+    x_low, x_high, y_low, y_high = compute_slope_limits(camera)
     x_slope, y_slope = (x / safe).clamp(x_low, x_high), (y / safe).clamp(y_low, y_high)
     zero = torch.zeros_like(z)
     J = torch.stack(
@@ -90,13 +90,13 @@ def project(
         ),
         dim=1,
     )
-    M = J @ R @ (rotations(quats_wxyz) * scales[:, None, :])
+    M = J @ R @ (compute_rotations(quats_wxyz) * scales[:, None, :])
     blur = BLUR * torch.eye(2, dtype=means.dtype, device=means.device)
     center = torch.stack((camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy), dim=1)
     return center, M @ M.transpose(1, 2) + blur, z
 
 
-def rotations(quats_wxyz: Tensor) -> Tensor:
+def compute_rotations(quats_wxyz: Tensor) -> Tensor:
     """(N, 4) quaternions of any length to (N, 3, 3)."""
     w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=1, keepdim=True)).unbind(1)
     rows = (
@@ -118,6 +118,6 @@ def _composite(pixels: Tensor, center: Tensor, conic: Tensor, opacities: Tensor,
     return torch.where(after > TRANSMITTANCE_MIN, alpha * before, torch.zeros_like(alpha)) @ values
 
 
-def load(options: Options) -> Reference:
+def load(options: Options) -> ReferenceRasterizer:
     """The rasterizer."""
-    return Reference(options.device)
+    return ReferenceRasterizer(options.device)

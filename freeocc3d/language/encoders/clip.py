@@ -72,21 +72,21 @@ class ClipEncoder(Encoder):
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16, or (rows, columns, D) of patches."""
-        from ..patch_features import finished
+        from ..patch_features import finish_patches
 
-        return finished(self.patches(frame.color), frame.color, self.options.stride)
+        return finish_patches(self.patches(frame.color), frame.color, self.options.stride)
 
     def patches(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(rows, columns, D) unit features of the patches of (H, W, 3) pixels."""
-        from ..patch_features import Splice, Tiling, unit
+        from ..patch_features import Splice, Tiling, normalize_patches
 
         options, package = self.options, self.package
         window = package.input_size if options.window is None else options.window
         tiling = Tiling.of(rgb.shape[0], rgb.shape[1], package, options.short_side, window)
         splice = Splice(tiling, self.dimension)
         for images, corners in tiling.windows(tiling.image(rgb, package.mean, package.std)):
-            splice.add(unit(self._window_features(images, tiling)), corners)
-        return unit(splice.mean())
+            splice.add(normalize_patches(self._window_features(images, tiling)), corners)
+        return normalize_patches(splice.mean())
 
     def _window_features(self, images: NDArray[np.float32], tiling: Tiling) -> NDArray[np.float32]:
         """(B, h, w, D) of (B, 3, H, W) windows."""
@@ -94,7 +94,7 @@ class ClipEncoder(Encoder):
 
         chosen = self.options.attention
         q, k, v, stream = self._image.run(["queries", "keys", "values", "stream"], {"image": images})
-        mixed = clip_attention.mixed(chosen, q, k, v, tiling.window)
+        mixed = clip_attention.mix_values(chosen, q, k, v, tiling.window)
         output = "features" if clip_attention.KEEPS_REST[chosen] else "reduced"
         (features,) = self._head.run([output], {"mixed": mixed, "stream": stream})
         h, w = tiling.window
@@ -106,7 +106,7 @@ class ClipEncoder(Encoder):
 
         q, k, v, stream = self._image.run(["queries", "keys", "values", "stream"], {"image": images})
         grid = images.shape[2] // self.package.patch, images.shape[3] // self.package.patch
-        mixed = clip_attention.mixed("plain", q, k, v, grid)
+        mixed = clip_attention.mix_values("plain", q, k, v, grid)
         return np.asarray(self._head.run(["pooled"], {"mixed": mixed, "stream": stream})[0])
 
     def text_state(self) -> dict[str, Any]:
@@ -119,7 +119,7 @@ NEEDS_CAPTURE = False
 
 def check(options: Options) -> model_packages.Package:
     """The model that is named. Raises ModelError if it is not there."""
-    return model_packages.find(options.model, ("clip",), "language.clip.model")
+    return model_packages.find_model(options.model, ("clip",), "language.clip.model")
 
 
 def load(options: Options, capture: object = None) -> ClipEncoder:

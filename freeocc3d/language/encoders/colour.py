@@ -228,7 +228,7 @@ class ColourWords(TextEncoder):
         attainable = np.ones(len(words), np.float32)
         understood = []
         for row, word in enumerate(words):
-            meanings = parse(word)
+            meanings = parse_colors(word)
             understood.append(", ".join(meanings))
             if meanings:
                 features[row] = np.sqrt(np.mean([_text_squared(m) for m in meanings.values()], axis=0))
@@ -255,7 +255,7 @@ def load_text(state: dict[str, Any]) -> ColourWords:
     return ColourWords()
 
 
-def parse(phrase: str) -> dict[str, Meaning | str]:
+def parse_colors(phrase: str) -> dict[str, Meaning | str]:
     """The colours that a phrase names: "a dark-blue sofa" gives "dark blue". Each with its meaning, or with the basic
     term that it is."""
     meanings: dict[str, Meaning | str] = {}

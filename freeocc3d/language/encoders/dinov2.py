@@ -62,15 +62,15 @@ class Dinov2Encoder(Encoder):
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16, or (rows, columns, D) of patches."""
-        from ..patch_features import Splice, Tiling, finished, unit
+        from ..patch_features import Splice, Tiling, finish_patches, normalize_patches
 
         options, package, rgb = self.options, self.package, frame.color
         window = package.input_size if options.window is None else options.window
         tiling = Tiling.of(rgb.shape[0], rgb.shape[1], package, options.short_side, window)
         splice = Splice(tiling, self.dimension)
         for images, corners in tiling.windows(tiling.image(rgb, package.mean, package.std)):
-            splice.add(unit(self._image.run(["features"], {"image": images})[0]), corners)
-        return finished(unit(splice.mean()), rgb, options.stride)
+            splice.add(normalize_patches(self._image.run(["features"], {"image": images})[0]), corners)
+        return finish_patches(normalize_patches(splice.mean()), rgb, options.stride)
 
     def text_state(self) -> dict[str, Any]:
         return self.options.wording.state(self.package)
@@ -82,7 +82,7 @@ NEEDS_CAPTURE = False
 
 def check(options: Options) -> model_packages.Package:
     """The model that is named. Raises ModelError if it is not there."""
-    return model_packages.find(options.model, ("dense",), "language.dinov2.model")
+    return model_packages.find_model(options.model, ("dense",), "language.dinov2.model")
 
 
 def load(options: Options, capture: object = None) -> Dinov2Encoder:

@@ -116,7 +116,7 @@ class LabelWords(TextEncoder):
 
     def matching(self, word: str) -> tuple[list[int], str]:
         """Dimensions of the classes that a phrase means, and the part of it that was used."""
-        return synonyms.matching_names(word, self.classes[1:])
+        return synonyms.match_names(word, self.classes[1:])
 
     def contrast_words(self) -> list[str]:
         return self.classes[1:]

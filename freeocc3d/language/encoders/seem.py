@@ -73,20 +73,20 @@ class SeemEncoder(Encoder):
         tiling = Tiling.of(rgb.shape[0], rgb.shape[1], package, self.options.short_side, 0)
         image = tiling.image(rgb, package.mean, package.std)[None]
         masks, embeddings = self._image.run(["masks", "embeddings"], {"image": image})
-        return painted(masks[0], embeddings[0], self.options.mask_probability)
+        return paint_masks(masks[0], embeddings[0], self.options.mask_probability)
 
     def text_state(self) -> dict[str, Any]:
         return self.options.wording.state(self.package)
 
 
-def painted(
+def paint_masks(
     masks: NDArray[np.float32], embeddings: NDArray[np.float32], least_probability: float
 ) -> NDArray[np.float16]:
     """(h, w, D) unit embeddings of the masks, (Q, h, w) logits, that cover each pixel best; zero where none does."""
-    from ..patch_features import unit
+    from ..patch_features import normalize_patches
 
     best = masks.argmax(axis=0)
-    features = unit(embeddings).astype(np.float16)[best]
+    features = normalize_patches(embeddings).astype(np.float16)[best]
     features[masks.max(axis=0) < np.log(least_probability / (1 - least_probability))] = 0
     return features
 
@@ -97,7 +97,7 @@ NEEDS_CAPTURE = False
 
 def check(options: Options) -> model_packages.Package:
     """The model that is named. Raises ModelError if it is not there."""
-    return model_packages.find(options.model, ("masks",), "language.seem.model")
+    return model_packages.find_model(options.model, ("masks",), "language.seem.model")
 
 
 def load(options: Options, capture: object = None) -> SeemEncoder:

@@ -84,7 +84,9 @@ class SegmenterEncoder(Encoder):
 
     name: ClassVar[str] = "segmenter"
 
-    def __init__(self, network: Network, classes: tuple[str, ...], grouping: NDArray[np.float32], options: Options):
+    def __init__(
+        self, network: SegmentationNetwork, classes: tuple[str, ...], grouping: NDArray[np.float32], options: Options
+    ):
         """grouping: (D, C) 1 where the network's class c counts as the d-th of ``classes``; a void column is zero."""
         self.network = network
         self.classes = classes
@@ -110,7 +112,7 @@ class SegmenterEncoder(Encoder):
         return {"classes": list(self.classes), "aliases": self.aliases}
 
 
-class Network:
+class SegmentationNetwork:
     """A session with one image input and one output that is taken; what it wants and gives is asked of the file."""
 
     def __init__(self, path: Path, n_classes: int, options: Options):
@@ -234,11 +236,11 @@ class SegmenterWords(LabelWords):
     def matching(self, word: str) -> tuple[list[int], str]:
         """Of the parts of a phrase, most specific first, the first that either knows."""
         found, used = super().matching(word)
-        for part in synonyms.parts_of(word):
+        for part in synonyms.split_phrase(word):
             if part == used:
                 break
-            if synonyms.key_of(part) in self.aliases:
-                return [self.aliases[synonyms.key_of(part)]], part
+            if synonyms.make_key(part) in self.aliases:
+                return [self.aliases[synonyms.make_key(part)]], part
         return found, used
 
 
@@ -258,7 +260,7 @@ def load(options: Options, capture: Capture | None = None) -> SegmenterEncoder:
     """The encoder; it needs nothing of the capture. Raises ConfigError for files that cannot be used."""
     check(options)
     names = read_names(Path(options.classes))
-    network = Network(Path(options.model), len(names), options)
+    network = SegmentationNetwork(Path(options.model), len(names), options)
     classes, grouping = read_mapping(Path(options.mapping), names) if options.mapping else (names, np.eye(len(names)))
     grouping = grouping.astype(np.float32) * ~_void(names, options)
     said = np.asarray(grouping.any(axis=1))
@@ -292,8 +294,8 @@ def _void(names: tuple[str, ...], options: Options) -> NDArray[np.bool_]:
 
 def _aliases(names: NameEmbeddings, classes: tuple[str, ...]) -> dict[str, int]:
     """Names that mean a class by their embeddings, and that the vocabulary knows nothing of."""
-    known = {name: synonyms.matching_names(name, list(classes))[1] for name in names.names}
-    whole = {synonyms.key_of(name) for name, part in known.items() if part == synonyms.normal(name)}
+    known = {name: synonyms.match_names(name, list(classes))[1] for name in names.names}
+    whole = {synonyms.make_key(name) for name, part in known.items() if part == synonyms.normalize_phrase(name)}
     return {key: row for key, row in names.meaning(classes).items() if key not in whole}
 
 

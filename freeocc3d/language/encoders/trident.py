@@ -103,7 +103,7 @@ class TridentEncoder(Encoder):
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16, or (h, w, D) at SAM's grid, twice as fine with masks."""
-        from ..patch_features import finished, resampled
+        from ..patch_features import finish_patches, resample_patches
 
         rgb = frame.color
         spliced = self.spliced(rgb)
@@ -111,12 +111,12 @@ class TridentEncoder(Encoder):
         seen = sam_features[0, :, : grid[0], : grid[1]].reshape(sam_features.shape[1], -1).T
         side = sam_features.shape[3]
         inside = (np.arange(grid[0])[:, None] * side + np.arange(grid[1])).ravel()
-        weights = gathering(attention[0][np.ix_(inside, inside)], seen, self.options.cosine)
-        gathered = weights @ resampled(spliced, grid).reshape(len(inside), -1)
+        weights = gate_attention(attention[0][np.ix_(inside, inside)], seen, self.options.cosine)
+        gathered = weights @ resample_patches(spliced, grid).reshape(len(inside), -1)
         features = self._in_words(gathered).reshape(*grid, -1)
         if self.options.points:
             features = self._refined(features, sam_features)
-        return finished(features, rgb, self.options.stride)
+        return finish_patches(features, rgb, self.options.stride)
 
     def spliced(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(rows, columns, width) CLIP's values, mixed by DINO's correlation in each window; the windows' mean."""
@@ -140,20 +140,20 @@ class TridentEncoder(Encoder):
         return splice.mean()
 
     def _mixed(self, values: NDArray[np.float32], seen: NDArray[np.float32], tiling: Tiling) -> NDArray[np.float32]:
-        from ..clip_attention import joined
+        from ..clip_attention import join_heads
 
         h, w = tiling.window
-        patches = joined(values)[:, -h * w :]
+        patches = join_heads(values)[:, -h * w :]
         flat = seen.reshape(len(seen), h * w, -1)
-        weights = np.stack([correlation(own, self.options.beta, self.options.gamma) for own in flat])
+        weights = np.stack([correlate_patches(own, self.options.beta, self.options.gamma) for own in flat])
         return np.asarray((weights @ patches).reshape(len(seen), h, w, -1))
 
     def _in_words(self, mixed: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N, D) unit features of (N, width) mixed values."""
-        from ..patch_features import unit
+        from ..patch_features import normalize_patches
 
         (features,) = self._head.run(["reduced"], {"mixed": mixed[None], "stream": np.zeros_like(mixed[None])})
-        return unit(features[0])
+        return normalize_patches(features[0])
 
     def _sam_view(self, rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[int, int]]:
         """SAM's features (1, C, n, n), attention (1, n n, n n), and the (rows, columns) of them that show the frame: it
@@ -172,7 +172,7 @@ class TridentEncoder(Encoder):
 
     def _refined(self, features: NDArray[np.float32], sam_features: NDArray[np.float32]) -> NDArray[np.float32]:
         """(2 h, 2 w, D) features of (h, w, D), brought together within SAM's masks."""
-        from ..patch_features import resampled, unit
+        from ..patch_features import normalize_patches, resample_patches
 
         h, w = features.shape[:2]
         spacing = max(h, w) / self.options.points * self.sam.patch
@@ -181,39 +181,39 @@ class TridentEncoder(Encoder):
         masks, scores = self._masks.run(["masks", "scores"], {"features": sam_features, "points": points})
         best = scores[0].argmax(axis=1)
         rows = np.flatnonzero(scores[0, np.arange(len(best)), best] >= self.options.mask_score)
-        finer = unit(resampled(features, (_FINER * h, _FINER * w)))
+        finer = normalize_patches(resample_patches(features, (_FINER * h, _FINER * w)))
         fraction = masks.shape[3] // sam_features.shape[2]  # pixels of a mask in a patch of SAM's
         cell = fraction // _FINER
         if not len(rows):
             return finer
         covers = masks[0, rows, best[rows], : h * fraction, : w * fraction] > 0
         shares = covers.reshape(len(rows), _FINER * h, cell, _FINER * w, cell).mean(axis=(2, 4), dtype=np.float32)
-        return unit(pooled(finer, shares, scores[0, rows, best[rows]]))
+        return normalize_patches(pool_masks(finer, shares, scores[0, rows, best[rows]]))
 
     def text_state(self) -> dict[str, Any]:
         return self.options.wording.state(self.clip)
 
 
-def correlation(seen: NDArray[np.float32], beta: float, gamma: float) -> NDArray[np.float32]:
+def correlate_patches(seen: NDArray[np.float32], beta: float, gamma: float) -> NDArray[np.float32]:
     """(N, N) attention from the cosines of (N, C) features: those below beta times their mean get nothing; a patch
     always attends to itself."""
-    from ..clip_attention import softmax
-    from ..patch_features import unit
+    from ..clip_attention import apply_softmax
+    from ..patch_features import normalize_patches
 
-    u = unit(seen)
+    u = normalize_patches(seen)
     cosines = u @ u.T
     logits = np.float32(gamma) * (cosines - np.float32(beta) * cosines.mean())
     masked = logits < 0
     np.fill_diagonal(masked, False)
-    return softmax(np.where(masked, np.float32(-np.inf), logits).astype(np.float32))
+    return apply_softmax(np.where(masked, np.float32(-np.inf), logits).astype(np.float32))
 
 
-def gathering(attention: NDArray[np.float32], seen: NDArray[np.float32], cosine: float) -> NDArray[np.float32]:
+def gate_attention(attention: NDArray[np.float32], seen: NDArray[np.float32], cosine: float) -> NDArray[np.float32]:
     """(N, N) attention without the pairs of patches whose (N, C) features are less alike than ``cosine`` times the
     mean, rows summing to 1."""
-    from ..patch_features import unit
+    from ..patch_features import normalize_patches
 
-    u = unit(seen)
+    u = normalize_patches(seen)
     cosines = u @ u.T
     kept = cosines >= np.float32(cosine) * cosines.mean()
     np.fill_diagonal(kept, True)
@@ -221,7 +221,7 @@ def gathering(attention: NDArray[np.float32], seen: NDArray[np.float32], cosine:
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
-def pooled(
+def pool_masks(
     features: NDArray[np.float32], shares: NDArray[np.float32], scores: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """(h, w, D): the mean over masks of their mean feature, a mask weighing by its score and by its share (M, h, w) of
@@ -242,9 +242,9 @@ NEEDS_CAPTURE = False
 def check(options: Options) -> tuple[model_packages.Package, model_packages.Package, model_packages.Package]:
     """The models that are named: CLIP, DINO and SAM. Raises ModelError if one is not there."""
     return (
-        model_packages.find(options.model, ("clip",), "language.trident.model"),
-        model_packages.find(options.dino, ("backbone",), "language.trident.dino"),
-        model_packages.find(options.sam, ("sam",), "language.trident.sam"),
+        model_packages.find_model(options.model, ("clip",), "language.trident.model"),
+        model_packages.find_model(options.dino, ("backbone",), "language.trident.dino"),
+        model_packages.find_model(options.sam, ("sam",), "language.trident.sam"),
     )
 
 

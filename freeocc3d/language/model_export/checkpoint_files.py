@@ -60,7 +60,7 @@ def _local(source: str) -> Path:
     """The folder of a checkpoint, fetched from the hub where it is no folder here."""
     if Path(source).is_dir():
         return Path(source)
-    return model_hub.pull(source)
+    return model_hub.pull_package(source)
 
 
 def _from_transformers(folder: Path) -> nn.Module:

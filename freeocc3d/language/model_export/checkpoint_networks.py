@@ -23,7 +23,7 @@ _TALK2DINO_TEMPERATURE = 0.07
 
 
 @dataclass(frozen=True)
-class Network:
+class CheckpointNetwork:
     """A module to export: example inputs by name, which of their axes may have any length, and its outputs' names."""
 
     module: nn.Module
@@ -37,7 +37,7 @@ class Checkpoint:
     """What is exported: networks by part, the tokenizer as JSON, and the manifest's facts."""
 
     kind: str
-    networks: dict[str, Network]
+    networks: dict[str, CheckpointNetwork]
     facts: dict[str, Any]
     tokenizer: str | None = None
 
@@ -70,7 +70,9 @@ def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[
 
 def build_backbone(model: nn.Module, mean: list[float], std: list[float]) -> Checkpoint:
     """Of transformers' ViTModel (DINO) or Dinov2Model, with registers or without."""
-    network = Network(graphs.DinoPatches(model), {"image": _image(model.config)}, {"image": (0, 2, 3)}, ("features",))
+    network = CheckpointNetwork(
+        graphs.DinoPatches(model), {"image": _image(model.config)}, {"image": (0, 2, 3)}, ("features",)
+    )
     facts = _facts(model.config.hidden_size, mean, std, model.config, 0, 1.0)
     return Checkpoint("backbone", {"image": network}, facts)
 
@@ -98,10 +100,10 @@ def build_sam(model: nn.Module, mean: list[float], std: list[float]) -> Checkpoi
     return Checkpoint(
         "sam",
         {
-            "image": Network(
+            "image": CheckpointNetwork(
                 graphs.SamImage(model), {"image": torch.zeros((1, 3, side, side))}, {}, ("features", "attention")
             ),
-            "masks": Network(
+            "masks": CheckpointNetwork(
                 graphs.SamMasks(model), {"features": features, "points": points}, {"points": (1,)}, ("masks", "scores")
             ),
         },
@@ -114,21 +116,23 @@ def _image(config: Any) -> Tensor:
     return torch.zeros((2, 3, 3 * patch, 5 * patch))
 
 
-def _image_networks(model: nn.Module, head: nn.Module) -> dict[str, Network]:
+def _image_networks(model: nn.Module, head: nn.Module) -> dict[str, CheckpointNetwork]:
     config = model.config.vision_config
     trunk, image = graphs.ImageTrunk(model.vision_model), _image(config)
     stream = torch.zeros((2, 11, config.hidden_size))
     return {
-        "image": Network(trunk, {"image": image}, {"image": (0, 2, 3)}, ("queries", "keys", "values", "stream")),
-        "head": Network(
+        "image": CheckpointNetwork(
+            trunk, {"image": image}, {"image": (0, 2, 3)}, ("queries", "keys", "values", "stream")
+        ),
+        "head": CheckpointNetwork(
             head, {"mixed": stream, "stream": stream.clone()}, {"mixed": (0, 1), "stream": (0, 1)},
             ("features", "reduced", "pooled"),
         ),
     }  # fmt: skip
 
 
-def _text_network(module: nn.Module, tokens: Tensor, dynamic: tuple[int, ...]) -> Network:
-    return Network(module, {"tokens": tokens}, {"tokens": dynamic}, ("features",))
+def _text_network(module: nn.Module, tokens: Tensor, dynamic: tuple[int, ...]) -> CheckpointNetwork:
+    return CheckpointNetwork(module, {"tokens": tokens}, {"tokens": dynamic}, ("features",))
 
 
 def _facts(

@@ -38,7 +38,7 @@ def export_checkpoint(
     from .checkpoint_files import read_checkpoint, stated_licence
     from .package_writer import write_package
 
-    folder = model_packages.models_folder() / output if Path(output).name == output else Path(output)
+    folder = model_packages.find_models_folder() / output if Path(output).name == output else Path(output)
     checkpoint = read_checkpoint(source, tokenizer, text, text_head)
     write_package(checkpoint, folder, folder.name, source, licence or stated_licence(source), precision)
-    return model_packages.read(folder)
+    return model_packages.read_package(folder)

@@ -15,7 +15,7 @@ import yaml
 
 from ...core.errors import ModelError
 from .. import model_packages
-from .checkpoint_networks import Checkpoint, Network
+from .checkpoint_networks import Checkpoint, CheckpointNetwork
 
 _OPSET = 18
 """Version of ONNX's operators: the newest that every supported onnxruntime runs."""
@@ -53,16 +53,16 @@ def write_package(
             "licence": licence,
             "source": source,
             "parts": parts,
-            "files": {file: model_packages.sha256(made / file) for file in parts.values()},
+            "files": {file: model_packages.hash_file(made / file) for file in parts.values()},
         }
         (made / model_packages.MANIFESTS[0]).write_text(yaml.safe_dump(manifest, sort_keys=False), encoding="utf-8")
-        package = model_packages.read(made)
+        package = model_packages.read_package(made)
         for part in checkpoint.networks:
             package.session(part)  # what is written can be run
         os.replace(made, folder)
 
 
-def write_onnx(network: Network, path: Path) -> None:
+def write_onnx(network: CheckpointNetwork, path: Path) -> None:
     """Export one network."""
     any_length = {
         name: dict.fromkeys(network.dynamic.get(name, ()), torch.export.Dim.DYNAMIC) for name in network.inputs

@@ -25,7 +25,7 @@ _WINDOW = 6  # full-size pixels on each side of a pixel's centre in which its pl
 
 
 @dataclass(frozen=True)
-class View:
+class AlignmentView:
     """A frame as the alignment needs it.
 
     intrinsics: of the (h, w) images.  points: (h, w, 3) float32, camera frame, metres; 0 where there is no surface.
@@ -49,7 +49,7 @@ class View:
         return float((self.points[..., 2] > 0).mean())
 
 
-def view_of(frame: Frame) -> View:
+def prepare_alignment_view(frame: Frame) -> AlignmentView:
     """Prepare a frame."""
     camera = frame.intrinsics
     step = max(1, round(camera.width / WIDTH))
@@ -58,17 +58,17 @@ def view_of(frame: Frame) -> View:
         w, h, camera.fx / step, camera.fy / step, (camera.cx + 0.5) / step - 0.5, (camera.cy + 0.5) / step - 0.5
     )
     window = max(2, round(_WINDOW * camera.width / 640))
-    points, normals = planes(frame.depth_m, step, window, camera.fx, camera.fy, camera.cx, camera.cy)
+    points, normals = fit_planes(frame.depth_m, step, window, camera.fx, camera.fy, camera.cx, camera.cy)
     gray = cv2.cvtColor(frame.color[: h * step, : w * step], cv2.COLOR_RGB2GRAY)
     gray = cv2.resize(gray, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
     pyramid = [cv2.GaussianBlur(gray, (3, 3), 0.6)]
     for _ in range(_LEVELS - 1):
         pyramid.append(cv2.pyrDown(pyramid[-1]))
-    return View(small, points, normals, tuple(pyramid))
+    return AlignmentView(small, points, normals, tuple(pyramid))
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def planes(
+def fit_planes(
     depth_m: NDArray[np.float32], step: int, window: int, fx: float, fy: float, cx: float, cy: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Points and normals (h, w, 3) of planes 1/z = a + b (u - u0) + c (v - v0) fitted around every ``step``-th pixel's

@@ -8,7 +8,7 @@ With p a source point and p' = T p, n and q the target's normal and point where 
 
 with s from the residuals' median absolute deviation and rho the Geman-McClure function. Gain and offset are solved for
 together with xi, so that a change of exposure moves nothing. What the residuals do not determine, such as a slide along
-a bare wall, is told by the eigenvalues of the normal equations and stays as it was guessed (``constrained``).
+a bare wall, is told by the eigenvalues of the normal equations and stays as it was guessed (``remove_undetermined``).
 
 Sources: Y. Chen, G. Medioni, Object Modelling by Registration of Multiple Range Images, IVC 1992 (1); C. Kerl, J.
 Sturm, D. Cremers, Dense Visual SLAM for RGB-D Cameras, IROS 2013 (2); J. Zhang, M. Kaess, S. Singh, On Degeneracy of
@@ -25,14 +25,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...core.transforms import nearest_rigid
-from .alignment_views import View
+from .alignment_views import AlignmentView
 
 PHOTOMETRIC = 0.2
 """Weight of the intensities: neighbouring ones are far from independent."""
 
 
 @dataclass(frozen=True)
-class Alignment:
+class ViewAlignment:
     """The pose of a source view in a target view.
 
     T_target_source: (4, 4).  information: (6, 6) at it, rotation before translation, for T <- exp(xi) T, without what
@@ -56,14 +56,14 @@ _FLAT, _FEW = 0.015, 100  # standard deviation of intensities that say nothing; 
 _COMPARED = 0.15  # share of what is in view that must meet a surface, not a hole
 
 STATS = 10
-"""Statistics that ``linearise`` counts."""
+"""Statistics that ``linearize`` counts."""
 
 _BINS = 512
 _PER_SIGMA = 16.0  # histogram bins per unit of a normalised residual
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def linearise(
+def linearize(
     points_s: NDArray[np.float32],
     normals_s: NDArray[np.float32],
     gray_s: NDArray[np.float32],
@@ -225,13 +225,13 @@ def _spread(histogram: NDArray[np.int64], count: int, least: float) -> float:
     return 1.4826 * len(histogram) / _PER_SIGMA
 
 
-def align(
-    source: View,
-    target: View,
+def align_views(
+    source: AlignmentView,
+    target: AlignmentView,
     T_target_source: NDArray[np.float64],
     iterations: tuple[int, ...] = (8, 6, 6),
     photometric: float = PHOTOMETRIC,
-) -> Alignment:
+) -> ViewAlignment:
     """Refine the pose of ``source`` in ``target`` from a guess, coarse to fine.
 
     iterations: at most so many steps at each level, coarsest first.  photometric: weight of the intensities.
@@ -242,21 +242,21 @@ def align(
         source.points, source.normals, source.gray, target.points, target.normals, target.gray,
         target.camera, T, np.array(iterations), photometric, H, g, stats,
     )  # fmt: skip
-    information, _, determined = constrained(*marginal(H, g))
-    return Alignment(
-        nearest_rigid(T), information, bool(determined), float(stats[1] / max(stats[0], 1.0)), inliers(stats),
-        correlation(stats),
+    information, _, determined = remove_undetermined(*eliminate_brightness(H, g))
+    return ViewAlignment(
+        nearest_rigid(T), information, bool(determined), float(stats[1] / max(stats[0], 1.0)),
+        compute_inlier_share(stats), compute_correlation(stats),
     )  # fmt: skip
 
 
-def inliers(stats: NDArray[np.float64]) -> float:
-    """Share of the pixels that lie on the target's surface, of those where it has one, from ``linearise``'s statistics;
+def compute_inlier_share(stats: NDArray[np.float64]) -> float:
+    """Share of the pixels that lie on the target's surface, of those where it has one, from ``linearize``'s statistics;
     0 where too few have to tell."""
     return float(stats[3] / stats[2]) if stats[2] >= max(_FEW, _COMPARED * stats[1]) else 0.0
 
 
-def correlation(stats: NDArray[np.float64]) -> float:
-    """Of the intensities of two views, from ``linearise``'s statistics."""
+def compute_correlation(stats: NDArray[np.float64]) -> float:
+    """Of the intensities of two views, from ``linearize``'s statistics."""
     n = max(stats[4], 1.0)
     s, t = stats[5] / n, stats[6] / n
     ss, tt, st = stats[7] / n - s * s, stats[8] / n - t * t, stats[9] / n - s * t
@@ -280,20 +280,20 @@ def _descend(
     g: NDArray[np.float64],
     stats: NDArray[np.float64],
 ) -> None:
-    """``align``'s loop: T is moved in place; H, g and stats are those of the last step's start."""
+    """``align_views``'s loop: T is moved in place; H, g and stats are those of the last step's start."""
     scales = np.array((6.0, 10.0))
     brightness = np.array((1.0, 0.0))
     for done in range(len(iterations)):
         level = len(iterations) - 1 - done
         for _ in range(iterations[done]):
-            linearise(
+            linearize(
                 points_s, normals_s, gray_s[level], points_t, normals_t, gray_t[level], camera, T, 1 << level,
                 brightness, scales, photometric, H, g, stats,
             )  # fmt: skip
             if stats[2] < 30:
                 return
-            information, gradient = marginal(H, g)
-            information, gradient, _ = constrained(information, gradient)
+            information, gradient = eliminate_brightness(H, g)
+            information, gradient, _ = remove_undetermined(information, gradient)
             for a in range(6):
                 information[a, a] += 1e-6 * information[a, a] + 1.0
             step = np.linalg.solve(information, -gradient)
@@ -301,13 +301,13 @@ def _descend(
             D[0, 0] += 1e-9
             D[1, 1] += 1e-9
             brightness += np.linalg.solve(D, -g[6:] - np.ascontiguousarray(H[6:, :6]) @ step)
-            move(T, step)
+            apply_twist(T, step)
             if np.abs(step).max() < 2e-4:
                 break
 
 
 @njit(nogil=True, cache=True)
-def constrained(
+def remove_undetermined(
     H: NDArray[np.float64], g: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
     """(6, 6), (6,) normal equations without what noise in the normals alone would contribute, and whether something of
@@ -324,7 +324,7 @@ def constrained(
 
 
 @njit(nogil=True, cache=True)
-def move(T: NDArray[np.float64], xi: NDArray[np.float64]) -> None:
+def apply_twist(T: NDArray[np.float64], xi: NDArray[np.float64]) -> None:
     """T <- exp(xi) T in place; rotation before translation."""
     angle = math.sqrt(xi[0] ** 2 + xi[1] ** 2 + xi[2] ** 2)
     W = np.array(((0.0, -xi[2], xi[1]), (xi[2], 0.0, -xi[0]), (-xi[1], xi[0], 0.0)))
@@ -344,7 +344,9 @@ def move(T: NDArray[np.float64], xi: NDArray[np.float64]) -> None:
 
 
 @njit(nogil=True, cache=True)
-def marginal(H: NDArray[np.float64], g: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def eliminate_brightness(
+    H: NDArray[np.float64], g: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(6, 6), (6,) normal equations of xi alone, gain and offset eliminated from (8, 8), (8,)."""
     D = np.ascontiguousarray(H[6:, 6:])
     D[0, 0] += 1e-9

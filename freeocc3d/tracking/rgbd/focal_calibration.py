@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
-from ...core.transforms import apart
+from ...core.transforms import measure_pose_difference
 from . import dense_alignment, orb_features
-from .keyframe_registration import KeyframeView, decoded_view, matched
+from .keyframe_registration import KeyframeView, decode_keyframe_view, match_keyframes
 
 PAIRS = 36
 """Pairs of frames that are looked at."""
@@ -31,7 +31,7 @@ _LEAST_PAIRS, _LEAST_MATCHES = 8, 500
 _FAR_PX = 3.0  # an error from which on a match counts as wrong
 
 
-def color_focal(capture: Capture, frames: range) -> float:
+def estimate_color_focal(capture: Capture, frames: range) -> float:
     """Focal length of the colour camera over that of the depth camera; 1 where the scan does not clearly say otherwise.
 
     frames: those of the capture that are used. No poses are read.
@@ -61,19 +61,19 @@ def _pairs(capture: Capture, frames: range) -> list[_Pair]:
 
 def _pair(capture: Capture, frames: range) -> _Pair | None:
     """The first frame with the farthest of a few further on that still shows most of the same."""
-    target = decoded_view(capture, frames[0])
+    target = decode_keyframe_view(capture, frames[0])
     for gap in _GAPS:
-        source = decoded_view(capture, frames[gap]) if target is not None and gap < len(frames) else None
+        source = decode_keyframe_view(capture, frames[gap]) if target is not None and gap < len(frames) else None
         if target is None or source is None:
             continue
-        found = matched(source, target)
-        guess = orb_features.pose(found.points_s, found.rays_t, 1.0 / target.camera.fx, threshold_px=6.0)
+        found = match_keyframes(source, target)
+        guess = orb_features.estimate_pose(found.points_s, found.rays_t, 1.0 / target.camera.fx, threshold_px=6.0)
         if guess is None:
             continue
-        aligned = dense_alignment.align(source.view, target.view, guess[0], photometric=0.0)
-        moved = max(apart(np.eye(4), aligned.T_target_source))
+        aligned = dense_alignment.align_views(source.view, target.view, guess[0], photometric=0.0)
+        moved = max(measure_pose_difference(np.eye(4), aligned.T_target_source))
         if aligned.determined and aligned.overlap > 0.6 and aligned.inliers > 0.75 and moved > 0.02:
-            return source, target, aligned.T_target_source, orb_features.match(source.features, target.features)
+            return source, target, aligned.T_target_source, orb_features.match_binary(source.features, target.features)
     return None
 
 
@@ -82,7 +82,7 @@ def _error(pairs: list[_Pair], ratio: float) -> float:
     total, count = 0.0, 0
     for source, target, T, rows in pairs:
         camera = replace(source.camera, fx=source.camera.fx * ratio, fy=source.camera.fy * ratio)
-        points = orb_features.lift(source.features.rays(camera), source.view)[rows[:, 0]]
+        points = orb_features.lift_rays(source.features.rays(camera), source.view)[rows[:, 0]]
         known = points[:, 2] > 0
         moved = points[known] @ T[:3, :3].T + T[:3, 3]
         off = camera.fx * (moved[:, :2] / moved[:, 2:] - target.features.rays(camera)[rows[known, 1]])

@@ -22,9 +22,9 @@ from scipy.sparse import csc_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from ...core.transforms import invert, nearest_rigid
-from ..overlap import mutual_overlap
+from ..overlap import measure_mutual_overlap
 from . import dense_alignment, orb_features
-from .keyframe_registration import KeyframeView, Matched, matched
+from .keyframe_registration import FeatureMatches, KeyframeView, match_keyframes
 
 _STRIDE = 2  # source pixels that are skipped: neighbouring ones say nearly the same
 _LEAST_SHARE, _LEAST_CORRELATION = 0.5, 0.5
@@ -36,13 +36,13 @@ _PRIOR = 1.0  # information that holds a keyframe which no pair holds
 class _Pair:
     source: int
     target: int
-    matched: Matched
+    matched: FeatureMatches
     brightness: NDArray[np.float64] = field(default_factory=lambda: np.array((1.0, 0.0)))
     scales: NDArray[np.float64] = field(default_factory=lambda: np.array((3.0, 5.0)))
     photometric: float = dense_alignment.PHOTOMETRIC
 
 
-def refine(
+def refine_poses(
     keyframes: Sequence[KeyframeView],
     poses: Sequence[NDArray[np.float64]],
     neighbours: int = 10,
@@ -62,9 +62,9 @@ def refine(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for _ in range(rounds):
             before = np.stack(T)
-            chosen = overlapping_pairs(keyframes, T, neighbours, least_overlap)
+            chosen = find_overlapping_pairs(keyframes, T, neighbours, least_overlap)
             new = [pair for pair in chosen if pair not in made]
-            matches = pool.map(lambda pair: matched(keyframes[pair[0]], keyframes[pair[1]]), new)
+            matches = pool.map(lambda pair: match_keyframes(keyframes[pair[0]], keyframes[pair[1]]), new)
             made.update({pair: _Pair(*pair, found) for pair, found in zip(new, matches, strict=True)})
             pairs = [made[pair] for pair in chosen]
             for _ in range(iterations):
@@ -72,7 +72,7 @@ def refine(
                 step = _solve([pair for pair, term in zip(pairs, terms, strict=True) if term is not None],
                               [term for term in terms if term is not None], len(T))  # fmt: skip
                 for k, xi in enumerate(step):
-                    dense_alignment.move(T[k], xi)
+                    dense_alignment.apply_twist(T[k], xi)
                 if np.abs(step).max() < _STILL:
                     break
             if np.abs(np.stack(T) - before)[:, :3, 3].max() < _FAR_M:
@@ -80,7 +80,7 @@ def refine(
     return [nearest_rigid(pose) for pose in T]
 
 
-def overlapping_pairs(
+def find_overlapping_pairs(
     keyframes: Sequence[KeyframeView], T: Sequence[NDArray[np.float64]], neighbours: int, least: float
 ) -> list[tuple[int, int]]:
     """(source, target) of the keyframes that share most of their views; each is paired with the one before it."""
@@ -90,7 +90,9 @@ def overlapping_pairs(
         # The middles of what two cameras see are near where their views overlap: measure only these.
         near = np.argsort(np.linalg.norm(centers[:n] - centers[n], axis=1), kind="stable")[: 4 * neighbours]
         T_n_world = invert(T[n])
-        shared = [(mutual_overlap(keyframes[m].overlap, keyframes[n].overlap, T_n_world @ T[m]), int(m)) for m in near]
+        shared = [
+            (measure_mutual_overlap(keyframes[m].overlap, keyframes[n].overlap, T_n_world @ T[m]), int(m)) for m in near
+        ]
         pairs |= {(n, m) for share, m in sorted(shared, reverse=True)[:neighbours] if share >= least}
         pairs.add((n, n - 1))
     return sorted(pairs)
@@ -112,21 +114,21 @@ def _terms(
     T_target_world = invert(T[pair.target])
     T_ts = T_target_world @ T[pair.source]
     H8, g8, stats = np.zeros((8, 8)), np.zeros(8), np.zeros(dense_alignment.STATS)
-    dense_alignment.linearise(
+    dense_alignment.linearize(
         a.points, a.normals, a.gray[0], b.points, b.normals, b.gray[0], b.camera, T_ts, _STRIDE, pair.brightness,
         pair.scales, pair.photometric, H8, g8, stats,
     )  # fmt: skip
     few = stats[1] * _STRIDE**2 < 0.05 * a.points[..., 0].size
-    correlation = dense_alignment.correlation(stats)
-    if few or dense_alignment.inliers(stats) < _LEAST_SHARE or correlation < _LEAST_CORRELATION:
+    correlation = dense_alignment.compute_correlation(stats)
+    if few or dense_alignment.compute_inlier_share(stats) < _LEAST_SHARE or correlation < _LEAST_CORRELATION:
         return None
     # Intensities that agree less well (colour that lies beside its depth, reflections) say less of the pose.
     if not np.isnan(correlation):  # flat ones say nothing, at any weight
         agreement = (correlation - _LEAST_CORRELATION) / (1 - _LEAST_CORRELATION)
         pair.photometric = dense_alignment.PHOTOMETRIC * agreement**4
     pair.brightness += np.linalg.solve(H8[6:, 6:] + 1e-9 * np.eye(2), -g8[6:])
-    H, g, _ = dense_alignment.constrained(*dense_alignment.marginal(H8, g8))
-    orb_features.reprojection(pair.matched.points_s, pair.matched.rays_t, T_ts, target.camera.fx, H, g)
+    H, g, _ = dense_alignment.remove_undetermined(*dense_alignment.eliminate_brightness(H8, g8))
+    orb_features.add_reprojection(pair.matched.points_s, pair.matched.rays_t, T_ts, target.camera.fx, H, g)
     A = _adjoint(T_target_world)
     return A.T @ H @ A, A.T @ g
 

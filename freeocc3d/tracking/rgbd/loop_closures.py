@@ -14,12 +14,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.transforms import apart, invert
+from ...core.transforms import invert, measure_pose_difference
 from ..pose_graph import Edge
 from . import dense_alignment
 from .keyframe_registration import KeyframeView, register_by_features
-from .orb_features import Features, match
-from .place_recognition import Vocabulary, similarity
+from .orb_features import OrbFeatures, match_binary
+from .place_recognition import Vocabulary, compare_histograms
 
 CANDIDATES = 4
 """Keyframes that each is compared with: the most similar ones."""
@@ -31,7 +31,7 @@ _LEAST_OVERLAP, _LEAST_INLIERS, _LEAST_CORRELATION = 0.35, 0.75, 0.7
 _NEAR_M, _NEAR_DEG = 0.10, 4.0
 
 
-def find(
+def find_closures(
     keyframes: Sequence[KeyframeView], submap: Sequence[int], T_world_keyframe: Sequence[NDArray[np.float64]]
 ) -> list[Edge]:
     """Verified closures among K keyframes.
@@ -41,7 +41,7 @@ def find(
     """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         candidates = _candidates(keyframes, submap, pool)
-        found = pool.map(lambda pair: verify(keyframes, submap, T_world_keyframe, *pair), candidates)
+        found = pool.map(lambda pair: verify_closure(keyframes, submap, T_world_keyframe, *pair), candidates)
         return [edge for edge in found if edge is not None]
 
 
@@ -53,7 +53,7 @@ def _candidates(
     if sum(map(len, described)) < _FEATURES * 2:
         return []
     vocabulary = Vocabulary(described)
-    alike = similarity(np.stack(list(pool.map(vocabulary.histogram, described))))
+    alike = compare_histograms(np.stack(list(pool.map(vocabulary.histogram, described))))
     pairs, rows = set(), np.arange(len(keyframes))
     for n in range(len(keyframes)):
         near = (np.abs(rows - n) <= _BETWEEN) & (np.asarray(submap) == submap[n])
@@ -63,13 +63,13 @@ def _candidates(
     return sorted(pairs)
 
 
-def in_common(a: Features, b: Features) -> int:
+def count_common_features(a: OrbFeatures, b: OrbFeatures) -> int:
     """How many features of two frames are each other's nearest, and near, of a sample."""
-    few = [Features(f.pixels[:_SAMPLE], f.descriptors[:_SAMPLE]) for f in (a, b)]
-    return len(match(*few))
+    few = [OrbFeatures(f.pixels[:_SAMPLE], f.descriptors[:_SAMPLE]) for f in (a, b)]
+    return len(match_binary(*few))
 
 
-def verify(
+def verify_closure(
     keyframes: Sequence[KeyframeView],
     submap: Sequence[int],
     T_world_keyframe: Sequence[NDArray[np.float64]],
@@ -88,7 +88,7 @@ def verify(
         """Whether keyframes a and b fall into place where the closure and the path say."""
         T_source_a = invert(T_world_keyframe[source]) @ T_world_keyframe[a]
         guess = invert(T_world_keyframe[b]) @ T_world_keyframe[target] @ closed.T_target_source @ T_source_a
-        aligned = dense_alignment.align(keyframes[a].view, keyframes[b].view, guess)
+        aligned = dense_alignment.align_views(keyframes[a].view, keyframes[b].view, guess)
         return _falls_into_place(aligned) and _near(guess, aligned.T_target_source)
 
     def beside(row: int) -> list[int]:
@@ -101,7 +101,7 @@ def verify(
     return Edge(source, target, closed.T_target_source, closed.information, uncertain=True)
 
 
-def _falls_into_place(aligned: dense_alignment.Alignment) -> bool:
+def _falls_into_place(aligned: dense_alignment.ViewAlignment) -> bool:
     return (
         aligned.determined
         and aligned.overlap >= _LEAST_OVERLAP
@@ -111,5 +111,5 @@ def _falls_into_place(aligned: dense_alignment.Alignment) -> bool:
 
 
 def _near(T_a: NDArray[np.float64], T_b: NDArray[np.float64]) -> bool:
-    metres, degrees = apart(T_a, T_b)
+    metres, degrees = measure_pose_difference(T_a, T_b)
     return metres <= _NEAR_M and degrees <= _NEAR_DEG

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...core.types import Frame, Intrinsics
-from .alignment_views import View
+from .alignment_views import AlignmentView
 
 COUNT = 800
 _MIN_INLIERS = 12
@@ -23,7 +23,7 @@ _FARTHEST_PX, _AGREES_PX = 12.0, 4.0
 
 
 @dataclass(frozen=True)
-class Features:
+class OrbFeatures:
     """pixels: (N, 2) float32 of the colour image.  descriptors: (N, 32) uint8."""
 
     pixels: NDArray[np.float32]
@@ -35,17 +35,17 @@ class Features:
         return np.asarray((self.pixels - center) / np.array((camera.fx, camera.fy), np.float32), np.float32)
 
 
-def detect(frame: Frame, count: int = COUNT) -> Features:
+def detect_features(frame: Frame, count: int = COUNT) -> OrbFeatures:
     """The strongest corners of a frame, spread over it."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     orb = cv2.ORB_create(nfeatures=count, scaleFactor=1.2, nlevels=8, fastThreshold=10)
     points, descriptors = orb.detectAndCompute(gray, None)
     if descriptors is None:
-        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
-    return Features(np.array([p.pt for p in points], np.float32), descriptors)
+        return OrbFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+    return OrbFeatures(np.array([p.pt for p in points], np.float32), descriptors)
 
 
-def lift(rays: NDArray[np.float32], view: View) -> NDArray[np.float32]:
+def lift_rays(rays: NDArray[np.float32], view: AlignmentView) -> NDArray[np.float32]:
     """(N, 3) camera-frame points where the (N, 2) rays meet the planes of the view's pixels, 0 where there is none."""
     K = view.intrinsics
     u = np.rint(rays[:, 0] * K.fx + K.cx).astype(int)
@@ -61,7 +61,7 @@ def lift(rays: NDArray[np.float32], view: View) -> NDArray[np.float32]:
     return (directions * z[:, None]).astype(np.float32)
 
 
-def match(a: Features, b: Features) -> NDArray[np.int64]:
+def match_binary(a: OrbFeatures, b: OrbFeatures) -> NDArray[np.int64]:
     """(M, 2) rows of a and b whose descriptors are each other's nearest, and near."""
     if not len(a.pixels) or not len(b.pixels):
         return np.zeros((0, 2), np.int64)
@@ -69,7 +69,7 @@ def match(a: Features, b: Features) -> NDArray[np.int64]:
     return np.array([(m.queryIdx, m.trainIdx) for m in found if m.distance < 64], np.int64).reshape(-1, 2)
 
 
-def pose(
+def estimate_pose(
     points_s: NDArray[np.float32],
     rays_t: NDArray[np.float32],
     pixel: float,
@@ -98,7 +98,7 @@ def pose(
 
 
 @njit(nogil=True, cache=True)
-def reprojection(
+def add_reprojection(
     points_s: NDArray[np.float32],
     rays_t: NDArray[np.float32],
     T: NDArray[np.float64],

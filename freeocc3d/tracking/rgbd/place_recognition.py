@@ -41,7 +41,7 @@ class Vocabulary:
         return np.bincount(nearest, minlength=len(self._words)).astype(np.float32)
 
 
-def similarity(histograms: NDArray[np.float32]) -> NDArray[np.float32]:
+def compare_histograms(histograms: NDArray[np.float32]) -> NDArray[np.float32]:
     """(K, K) cosine of K keyframes' (K, W) histograms, square-rooted and weighed by inverse document frequency."""
     occurs = np.maximum((histograms > 0).sum(axis=0), 1)
     weighed = np.sqrt(histograms) * np.log(1 + len(histograms) / occurs)

@@ -35,7 +35,7 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
         own = PurePath(name)
         return whole.get(own.name, stems.get(own.stem))
 
-    found = reconstruction_of(model, len(capture), frame_of, str(folder))
+    found = convert_model(model, len(capture), frame_of, str(folder))
     if not found.has_pose.any():
         first = next((image.name for image in model.images.values()), "no image")
         raise TrackingError(
@@ -54,7 +54,7 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
     return found
 
 
-def reconstruction_of(
+def convert_model(
     model: pycolmap.Reconstruction, frames: int, frame_of: Callable[[str], int | None], source: str
 ) -> Reconstruction:
     """A model as that of a capture of N ``frames``; ``frame_of`` tells which one an image shows by its name.
@@ -98,6 +98,6 @@ def reconstruction_of(
 _NO_LENS = Lens(Intrinsics(1, 1, 1.0, 1.0, 0.0, 0.0))
 
 
-def registered(model: pycolmap.Reconstruction) -> NDArray[np.int64]:
+def list_registered(model: pycolmap.Reconstruction) -> NDArray[np.int64]:
     """Ids of the images that have a pose, ascending."""
     return np.array(sorted(model.reg_image_ids()), np.int64)

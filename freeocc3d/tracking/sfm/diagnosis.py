@@ -50,7 +50,7 @@ def check_motion(database: SfmDatabase, what: str) -> None:
         )
 
 
-def no_model(database: SfmDatabase, registered: int, what: str) -> TrackingError:
+def explain_missing_model(database: SfmDatabase, registered: int, what: str) -> TrackingError:
     """The error for a scan whose images match, but of which no model or one of only ``registered`` images came."""
     pairs = [(kind, inliers) for *_, kind, inliers in database.geometries() if inliers]
     flat = np.mean([kind in ("PLANAR_OR_PANORAMIC", "PLANAR", "PANORAMIC") for kind, _ in pairs])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 _FARTHEST = 0.7  # radians between descriptors of one point
 
 
-def match(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDArray[np.uint32]:
+def match_descriptors(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDArray[np.uint32]:
     """(M, 2) rows of (N, D) and (K, D) unit descriptors that match.
 
     ratio: the angle to the nearest must be less than this of that to the second nearest, either way; 1 = not asked.

@@ -20,7 +20,7 @@ _ASTRAY_PX = 1.0  # from where a corner was, when it is followed there and back
 _CREEP = 1e-4  # of the width, so that a camera that rests still gets on
 
 
-def choose(capture: Capture, frames: Sequence[int], budget: int, progress: Progress) -> list[int]:
+def choose_frames(capture: Capture, frames: Sequence[int], budget: int, progress: Progress) -> list[int]:
     """At most ``budget`` of the frames, ascending; all of them if they are no more. Frames that cannot be decoded are
     left out of a choice."""
     if len(frames) <= budget:
@@ -32,14 +32,14 @@ def choose(capture: Capture, frames: Sequence[int], budget: int, progress: Progr
         if not isinstance(frame, FrameError):
             image = _small(frame.color)
             indices.append(index)
-            sharp.append(sharpness(image))
-            moved.append(0.0 if before is None else motion(before, image))
+            sharp.append(measure_sharpness(image))
+            moved.append(0.0 if before is None else measure_motion(before, image))
             before = image
         progress.advance(done)
-    return [indices[row] for row in spread(np.array(sharp), np.array(moved), budget)]
+    return [indices[row] for row in spread_frames(np.array(sharp), np.array(moved), budget)]
 
 
-def spread(sharp: NDArray[np.float64], moved: NDArray[np.float64], budget: int) -> list[int]:
+def spread_frames(sharp: NDArray[np.float64], moved: NDArray[np.float64], budget: int) -> list[int]:
     """Rows of (N,) frames: the way of (N,) steps, each from the frame before, is cut into ``budget`` equal parts, and
     of each the sharpest frame is taken."""
     way = np.cumsum(np.maximum(moved, _CREEP))
@@ -49,12 +49,12 @@ def spread(sharp: NDArray[np.float64], moved: NDArray[np.float64], budget: int) 
     return sorted(order[first].tolist())
 
 
-def sharpness(gray: NDArray[np.uint8]) -> float:
+def measure_sharpness(gray: NDArray[np.uint8]) -> float:
     """Variance of the Laplacian: higher where edges are crisp."""
     return float(cv2.Laplacian(gray, cv2.CV_32F).var())
 
 
-def motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
+def measure_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
     """Median way of corners from one (H, W) grey image to the next, over the width."""
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 8)
     if corners is None or len(corners) < _LEAST_FOLLOWED:

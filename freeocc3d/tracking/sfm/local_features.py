@@ -46,9 +46,9 @@ class Detector(Protocol):
     def __call__(self, color: NDArray[np.uint8]) -> LocalFeatures: ...
 
 
-def detector(name: str) -> Detector:
+def load_detector(name: str) -> Detector:
     """``"sift"``, or the path of an ONNX network. Raises ModelError."""
-    return Sift() if name == SIFT else Network(Path(name).expanduser())
+    return Sift() if name == SIFT else KeypointNetwork(Path(name).expanduser())
 
 
 class Sift:
@@ -80,7 +80,7 @@ def _sift() -> Any:
     return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
 
 
-class Network:
+class KeypointNetwork:
     """A network that finds and describes keypoints, as exports of SuperPoint, DISK and ALIKED do.
 
     Its input is (1, 1 or 3, H, W) float32 in 0…1; among its outputs are one whose name holds "keypoint", (1, N, 2) or

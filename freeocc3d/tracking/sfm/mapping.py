@@ -13,7 +13,7 @@ from pathlib import Path
 import pycolmap
 
 _GROWTH = 1.4  # of a model between two adjustments of all of it
-_REFINEMENTS = 2, 1  # of a model, and of what is around a new image: ``adjusted`` refines the whole in the end
+_REFINEMENTS = 2, 1  # of a model, and of what is around a new image: ``adjust_model`` refines the whole in the end
 _TOLERANCES = 1e-5, 1e-4
 _LEAST_IMAGES = 3
 _MOST_MODELS = 8
@@ -23,7 +23,7 @@ _CLEARLY_BETTER = 0.98  # of the squared error, with distortion; where there is 
 _DISTORTED = "SIMPLE_RADIAL"
 
 
-def incremental(
+def map_incrementally(
     database: Path, folder: Path, fixed: bool, registered: Callable[[], None], start: Path | None = None
 ) -> list[pycolmap.Reconstruction]:
     """Models, the largest first. fixed: intrinsics stay.  registered: called for each image that gets a pose.
@@ -47,7 +47,7 @@ def incremental(
     return _largest_first(found)
 
 
-def global_(database: Path, folder: Path, fixed: bool) -> list[pycolmap.Reconstruction]:
+def map_globally(database: Path, folder: Path, fixed: bool) -> list[pycolmap.Reconstruction]:
     """Models, the largest first: all images at once, which is faster and needs more matches."""
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
@@ -58,15 +58,17 @@ def global_(database: Path, folder: Path, fixed: bool) -> list[pycolmap.Reconstr
     return _largest_first(pycolmap.global_mapping(database, folder, _fresh(folder / "models"), options))
 
 
-def continued(database: Path, folder: Path, fixed: bool, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+def continue_mapping(
+    database: Path, folder: Path, fixed: bool, model: pycolmap.Reconstruction
+) -> pycolmap.Reconstruction:
     """The model with the images that it lacks, where they can be placed now that all of it is there."""
     begun = _fresh(folder / "begun")
     model.write(begun)
-    more = incremental(database, folder, fixed, lambda: None, begun)
+    more = map_incrementally(database, folder, fixed, lambda: None, begun)
     return more[0] if more and more[0].num_reg_images() > model.num_reg_images() else model
 
 
-def silence() -> None:
+def silence_colmap() -> None:
     """COLMAP prints nothing: what went wrong is told in errors and warnings."""
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
 
@@ -81,7 +83,7 @@ def _largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.R
     return sorted(found.values(), key=lambda model: -model.num_reg_images())
 
 
-def adjusted(model: pycolmap.Reconstruction, fixed: bool, distorts: bool) -> pycolmap.Reconstruction:
+def adjust_model(model: pycolmap.Reconstruction, fixed: bool, distorts: bool) -> pycolmap.Reconstruction:
     """The model after an adjustment of everything with a robust loss; with distortion where ``distorts`` says so, or
     where that lowers the error clearly. It is changed in place, and not what is returned."""
     if fixed or distorts:

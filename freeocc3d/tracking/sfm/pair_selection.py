@@ -19,7 +19,7 @@ _WORDS, _SAMPLE, _ROUNDS = 64, 20_000, 8
 _NEAR = 5  # successors in a video are among the images most like each
 
 
-def similarity(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+def compare_images(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     """(N, N) cosine of N images' descriptors of descriptors, each (F, D) of unit length."""
     rng = np.random.default_rng(0)
     sampled = [d[rng.permutation(len(d))[: max(_SAMPLE // len(descriptors), 1)]] for d in descriptors]
@@ -53,7 +53,7 @@ def _vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArr
     return np.asarray(sums.ravel() / max(float(np.linalg.norm(sums)), 1e-9), np.float32)
 
 
-def in_order(alike: NDArray[np.float32]) -> bool:
+def is_sequence(alike: NDArray[np.float32]) -> bool:
     """Whether images that follow each other look alike, as those of a video, given all similarities (N, N)."""
     if len(alike) <= 2 * _NEAR:
         return False
@@ -63,7 +63,7 @@ def in_order(alike: NDArray[np.float32]) -> bool:
     return bool(np.median(rank) < _NEAR)
 
 
-def pairs(alike: NDArray[np.float32], follow: int, retrieved: int) -> NDArray[np.int64]:
+def choose_pairs(alike: NDArray[np.float32], follow: int, retrieved: int) -> NDArray[np.int64]:
     """(P, 2) ascending pairs (i < j) of N images: each with the next ``follow`` ones and with as many as ``retrieved``
     of those most like it, the nearest first.
 

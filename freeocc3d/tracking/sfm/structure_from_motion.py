@@ -26,10 +26,10 @@ from ...core.errors import FrameError
 from ...core.progress import Progress
 from ...core.types import Intrinsics
 from . import diagnosis, frame_selection, mapping, pair_selection
-from .colmap_reconstruction import reconstruction_of
+from .colmap_reconstruction import convert_model
 from .database import SfmDatabase, image_name
-from .feature_matching import match
-from .local_features import Detector, LocalFeatures, detector
+from .feature_matching import match_descriptors
+from .local_features import Detector, LocalFeatures, load_detector
 from .reconstruction import Reconstruction
 
 _DATABASE, _CHOSEN, _RESULT = "database.db", "chosen.json", "reconstruction.npz"
@@ -53,7 +53,7 @@ class Recipe:
     intrinsics: str = "refine"
 
 
-def reconstruct(
+def reconstruct_poses(
     capture: Capture, frames: Sequence[int], folder: Path, recipe: Recipe, progress: Progress
 ) -> Reconstruction:
     """Poses and points of the capture's frames, in a unit in which the median depth is ``NOMINAL_DEPTH``.
@@ -65,8 +65,8 @@ def reconstruct(
     what = str(capture.path)
     diagnosis.check_count(len(frames), what)
     chosen = _chosen(capture, frames, folder / _CHOSEN, recipe.frames, progress)
-    detect = detector(recipe.features)
-    mapping.silence()
+    detect = load_detector(recipe.features)
+    mapping.silence_colmap()
     with SfmDatabase(folder / _DATABASE) as database:
         warnings = _extract(capture, chosen, database, detect, recipe, progress)
         found = database.frames()
@@ -77,11 +77,11 @@ def reconstruct(
         models = _mapped(folder, len(found), recipe, progress)
         largest = models[0].num_reg_images() if models else 0
         if largest < diagnosis.LEAST_IMAGES:
-            raise diagnosis.no_model(database, largest, what)
+            raise diagnosis.explain_missing_model(database, largest, what)
     progress.stage("adjustment")
-    model = mapping.adjusted(models[0], recipe.intrinsics == "fixed", distorts=not capture.intrinsics_known)
+    model = mapping.adjust_model(models[0], recipe.intrinsics == "fixed", distorts=not capture.intrinsics_known)
     frame_of = {image_name(index): index for index in found}
-    result = reconstruction_of(model, len(capture), frame_of.get, what).normalised()
+    result = convert_model(model, len(capture), frame_of.get, what).normalised()
     apart, pieces = _apart(models, result.has_pose)
     if pieces:
         warnings.append(
@@ -115,7 +115,7 @@ def _chosen(capture: Capture, frames: Sequence[int], path: Path, budget: int, pr
     """The frames that are reconstructed."""
     if path.is_file():
         return list(json.loads(path.read_text(encoding="utf-8")))
-    found = frame_selection.choose(capture, frames, budget, progress)
+    found = frame_selection.choose_frames(capture, frames, budget, progress)
     replace_text(path, json.dumps(found))
     return found
 
@@ -177,7 +177,9 @@ def _compare(database: SfmDatabase, frames: Sequence[int], order: str, ratio: fl
         for start in range(0, len(waiting), _CHUNK):
             part = waiting[start : start + _CHUNK]
             described = [(descriptors(i), descriptors(j)) for i, j in part]
-            database.add_matches(part, list(pool.map(lambda pair: match(pair[0], pair[1], ratio), described)))
+            database.add_matches(
+                part, list(pool.map(lambda pair: match_descriptors(pair[0], pair[1], ratio), described))
+            )
             progress.advance(len(proposed) - len(waiting) + start + len(part))
 
 
@@ -188,10 +190,10 @@ def _pairs(descriptors: Callable[[int], NDArray[np.float32]], frames: Sequence[i
     for frame in frames:
         found = descriptors(frame)
         sampled.append(found[rng.permutation(len(found))[: pair_selection.OF_IMAGE]])
-    alike = pair_selection.similarity(sampled)
-    if order == "video" or (order == "auto" and pair_selection.in_order(alike)):
-        return pair_selection.pairs(alike, _FOLLOW, _ALIKE)
-    return pair_selection.pairs(alike, 0, len(frames) - 1 if len(frames) <= _ALL_PAIRS else _ALIKE_UNORDERED)
+    alike = pair_selection.compare_images(sampled)
+    if order == "video" or (order == "auto" and pair_selection.is_sequence(alike)):
+        return pair_selection.choose_pairs(alike, _FOLLOW, _ALIKE)
+    return pair_selection.choose_pairs(alike, 0, len(frames) - 1 if len(frames) <= _ALL_PAIRS else _ALIKE_UNORDERED)
 
 
 def _mapped(folder: Path, images: int, recipe: Recipe, progress: Progress) -> list[pycolmap.Reconstruction]:
@@ -204,10 +206,10 @@ def _mapped(folder: Path, images: int, recipe: Recipe, progress: Progress) -> li
         progress.advance(min(next(placed), images))
 
     if recipe.mapping == "global":
-        models = mapping.global_(folder / _DATABASE, folder, fixed)
+        models = mapping.map_globally(folder / _DATABASE, folder, fixed)
     else:
-        models = mapping.incremental(folder / _DATABASE, folder, fixed, advance)
+        models = mapping.map_incrementally(folder / _DATABASE, folder, fixed, advance)
     somewhere = {image_id for model in models for image_id in model.reg_image_ids()}
     if models and len(somewhere) < images:
-        models[0] = mapping.continued(folder / _DATABASE, folder, fixed, models[0])
+        models[0] = mapping.continue_mapping(folder / _DATABASE, folder, fixed, models[0])
     return models

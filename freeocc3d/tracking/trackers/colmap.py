@@ -19,7 +19,7 @@ from ..base import Tracked
 from ..given_poses import GivenTracker
 from ..sfm.colmap_reconstruction import read_model
 from ..sfm.reconstruction import Reconstruction
-from ..sfm.structure_from_motion import Recipe, reconstruct
+from ..sfm.structure_from_motion import Recipe, reconstruct_poses
 
 REQUIRES: tuple[str, ...] = ("pycolmap",)
 
@@ -89,7 +89,7 @@ class ColmapTracker(GivenTracker):
             found = read_model(Path(options.model).expanduser(), self._capture).normalised()
         else:
             recipe = Recipe(options.frames, options.order, options.features, options.mapping, options.intrinsics)
-            found = reconstruct(self._capture, frames, folder, recipe, progress)
+            found = reconstruct_poses(self._capture, frames, folder, recipe, progress)
         return found if scale is None else found.scaled(scale)
 
     def as_pinhole(self, frame: Frame) -> Frame:

@@ -17,7 +17,7 @@ from ...core.types import Frame
 from ...settings.registry import require_positive
 from ..given_poses import GivenTracker
 from ..rgbd import orb_features
-from ..rgbd.keyframe_registration import decoded_view
+from ..rgbd.keyframe_registration import decode_keyframe_view
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 
@@ -89,11 +89,11 @@ class FileTracker(GivenTracker):
         T_world_cam = self.T_world_cam[frame.index]
         if self._points is None or not np.isfinite(T_world_cam).all():
             return frame
-        depth_m = depth_of_points(transform(invert(T_world_cam), self._points), frame)
+        depth_m = project_depth(transform(invert(T_world_cam), self._points), frame)
         return replace(frame, depth_m=np.where(frame.depth_m > 0, frame.depth_m, depth_m))
 
 
-def depth_of_points(points_cam: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:
+def project_depth(points_cam: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:
     """(H, W) metres: (P, 3) camera-frame points at the pixels where they fall, the nearest first; 0 elsewhere. A cloud
     has gaps, so points far behind others in a neighbourhood of pixels count as hidden."""
     camera = frame.intrinsics
@@ -134,7 +134,7 @@ def _scale(T_world_cam: NDArray[np.float64], capture: Capture, options: Options)
     """Metres per unit, from the options, checked against what depth says, or from depth; 1 where nothing says it."""
     if not capture.has_depth:
         return capture.options.scale or options.scale or 1.0
-    measured = depth_scale(T_world_cam, capture)
+    measured = estimate_depth_scale(T_world_cam, capture)
     if options.scale is None:
         if measured is None:
             raise TrackingError(
@@ -151,7 +151,7 @@ def _scale(T_world_cam: NDArray[np.float64], capture: Capture, options: Options)
     return options.scale
 
 
-def depth_scale(T_world_cam: NDArray[np.float64], capture: Capture) -> float | None:
+def estimate_depth_scale(T_world_cam: NDArray[np.float64], capture: Capture) -> float | None:
     """Metres per unit of (N, 4, 4) poses by the capture's depth; None where too little tells.
 
     Where two frames match features with depths p_s, p_t, p_t = R p_s + scale t: each match gives a scale along t, and
@@ -169,12 +169,12 @@ def depth_scale(T_world_cam: NDArray[np.float64], capture: Capture) -> float | N
 
 
 def _pair_scale(T_world_cam: NDArray[np.float64], capture: Capture, frames: NDArray[np.int64]) -> float | None:
-    target = decoded_view(capture, int(frames[0]))
+    target = decode_keyframe_view(capture, int(frames[0]))
     for gap in (12, 6, 3, 1):
-        source = decoded_view(capture, int(frames[gap])) if target is not None and gap < len(frames) else None
+        source = decode_keyframe_view(capture, int(frames[gap])) if target is not None and gap < len(frames) else None
         if target is None or source is None:
             continue
-        rows = orb_features.match(source.features, target.features)
+        rows = orb_features.match_binary(source.features, target.features)
         p_s, p_t = source.points[rows[:, 0]].astype(np.float64), target.points[rows[:, 1]].astype(np.float64)
         known = (p_s[:, 2] > 0) & (p_t[:, 2] > 0)
         T = invert(T_world_cam[frames[0]]) @ T_world_cam[frames[gap]]

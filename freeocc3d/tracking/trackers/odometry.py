@@ -17,7 +17,7 @@ from ...core.types import Frame, Intrinsics
 from ...settings.registry import require_positive
 from .. import pose_graph
 from ..base import Tracked, Tracker
-from ..overlap import DepthView, mutual_overlap, sample_points
+from ..overlap import DepthView, measure_mutual_overlap, sample_points
 from ..pose_graph import Edge
 from ..records import Records
 
@@ -172,7 +172,7 @@ class OdometryTracker(Tracker):
         self._frames_lost = 0
 
     def _is_keyframe(self, view: _View, match: _Match) -> bool:
-        return mutual_overlap(view, self._keyframes[-1], match.T_target_source) < self.options.keyframe_overlap
+        return measure_mutual_overlap(view, self._keyframes[-1], match.T_target_source) < self.options.keyframe_overlap
 
     def _confidence(self, match: _Match) -> float:
         return float(np.clip(match.fitness, 0.0, 1.0))
@@ -189,7 +189,7 @@ class OdometryTracker(Tracker):
         """Register keyframe ``row`` to the earlier ones that share most of its view by the present poses."""
         view, T_cam_world = self._keyframes[row], invert(self.records.T_world_keyframe[row])
         shared = [
-            mutual_overlap(other, view, T_cam_world @ self.records.T_world_keyframe[k])
+            measure_mutual_overlap(other, view, T_cam_world @ self.records.T_world_keyframe[k])
             for k, other in enumerate(self._keyframes[: row - 1])
         ]
         best = np.argsort(shared)[::-1][: self.options.overlap_edges]

@@ -10,17 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
-from ...core.transforms import apart, invert
+from ...core.transforms import invert, measure_pose_difference
 from ...core.types import Frame
 from ...settings.registry import require_positive
 from .. import pose_graph
 from ..base import Tracked, Tracker
-from ..overlap import DepthView, mutual_overlap
+from ..overlap import DepthView, measure_mutual_overlap
 from ..pose_graph import Edge
 from ..records import Records
 from ..rgbd import dense_alignment, joint_refinement, loop_closures
-from ..rgbd.alignment_views import View, view_of
-from ..rgbd.keyframe_registration import KeyframeView, Registered, keyframe_view, register_by_features, surface_of
+from ..rgbd.alignment_views import AlignmentView, prepare_alignment_view
+from ..rgbd.keyframe_registration import (
+    FeatureRegistration,
+    KeyframeView,
+    prepare_keyframe_view,
+    register_by_features,
+    sample_surface,
+)
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 
@@ -63,14 +69,14 @@ class _Seen:
     """A frame as the tracker needs it; its features are detected when they are asked for."""
 
     frame: Frame
-    view: View
+    view: AlignmentView
     surface: DepthView
     _full: list[KeyframeView] = field(default_factory=list)
 
     @property
     def full(self) -> KeyframeView:
         if not self._full:
-            self._full.append(keyframe_view(self.frame, self.view))
+            self._full.append(prepare_keyframe_view(self.frame, self.view))
         return self._full[0]
 
 
@@ -96,10 +102,10 @@ class RgbdTracker(Tracker):
         self._last: _Seen | None = None  # not kept over an interruption: keyframes are enough to go on
 
     def track(self, frame: Frame) -> Tracked:
-        view = view_of(frame)
+        view = prepare_alignment_view(frame)
         if view.covered < _LEAST_COVERED:
             return self._lose(frame.index)
-        seen = _Seen(frame, view, surface_of(view))
+        seen = _Seen(frame, view, sample_surface(view))
         if not self.keyframes:
             return self._begin_submap(seen)
         aligned = self._follow(seen)
@@ -113,23 +119,25 @@ class RgbdTracker(Tracker):
         T = self.records.T_world_keyframe
         self.edges = [edge for edge in self.edges if not edge.uncertain]
         if self.options.close_loops and len(T) > 2:
-            found = loop_closures.find(self.keyframes, self.records.submap, T)
-            self.edges = pose_graph.agreeing(T, self.records.submap, [*self.edges, *found])
-        pieces = pose_graph.pieces(self.records.submap, self.edges)
+            found = loop_closures.find_closures(self.keyframes, self.records.submap, T)
+            self.edges = pose_graph.drop_unsupported_closures(T, self.records.submap, [*self.edges, *found])
+        pieces = pose_graph.find_connected_components(self.records.submap, self.edges)
         for rows in pieces:
-            placed = pose_graph.optimize_piece(T, self.edges, rows)
+            placed = pose_graph.optimize_component(T, self.edges, rows)
             if self.options.refine:
-                placed = joint_refinement.refine([self.keyframes[k] for k in rows], placed, self.options.neighbours)
+                placed = joint_refinement.refine_poses(
+                    [self.keyframes[k] for k in rows], placed, self.options.neighbours
+                )
             for k, pose in zip(rows, placed, strict=True):
                 T[k] = pose
         self.records.pieces = pieces
 
-    def _follow(self, seen: _Seen) -> dense_alignment.Alignment | None:
+    def _follow(self, seen: _Seen) -> dense_alignment.ViewAlignment | None:
         """The alignment to the current keyframe; None if there is none that can be trusted."""
         target = self.keyframes[self._current]
         guess = self._T_keyframe_last @ self._velocity
-        aligned = dense_alignment.align(seen.view, target.view, guess)
-        metres, degrees = apart(guess, aligned.T_target_source)
+        aligned = dense_alignment.align_views(seen.view, target.view, guess)
+        metres, degrees = measure_pose_difference(guess, aligned.T_target_source)
         if _sure(aligned) and metres <= _JUMP_M and degrees <= _JUMP_DEG and self._frames_lost == 0:
             return aligned
         found = register_by_features(seen.full, target)
@@ -148,7 +156,7 @@ class RgbdTracker(Tracker):
             if found is not None and _recognised(found):
                 T = self._T_keyframe_last @ found.aligned.T_target_source
                 return self._place(seen, replace(found.aligned, T_target_source=T), "relocalised")
-        best: tuple[dense_alignment.Alignment, int] | None = None
+        best: tuple[dense_alignment.ViewAlignment, int] | None = None
         for row in self._alike(seen):
             found = register_by_features(seen.full, self.keyframes[row], _DRAWS)
             if found is None or not _recognised(found):
@@ -169,10 +177,12 @@ class RgbdTracker(Tracker):
             return recent
         older = [row for row in range(last + 1) if row not in recent and row != self._current]
         step = max(1, len(older) // 40)
-        scored = [(loop_closures.in_common(described, self.keyframes[row].features), row) for row in older[::step]]
+        scored = [
+            (loop_closures.count_common_features(described, self.keyframes[row].features), row) for row in older[::step]
+        ]
         return recent + [row for _, row in sorted(scored, reverse=True)[: loop_closures.CANDIDATES]]
 
-    def _place(self, seen: _Seen, aligned: dense_alignment.Alignment, status: str) -> Tracked:
+    def _place(self, seen: _Seen, aligned: dense_alignment.ViewAlignment, status: str) -> Tracked:
         """Hang the frame on the current keyframe, or make it the next one."""
         self._frames_lost = 0
         self._last = seen
@@ -180,7 +190,7 @@ class RgbdTracker(Tracker):
         T_world_cam = self.records.T_world_keyframe[self._current] @ aligned.T_target_source
         confidence = _confidence(aligned)
         index, target = seen.frame.index, self.keyframes[self._current]
-        shared = mutual_overlap(seen.surface, target.overlap, aligned.T_target_source)
+        shared = measure_mutual_overlap(seen.surface, target.overlap, aligned.T_target_source)
         if shared >= self.options.keyframe_overlap:
             self.records.add_tracked(index, self._current, aligned.T_target_source, confidence, status)
             return Tracked(status, T_world_cam, confidence)
@@ -214,40 +224,40 @@ class RgbdTracker(Tracker):
 
     def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
         self.records = Records.from_arrays(state)
-        self.keyframes = [keyframe_view(frame) for frame in keyframes]
+        self.keyframes = [prepare_keyframe_view(frame) for frame in keyframes]
         self._T_keyframe_last, self._velocity = np.asarray(state["last"], np.float64)
         self._current, self._frames_lost = state["counters"].tolist()
         self.edges = pose_graph.edges_from_arrays(state)
 
 
-def _confirmed(found: Registered) -> bool:
+def _confirmed(found: FeatureRegistration) -> bool:
     """Whether enough features agree, dense alignment stays where they say, and what is seen there agrees."""
     aligned = found.aligned
-    metres, degrees = apart(found.by_features, aligned.T_target_source)
+    metres, degrees = measure_pose_difference(found.by_features, aligned.T_target_source)
     alike = not aligned.correlation < _LEAST_CORRELATION  # where nothing varies, nothing disagrees
     seen = aligned.overlap >= _CONFIRMED_OVERLAP and aligned.inliers >= _LEAST_INLIERS
     return found.agreeing >= _FEATURES and alike and seen and metres <= _CONFIRMED_M and degrees <= _CONFIRMED_DEG
 
 
-def _recognised(found: Registered) -> bool:
+def _recognised(found: FeatureRegistration) -> bool:
     """Whether a frame of which nothing was known is where it was found: by features and surfaces, or, where these saw
     the way from afar only, by surfaces that share much and look the same."""
     seen_again = _sure(found.aligned) and found.aligned.overlap >= _RECOGNISED_OVERLAP
     return seen_again or (_confirmed(found) and _likely(found.aligned))
 
 
-def _sure(aligned: dense_alignment.Alignment) -> bool:
+def _sure(aligned: dense_alignment.ViewAlignment) -> bool:
     return _likely(aligned) and aligned.overlap >= _LEAST_OVERLAP and aligned.correlation >= _SURE_CORRELATION
 
 
-def _likely(aligned: dense_alignment.Alignment) -> bool:
+def _likely(aligned: dense_alignment.ViewAlignment) -> bool:
     return aligned.determined and aligned.inliers >= _SURE_INLIERS and aligned.correlation >= _LIKELY_CORRELATION
 
 
-def _score(aligned: dense_alignment.Alignment) -> float:
+def _score(aligned: dense_alignment.ViewAlignment) -> float:
     return aligned.inliers * max(np.nan_to_num(aligned.correlation), 0.1)
 
 
-def _confidence(aligned: dense_alignment.Alignment) -> float:
+def _confidence(aligned: dense_alignment.ViewAlignment) -> float:
     alike = 0.5 if np.isnan(aligned.correlation) else max(aligned.correlation, 0.0)
     return float(np.clip(aligned.inliers * alike * (1.0 if aligned.determined else 0.5), 0.0, 1.0))
