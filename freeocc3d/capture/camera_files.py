@@ -163,16 +163,6 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def read_class_names(path: Path) -> tuple[str, ...]:
-    """The names in a ``{"classes": ["nothing", …]}`` file, or none if there is no such file. Raises CaptureError."""
-    if not path.is_file():
-        return ()
-    names = read_json(path).get("classes")
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or len(names) > 255:
-        raise CaptureError(f'{path} must hold {{"classes": ["nothing", "name of class 1", …]}}, at most 255 of them.')
-    return tuple(names)
-
-
 def read_text(path: Path) -> str:
     """The text of a file. Raises CaptureError."""
     try:

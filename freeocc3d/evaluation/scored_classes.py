@@ -1,13 +1,6 @@
 """Which classes are scored, and how the names of other taxonomies map to them.
 
-A class file is YAML::
-
-    classes: [ceiling, floor, wall]     # scored, in this order
-    map:                                # optional: other names -> one of these, or null: not scored
-      carpet: floor
-      ceiling lamp: null
-
-or a bare list of names, in YAML or one a line. It is used in both directions: the truth's names are turned into the
+A class file (``capture/class_files.py``) is used in both directions: the truth's names are turned into the
 scored classes, and a map is asked for every name that the file knows, each voxel taking the class that its best name
 maps to.
 """
@@ -18,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from ..capture.class_files import read_class_file
 from ..core.errors import FreeOccError
 from ..core.types import UNKNOWN
 from .true_occupancy import GroundTruth
@@ -79,29 +72,9 @@ def map_each_to_itself(classes: tuple[str, ...]) -> ClassMap:
 
 def load_class_map(path: Path) -> ClassMap:
     """Read a class file. Raises FreeOccError: no such file, not of this form, a target that is no class."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        content = yaml.safe_load(text) if path.suffix in (".yaml", ".yml", ".json") else text.splitlines()
-    except OSError as error:
-        raise FreeOccError(f"Cannot read the class file {path}: {(error.strerror or str(error)).lower()}.") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise FreeOccError(f"The class file {path} is not valid YAML: {' '.join(str(error).split())}.") from error
-    if isinstance(content, list):
-        content = {"classes": [name for name in content if not isinstance(name, str) or name.strip()]}
-    if not isinstance(content, dict) or not set(content) <= {"classes", "map"}:
-        raise FreeOccError(f"The class file {path} must hold 'classes', a list of names, and perhaps 'map'.")
-    classes, mapped = content.get("classes"), content.get("map") or {}
-    if not isinstance(classes, list) or not classes or not all(isinstance(name, str) for name in classes):
-        raise FreeOccError(f"'classes' of {path} must be a list of names (quote a name like \"no\").")
-    names = tuple(name.strip() for name in classes)
-    if len({name.lower() for name in names}) < len(names) or len(names) > _MOST_CLASSES:
+    listed = read_class_file(path)
+    labels = {name.lower(): label for label, name in enumerate(listed.names, start=1)}
+    if len(labels) < len(listed.names) or len(listed.names) > _MOST_CLASSES:
         raise FreeOccError(f"'classes' of {path} must be at most {_MOST_CLASSES} different names.")
-    if not isinstance(mapped, dict) or not all(isinstance(name, str) for name in mapped):
-        raise FreeOccError(f"'map' of {path} must read 'name: class', a name a line.")
-    labels = {name.lower(): label for label, name in enumerate(names, start=1)}
-    targets = dict(labels)
-    for name, target in mapped.items():
-        if target is not None and str(target).lower() not in targets:
-            raise FreeOccError(f"{path} maps '{name}' to '{target}', which is none of its classes.")
-        labels[name.strip().lower()] = 0 if target is None else targets[str(target).lower()]
-    return ClassMap(names, labels)
+    known = {name: 0 if target is None else labels[target.lower()] for name, target in listed.targets.items()}
+    return ClassMap(listed.names, labels | known)

@@ -138,7 +138,7 @@ def test_without_parameters_the_options_can_state_them(tmp_path: Path) -> None:
 def test_class_names_of_another_kind_are_refused(tmp_path: Path) -> None:
     write_replica(tmp_path, 1)
     (tmp_path / "classes.json").write_text('{"classes": [{"id": 1, "name": "sofa"}]}')
-    with pytest.raises(CaptureError, match=r"classes\.json must hold"):
+    with pytest.raises(CaptureError, match=r"classes\.json must hold a list of names"):
         Reader(tmp_path, Options())
 
 

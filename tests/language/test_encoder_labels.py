@@ -111,7 +111,7 @@ def test_a_capture_without_class_images_says_what_to_do(tmp_path: Path) -> None:
         (lambda path: (path / "classes.json").write_text("{"), "must hold"),
         (lambda path: (path / "classes.json").write_text('{"names": []}'), "must hold"),
         (lambda path: (path / "classes.json").write_text('["nothing"]'), "at least 2"),
-        (lambda path: (path / "classes.json").write_text('["nothing", 3]'), "at least 2"),
+        (lambda path: (path / "classes.json").write_text('["nothing", 3]'), "a list of names"),
         (lambda path: [file.unlink() for file in path.glob("*.png")], "no class images"),
         (lambda path: (path / "other0.png").write_bytes((path / "seg2_frame00000.png").read_bytes()), "same number"),
     ],

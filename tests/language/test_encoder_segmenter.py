@@ -152,16 +152,16 @@ def test_posteriors_of_classes_that_are_mapped_to_one_are_added(tmp_path: Path) 
         ("classes: [plant]\nmap: {void: null, lettuce: plant, bluebell: plant}", "what 'tomato' becomes"),
         ("classes: [plant]\nmap: {void: stone}", "'stone', which is none"),
         ("map: {void: null}", "must hold 'classes'"),
-        ("classes: plant", "must hold 'classes'"),
-        ("- plant", "must hold 'classes'"),
-        ("classes: [plant]\nmap: [void]", "must hold 'classes'"),
+        ("classes: plant", "a list of names"),
+        ("- plant", "becomes"),
+        ("classes: [plant]\nmap: [void]", "must read 'name: class'"),
         ("classes: [", "not valid YAML"),
     ],
 )
 def test_broken_mappings_are_told(tmp_path: Path, text: str, told: str) -> None:
     path = tmp_path / "mapping.yaml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(FreeOccError, match=told):
         encoder(tmp_path, options={"mapping": str(path)})
 
 

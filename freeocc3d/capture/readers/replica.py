@@ -15,12 +15,12 @@ from ..base import Options
 from ..camera_files import (
     Calibration,
     guess_camera,
-    read_class_names,
     read_given_calibration,
     read_json,
     read_text,
     rescale_camera,
 )
+from ..class_files import capture_class_names
 from ..depth_registration import PixelGrid
 from ..image_files import has_file, list_numbered
 from ..image_pairs import ImagePairs, pair_files
@@ -52,7 +52,7 @@ class Reader(ImagePairs):
         grid = PixelGrid(camera, rescale_camera(camera, pairs.depth_size))
         super().__init__(path, options, pairs, grid, units_per_metre)
         self.intrinsics_known = self.focal_stated = calibration is not None
-        self.classes = read_class_names(path / "classes.json")
+        self.classes = capture_class_names(path)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -15,13 +15,13 @@ from ...core.types import Intrinsics
 from ..base import Options
 from ..camera_files import (
     guess_camera,
-    read_class_names,
     read_given_calibration,
     read_intrinsics,
     read_pose,
     read_rigid,
     rescale_camera,
 )
+from ..class_files import capture_class_names
 from ..depth_registration import PixelGrid
 from ..image_files import has_file, list_numbered
 from ..image_pairs import ImagePairs, Pairs, pair_files
@@ -61,7 +61,7 @@ class Reader(ImagePairs):
         grid, self.intrinsics_known = _grid(path, options, pairs)
         self.focal_stated = self.intrinsics_known
         super().__init__(path, options, pairs, grid, units_per_metre=1000.0)
-        self.classes = read_class_names(path / "classes.json")
+        self.classes = capture_class_names(path)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

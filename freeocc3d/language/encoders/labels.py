@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
+from ...capture.class_files import read_class_names
 from ...core.errors import CaptureError, ConfigError
 from ...core.types import Frame
 from .. import synonyms
-from ..class_files import read_names
 from .base import Encoder, TextEncoder, TextFeatures
 
 REQUIRES: tuple[str, ...] = ()
@@ -125,7 +125,7 @@ class LabelWords(TextEncoder):
 def load(options: Options, capture: Capture) -> LabelsEncoder:
     """The encoder. Raises CaptureError if there are no class images or no names for them."""
     if options.folder is None:
-        classes = read_names(Path(options.classes)) if options.classes else capture.classes
+        classes = read_class_names(Path(options.classes)) if options.classes else capture.classes
         if len(classes) < 2 or all(capture.labels(index) is None for index in range(min(len(capture), 10))):
             raise CaptureError(
                 f"{capture.path} brings no class images with names: give them with language.labels.folder and "
@@ -140,7 +140,7 @@ def load(options: Options, capture: Capture) -> LabelsEncoder:
             f"There is no classes.json or classes.txt in {folder}: add one, or give language.labels.classes, a file "
             "with the classes' names."
         )
-    return LabelsEncoder(read_names(named), _FolderImages(folder, len(capture)), options.stride)
+    return LabelsEncoder(read_class_names(named), _FolderImages(folder, len(capture)), options.stride)
 
 
 def load_text(state: dict[str, Any]) -> LabelWords:

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
+from ...capture.class_files import read_class_file, read_class_names
 from ...core.errors import ConfigError, FrameError
 from ...core.onnx_session import load_session
 from ...core.types import Frame
 from ...settings.registry import nearest
 from .. import synonyms
-from ..class_files import read_mapping, read_names
 from ..name_embeddings import NameEmbeddings
 from .base import Encoder
 from .labels import LabelWords
@@ -257,12 +257,15 @@ def check(options: Options) -> None:
 
 
 def load(options: Options, capture: Capture | None = None) -> SegmenterEncoder:
-    """The encoder; it needs nothing of the capture. Raises ConfigError for files that cannot be used."""
+    """The encoder; it needs nothing of the capture. Raises CaptureError, ConfigError for files that cannot be used."""
     check(options)
-    names = read_names(Path(options.classes))
+    names = read_class_names(Path(options.classes))
     network = SegmentationNetwork(Path(options.model), len(names), options)
-    classes, grouping = read_mapping(Path(options.mapping), names) if options.mapping else (names, np.eye(len(names)))
-    grouping = grouping.astype(np.float32) * ~_void(names, options)
+    classes, grouping = names, np.eye(len(names), dtype=np.float32)
+    if options.mapping:
+        mapping = read_class_file(Path(options.mapping))
+        classes, grouping = mapping.names, mapping.grouping(names)
+    grouping = grouping * ~_void(names, options)
     said = np.asarray(grouping.any(axis=1))
     classes, grouping = tuple(name for name, kept in zip(classes, said.tolist(), strict=True) if kept), grouping[said]
     if not classes:

@@ -1,0 +1,125 @@
+"""Files of class names, and of what the names of one taxonomy are called in another.
+
+    classes: [ceiling, floor, wall]     # in the order of their numbers
+    map:                                # optional: other names -> one of these, or null: none of them
+      carpet: floor
+      ceiling lamp: null
+
+as YAML or JSON, or a bare list of names, in YAML, in JSON or one a line. Names are compared without regard to case.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from ..core.errors import CaptureError, ConfigError
+from ..settings.registry import nearest
+
+CLASSES_JSON = "classes.json"
+"""The file of a capture's folder that names the values of its class images."""
+
+_MOST_CLASSES = 65536
+_MOST_IN_BYTES = 255
+"""Names that the class images of a capture, which are uint8, can tell apart."""
+
+
+@dataclass(frozen=True)
+class ClassFile:
+    """What a class file says.
+
+    names: of the classes, in their order.  targets: other name, in lower case -> one of ``names``, None = none of them.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    targets: dict[str, str | None]
+
+    def grouping(self, names: Sequence[str]) -> NDArray[np.float32]:
+        """(T, C) 1 where the c-th of other classes counts as the t-th of the file's. A class that ``targets`` does not
+        name must have the name of one of the file's. Raises ConfigError."""
+        row = {name.lower(): t for t, name in enumerate(self.names)}
+        matrix = np.zeros((len(self.names), len(names)), np.float32)
+        for c, name in enumerate(names):
+            target = self.targets.get(name.lower(), name)
+            if target is None:
+                continue
+            if target.lower() not in row:
+                raise ConfigError(
+                    f"{self.path} does not say what '{name}' becomes{nearest(name, self.targets)}: add it to 'map', "
+                    "with one of the classes or null."
+                )
+            matrix[row[target.lower()], c] = 1.0
+        return matrix
+
+
+def read_class_file(path: Path) -> ClassFile:
+    """Raises CaptureError: no such file, not of this form, a name that becomes none of the classes."""
+    content = _content(path)
+    if isinstance(content, list):
+        content = {"classes": content}
+    if not isinstance(content, dict) or "classes" not in content:
+        raise CaptureError(f"The class file {path} must hold 'classes', a list of names, and perhaps 'map'.")
+    if path.suffix != ".json" and (strange := set(content) - {"classes", "map"}):
+        raise CaptureError(
+            f"The class file {path} must hold 'classes', a list of names, and perhaps 'map', but not '{strange.pop()}'."
+        )
+    classes, mapped = content["classes"], content.get("map") or {}
+    if not isinstance(classes, list) or not classes or not all(isinstance(name, str) for name in classes):
+        raise CaptureError(f"'classes' of {path} must hold a list of names (quote a name like \"no\").")
+    if len(classes) > _MOST_CLASSES:
+        raise CaptureError(f"{path} names {len(classes)} classes: more than {_MOST_CLASSES} cannot be told apart.")
+    if not isinstance(mapped, dict) or not all(isinstance(name, str) for name in mapped):
+        raise CaptureError(f"'map' of {path} must read 'name: class', a name a line.")
+    names = tuple(name.strip() for name in classes)
+    spelled = {name.lower(): name for name in names}
+    targets: dict[str, str | None] = {}
+    for name, target in mapped.items():
+        if target is not None and str(target).strip().lower() not in spelled:
+            raise CaptureError(f"{path} maps '{name}' to '{target}', which is none of its classes.")
+        targets[name.strip().lower()] = None if target is None else spelled[str(target).strip().lower()]
+    return ClassFile(path, names, targets)
+
+
+def read_class_names(path: Path) -> tuple[str, ...]:
+    """The names of a class file, of which there must be two: what is nothing, and a class. Raises CaptureError."""
+    names = read_class_file(path).names
+    if len(names) < 2:
+        raise CaptureError(f"{path} must name at least 2 classes.")
+    return names
+
+
+def capture_class_names(folder: Path) -> tuple[str, ...]:
+    """The names in ``classes.json`` of a capture's folder, the first meaning nothing; none where there is no such file.
+    Raises CaptureError."""
+    path = folder / CLASSES_JSON
+    names = read_class_file(path).names if path.is_file() else ()
+    if len(names) > _MOST_IN_BYTES:
+        raise CaptureError(f"{path} must hold at most {_MOST_IN_BYTES} classes, which a byte can tell apart.")
+    return names
+
+
+def _content(path: Path) -> Any:
+    """What the file holds, as plain data."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        if path.suffix == ".json":
+            return json.loads(text)
+        if path.suffix in (".yaml", ".yml"):
+            return yaml.safe_load(text)
+        return [line for line in text.splitlines() if line.strip()]
+    except OSError as error:
+        raise CaptureError(f"Cannot read the class file {path}: {(error.strerror or str(error)).lower()}.") from error
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        form = "JSON" if path.suffix == ".json" else "YAML" if path.suffix in (".yaml", ".yml") else "text"
+        said = " ".join(str(error).split())
+        raise CaptureError(
+            f"The class file {path} is not valid {form}: {said}. It must hold 'classes', a list of names."
+        ) from error
