@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
 from .errors import ConfigError, ModelError
+from .threads import count_threads
 
 
 def load_session(path: Path, device: str = "cpu") -> Any:
@@ -19,7 +19,7 @@ def load_session(path: Path, device: str = "cpu") -> Any:
     if not path.is_file():
         raise ModelError(f"There is no network {path}.")
     options = ort.SessionOptions()
-    options.intra_op_num_threads = len(os.sched_getaffinity(0))
+    options.intra_op_num_threads = count_threads()
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # NumPy and Numba work between its runs
     options.log_severity_level = 3
     providers: list[Any] = ["CPUExecutionProvider"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +21,7 @@ from ..capture.base import Capture
 from ..core.arrays import read_arrays, write_arrays
 from ..core.errors import ConfigError, FrameError, MapError, TrackingError
 from ..core.progress import Progress
+from ..core.threads import count_threads
 from ..core.types import Frame, Intrinsics
 from ..settings.registry import require_positive
 from . import depth_network
@@ -174,7 +174,7 @@ class StereoDepth:
     def _each(self, frames: Sequence[int], step: Callable[[int], _Result]) -> Iterator[tuple[int, int, _Result]]:
         """How many are done, a frame, and ``step`` of it. On a CPU each core has a frame of its own: their images are
         too small to be shared out."""
-        workers = len(os.sched_getaffinity(0)) if self.options.device == "cpu" else 1
+        workers = count_threads() if self.options.device == "cpu" else 1
         threads = torch.get_num_threads()
         pool = ThreadPoolExecutor(workers, "stereo", initializer=torch.set_num_threads, initargs=(1,))
         try:

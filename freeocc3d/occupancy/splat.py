@@ -36,12 +36,13 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numba import get_num_threads, njit, prange, types
+from numba import njit, prange, types
 from numba.extending import overload
 from numpy.typing import NDArray
 
 from ..core.errors import ConfigError
 from ..core.hash_table import build_table, find_row
+from ..core.threads import count_threads
 from ..core.types import BLOCK, Gaussians
 from ..settings.registry import require_positive
 from .gaussian_mass import integrate_boxes
@@ -255,7 +256,7 @@ def _sort_by_block(
     """Counting sort of the (Gaussian, block) pairs: the blocks' packed keys, where each block's Gaussians start, and
     the Gaussians. Each thread sorts a part of the Gaussians; the parts keep their order, so that the result is the
     same with any number of threads."""
-    bounds = np.linspace(0, len(lo), get_num_threads() + 1).astype(int)
+    bounds = np.linspace(0, len(lo), count_threads() + 1).astype(int)
     parts = [slice(first, end) for first, end in pairwise(bounds)]
     with ThreadPoolExecutor(len(parts)) as threads:
         packed = unite_keys(*threads.map(lambda part: find_touched_blocks(lo[part], hi[part]), parts))

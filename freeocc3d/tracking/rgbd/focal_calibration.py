@@ -8,7 +8,6 @@ is taken, if it stands out; else nothing is changed.
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
+from ...core.threads import count_threads
 from ...core.transforms import measure_pose_difference
 from . import dense_alignment, orb_features
 from .keyframe_registration import KeyframeView, decode_keyframe_view, match_keyframes
@@ -54,7 +54,7 @@ _Pair = tuple[KeyframeView, KeyframeView, NDArray[np.float64], NDArray[np.int64]
 def _pairs(capture: Capture, frames: range) -> list[_Pair]:
     """Pairs of frames (source, target), the source's pose in the target by depth alone, and their (M, 2) matches."""
     starts = np.unique(np.linspace(0, max(len(frames) - 1, 0), PAIRS, dtype=int))
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(count_threads()) as pool:
         found = pool.map(lambda start: _pair(capture, frames[start:]), starts.tolist())
         return [pair for pair in found if pair is not None]
 

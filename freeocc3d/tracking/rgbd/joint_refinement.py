@@ -11,7 +11,6 @@ objective replaced.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, diags
 from scipy.sparse.linalg import spsolve
 
+from ...core.threads import count_threads
 from ...core.transforms import invert, nearest_rigid
 from ..overlap import measure_mutual_overlap
 from . import dense_alignment, orb_features
@@ -59,7 +59,7 @@ def refine_poses(
     if len(T) < 2:
         return T
     made: dict[tuple[int, int], _Pair] = {}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(count_threads()) as pool:
         for _ in range(rounds):
             before = np.stack(T)
             chosen = find_overlapping_pairs(keyframes, T, neighbours, least_overlap)

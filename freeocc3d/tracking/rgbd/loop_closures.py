@@ -7,13 +7,13 @@ neighbour of one of the two, moved along, falls into place on the other as well.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.threads import count_threads
 from ...core.transforms import invert, measure_pose_difference
 from ..pose_graph import Edge
 from . import dense_alignment
@@ -39,7 +39,7 @@ def find_closures(
     submap: (K,) of which piece of the path each is.  T_world_keyframe: their poses, of which only those of the same
     submap are compared.
     """
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(count_threads()) as pool:
         candidates = _candidates(keyframes, submap, pool)
         found = pool.map(lambda pair: verify_closure(keyframes, submap, T_world_keyframe, *pair), candidates)
         return [edge for edge in found if edge is not None]

@@ -6,7 +6,6 @@ R. Arandjelović, A. Zisserman, Three Things Everyone Should Know to Improve Obj
 
 from __future__ import annotations
 
-import os
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import ModelError
+from ...core.threads import count_threads
 
 SIFT = "sift"
 
@@ -95,7 +95,7 @@ class KeypointNetwork:
         if not path.is_file():
             raise ModelError(f"There is no network {path} (tracking.colmap.features): give 'sift', or an .onnx file.")
         options = ort.SessionOptions()
-        options.intra_op_num_threads = len(os.sched_getaffinity(0))
+        options.intra_op_num_threads = count_threads()
         options.log_severity_level = 3
         try:
             self._session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from ...capture.base import Capture
 from ...core.atomic_files import replace_text
 from ...core.errors import FrameError
 from ...core.progress import Progress
+from ...core.threads import count_threads
 from ...core.types import Intrinsics
 from . import diagnosis, frame_selection, mapping, pair_selection
 from .colmap_reconstruction import convert_model
@@ -142,7 +142,7 @@ def _extract(
             return None
         return frame.intrinsics, detect(frame.color)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(count_threads()) as pool:
         for start in range(0, len(waiting), _CHUNK):
             part = waiting[start : start + _CHUNK]
             done = len(chosen) - len(waiting) + start
@@ -173,7 +173,7 @@ def _compare(database: SfmDatabase, frames: Sequence[int], order: str, ratio: fl
     verified = database.verified()
     waiting = [pair for pair in proposed if pair not in verified]
     progress.stage("matching", len(proposed))
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(count_threads()) as pool:
         for start in range(0, len(waiting), _CHUNK):
             part = waiting[start : start + _CHUNK]
             described = [(descriptors(i), descriptors(j)) for i, j in part]
