@@ -30,7 +30,7 @@ ROOMS = (
 )
 """A room imports from the rooms before it, and from itself."""
 
-STILL_UPWARD = {"editing.scaling", "storage.store", "tracking.given_poses", "tracking.trackers.colmap"}
+STILL_UPWARD = {"editing.scaling", "storage.store"}
 """Modules that still import a later room."""
 
 MOST_LOOSE = 3

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from ..core.progress import Progress
 from ..core.threads import count_threads
 from ..core.types import Frame, Intrinsics
 from ..settings.registry import require_positive
+from ..tracking.base import PosedPoints
 from . import depth_network
 from .building_planes import Layout
 from .cross_view_check import DepthImage
@@ -35,7 +36,7 @@ from .view_depth import measure_depth
 from .view_selection import APART, SelectedViews, select_partners
 from .watertight_surface import Surface, build_surface
 
-__all__ = ["Options", "Scan", "StereoDepth", "StereoView", "depth_map"]
+__all__ = ["Options", "StereoDepth", "StereoView", "depth_map"]
 
 _AT_ONCE = 16  # frames
 _FILES_KEPT = 64  # in memory: images and depths of the frames around the one in work
@@ -74,23 +75,6 @@ class Options:
             raise ConfigError(f"'size' must be at least 64 pixels, got {self.size}.")
 
 
-class Scan(Protocol):
-    """Poses and sparse points of a capture.
-
-    T_world_cam: (N, 4, 4) float64, NaN where a frame has none.  points: (P, 3) float32 world.
-    seen_frame, seen_point: (O,) int32, point ``seen_point[o]`` is seen in frame ``seen_frame[o]``.
-    """
-
-    @property
-    def T_world_cam(self) -> NDArray[np.float64]: ...
-    @property
-    def points(self) -> NDArray[np.float32]: ...
-    @property
-    def seen_frame(self) -> NDArray[np.int32]: ...
-    @property
-    def seen_point(self) -> NDArray[np.int32]: ...
-
-
 def depth_map(
     view: StereoView, others: Sequence[StereoView], near: float, far: float, options: Options
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -114,7 +98,7 @@ class StereoDepth:
     def compute(
         self,
         capture: Capture,
-        scan: Scan,
+        scan: PosedPoints,
         frames: Sequence[int],
         progress: Progress,
         prepared: Callable[[Frame], Frame] = lambda frame: frame,

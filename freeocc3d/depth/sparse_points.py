@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from ..capture.base import Capture
 from ..core.errors import FrameError
 from ..core.progress import Progress
 from ..core.types import Frame
+from ..tracking.base import PosedPoints
 from ..tracking.rgbd import orb_features
 
 _STEPS = (1, 2, 3, 5, 8, 12)  # frames ahead
@@ -20,16 +20,6 @@ _NEAR = 6  # frames of another time whose cameras look the same way from close b
 _LOOK = 0.8  # cosine between optical axes
 _LEAST_ANGLE = np.radians(2.0)
 _AGREES = 2.0 / 500.0  # of a ray's length: how far two rays of one point may pass each other
-
-
-@dataclass(frozen=True)
-class PosedPoints:
-    """What stereo needs of a scan (``scan_depth.Scan``)."""
-
-    T_world_cam: NDArray[np.float64]
-    points: NDArray[np.float32]
-    seen_frame: NDArray[np.int32]
-    seen_point: NDArray[np.int32]
 
 
 def triangulate(

@@ -15,6 +15,8 @@ from ..core.errors import FrameError, TrackingError
 from ..core.progress import Progress
 from ..core.types import Frame, Gaussians, Occupancy, PosedFrame, Trajectory
 from ..depth import multi_view_stereo
+from ..depth.base import DepthSource, MeasuredDepth
+from ..depth.stereo_source import StereoSource
 from ..editing import adaptive_voxels
 from ..gaussians import anchors, fitting, rendered_views
 from ..gaussians.rasterizers.base import Rasterizer
@@ -46,13 +48,28 @@ class Mapper:
                 "capture.depth=false): estimate poses from colour with tracking.backend=colmap, or give them (known, "
                 "file)."
             )
-        self.tracker.stereo = options_of(multi_view_stereo, settings["tracking"]["stereo"])
+        self.depth: DepthSource = MeasuredDepth()
+        if not (capture.has_depth or self.tracker.brings_depth):
+            self.depth = StereoSource(capture, options_of(multi_view_stereo, settings["tracking"]["stereo"]))
         self.rasterizer: Rasterizer = load_backend(settings, "fitting", "rasterizer")
         self._fitted: tuple[Gaussians, Trajectory] | None = None
 
+    @property
+    def offline(self) -> bool:
+        """Whether ``prepare`` works through the whole scan before the first frame is added."""
+        return self.tracker.offline or self.depth.offline
+
+    def prepare(self, folder: Path, frames: range, progress: Progress) -> None:
+        """What the tracker and then the depth source do for the whole scan before its first frame; called if
+        ``offline``. folder: takes what lets an interrupted run go on.  frames: those that are used."""
+        if self.tracker.offline:
+            self.tracker.prepare(folder, frames, progress)
+        if self.depth.offline:
+            self.depth.prepare(self.tracker, folder, frames, progress)
+
     def add(self, frame: Frame) -> Tracked:
         """Track the next frame, and keep it if it is a keyframe."""
-        frame = self.tracker.completed(frame)
+        frame = self._complete(frame)
         tracked = self.tracker.track(frame)
         if tracked.status == "keyframe":
             self.keyframes.append(frame)
@@ -88,7 +105,7 @@ class Mapper:
                 while following is not None and (row + 1 == len(own) or following[0] < own[row + 1]):
                     index, found = following
                     if not isinstance(found, FrameError):
-                        yield PosedFrame(self.tracker.completed(found), trajectory.T_world_cam[index], row)
+                        yield PosedFrame(self._complete(found), trajectory.T_world_cam[index], row)
                     following = next(stream, None)
         finally:
             stream.close()
@@ -159,6 +176,10 @@ class Mapper:
         device, width = self.rasterizer.device, self.fit_options.width
         posed = zip(self.mapped(trajectory), trajectory.T_world_keyframe, strict=True)
         return [rendered_views.prepare_captured_view(frame, T, width, device) for frame, T in posed]
+
+    def _complete(self, frame: Frame) -> Frame:
+        """As the tracker knows the camera, and with depth."""
+        return self.depth.complete(self.tracker.prepare_frame(frame))
 
     def _fit(self, gaussians: Gaussians, trajectory: Trajectory, passes: int, progress: Progress) -> Gaussians:
         """Fitted to the trajectory's keyframes, ``passes`` times each."""

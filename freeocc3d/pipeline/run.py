@@ -159,8 +159,8 @@ def _track(mapper: Mapper, work: WorkFolder, progress: Progress) -> None:
     """Layer 1 over all frames that are used, with checkpoints."""
     capture = mapper.capture
     frames = select_frames(capture)
-    if mapper.tracker.offline:
-        mapper.tracker.prepare(work.begin_offline(), frames, progress)
+    if mapper.offline:
+        mapper.prepare(work.begin_offline(), frames, progress)
         for text in mapper.tracker.warnings:
             work.warnings.append(text)
             progress.warn(text)

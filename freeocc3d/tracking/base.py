@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,6 @@ from ..core.progress import Progress
 from ..core.types import Frame, Submap, Trajectory
 from .pose_graph import Edge, edges_to_arrays
 from .records import Records
-
-if TYPE_CHECKING:
-    from ..depth import multi_view_stereo
 
 
 @dataclass(frozen=True)
@@ -47,6 +44,20 @@ class Tracked:
     confidence: float
 
 
+@dataclass(frozen=True)
+class PosedPoints:
+    """Poses of a capture's N frames, and sparse points that these frames see.
+
+    T_world_cam: (N, 4, 4) float64, NaN where a frame has none.  points: (P, 3) float32 world.
+    seen_frame, seen_point: (O,) int32, point ``seen_point[o]`` is seen in frame ``seen_frame[o]``.
+    """
+
+    T_world_cam: NDArray[np.float64]
+    points: NDArray[np.float32]
+    seen_frame: NDArray[np.int32]
+    seen_point: NDArray[np.int32]
+
+
 class Tracker(ABC):
     """Follows the camera through a capture. Frames must come in ascending order; some may be left out."""
 
@@ -62,8 +73,8 @@ class Tracker(ABC):
     """Whether ``prepare`` works through the whole scan before the first frame is tracked."""
     warnings: tuple[str, ...] = ()
     """What ``prepare`` found that the user should know."""
-    stereo: multi_view_stereo.Options
-    """How depth is measured where the capture has none; set before ``prepare``."""
+    brings_depth: bool = False
+    """Whether ``prepare_frame`` adds depth, so that a capture without any needs no other depth source."""
 
     def __init__(self) -> None:
         self.records = Records()
@@ -76,9 +87,18 @@ class Tracker(ABC):
         that are used. Raises TrackingError for a scan that cannot be tracked.
         """
 
-    def completed(self, frame: Frame) -> Frame:
-        """The frame with what the tracker knows of its depth beyond what was measured; ``track`` is given this one, and
-        keyframes keep it."""
+    def poses_ahead(self) -> NDArray[np.float64] | None:
+        """(N, 4, 4) T_world_cam of the capture's frames, NaN where one has none, if they stand before the first frame
+        is tracked (after ``prepare``); None where poses are estimated frame by frame."""
+        return None
+
+    def posed_points(self) -> PosedPoints | None:
+        """``poses_ahead`` with the sparse points that they were found with; None where there are no such points."""
+        return None
+
+    def prepare_frame(self, frame: Frame) -> Frame:
+        """The frame as the tracker's camera is known to see it: undistorted, with depth that the tracker was given.
+        ``track`` takes this one, and keyframes keep it."""
         return frame
 
     @abstractmethod

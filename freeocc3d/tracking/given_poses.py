@@ -3,61 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture.base import Capture
 from ..core.errors import TrackingError
-from ..core.progress import Progress
 from ..core.transforms import invert, nearest_rigid
 from ..core.types import Frame
-from ..depth.multi_view_stereo import Scan, StereoDepth
-from ..depth.sparse_points import triangulate
 from .base import Tracked, Tracker
 from .overlap import DepthView, measure_mutual_overlap, sample_points
 from .records import Records
 
 _FARTHEST = 2000.0
-_SUREST_M = 5e-4  # a standard deviation of 0 would weigh infinitely
 _LEAST_COVERED = 0.05  # share of the pixels with a depth, or a frame shows nothing
 
 
 class GivenTracker(Tracker):
     """Takes (N, 4, 4) poses of a capture's frames as they are; a frame whose pose is NaN is lost, and one that shares
-    too little with its keyframe becomes a keyframe. Where the capture has no depth, multi-view stereo measures it."""
+    too little with its keyframe becomes a keyframe."""
 
-    def __init__(self, T_world_cam: NDArray[np.float64], keyframe_overlap: float, capture: Capture):
+    def __init__(self, T_world_cam: NDArray[np.float64], keyframe_overlap: float):
         super().__init__()
         self.T_world_cam = T_world_cam
         self.keyframe_overlap = keyframe_overlap
-        self.offline = not capture.has_depth
-        self._capture = capture
         self._keyframe: DepthView | None = None
-        self._depth: StereoDepth | None = None
 
-    def prepare(self, folder: Path, frames: range, progress: Progress) -> None:
-        scan = self.scan(folder, frames, progress)
-        if not self._capture.has_depth:
-            self._depth = StereoDepth(folder / "depth", self.stereo)
-            self._depth.compute(self._capture, scan, frames, progress, self.as_pinhole)
-
-    def scan(self, folder: Path, frames: range, progress: Progress) -> Scan:
-        """The poses with points that the frames see, for stereo."""
-        return triangulate(self._capture, self.T_world_cam, frames, progress)
-
-    def as_pinhole(self, frame: Frame) -> Frame:
-        """The frame as a pinhole camera would have taken it, should the tracker know the camera better."""
-        return frame
-
-    def completed(self, frame: Frame) -> Frame:
-        frame = self.as_pinhole(frame)
-        found = None if self._depth is None else self._depth.depth(frame.index)
-        if found is None:
-            return frame
-        return replace(frame, depth_m=found[0], depth_sigma_m=np.maximum(found[1], np.float32(_SUREST_M)))
+    def poses_ahead(self) -> NDArray[np.float64]:
+        return self.T_world_cam
 
     def track(self, frame: Frame) -> Tracked:
         given = self.T_world_cam[frame.index]

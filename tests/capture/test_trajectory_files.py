@@ -262,7 +262,7 @@ def test_a_point_cloud_completes_frames_and_leaves_what_was_measured(scan, tmp_p
     T[:, :3, 3] /= 2
     path = write_tum(tmp_path / "t.txt", T)
     options = file.Options(path=str(path), scale=2.0, points=str(tmp_path / "cloud.ply"))
-    completed = file.load(options, scan).completed(scan[0])
+    completed = file.load(options, scan).prepare_frame(scan[0])
     assert (depth == 0).any()
     np.testing.assert_allclose(completed.depth_m[depth == 0], 2.0, atol=1e-3)
     np.testing.assert_array_equal(completed.depth_m[depth > 0], depth[depth > 0])

@@ -17,6 +17,7 @@ from freeocc3d.core.transforms import invert, project, transform
 from freeocc3d.core.types import Frame
 from freeocc3d.depth import multi_view_stereo
 from freeocc3d.depth.sparse_points import triangulate
+from freeocc3d.depth.stereo_source import StereoSource
 from freeocc3d.tracking.trackers import known
 
 FRAMES = range(24)
@@ -49,27 +50,27 @@ class Colour(Capture):
         return self.room.pose(index)
 
 
-def _tracker(capture: Capture, folder: Path, frames=FRAMES, change: Callable = lambda T: T, **options):
+def _source(capture: Capture, folder: Path, frames=FRAMES, change: Callable = lambda T: T, **options) -> StereoSource:
     tracker = known.load(known.Options(), capture)
     tracker.T_world_cam = change(tracker.T_world_cam)
-    tracker.stereo = multi_view_stereo.Options(size=160, **options)
-    assert tracker.offline
-    tracker.prepare(folder, frames, Progress())
-    return tracker
+    source = StereoSource(capture, multi_view_stereo.Options(size=160, **options))
+    assert source.offline
+    source.prepare(tracker, folder, frames, Progress())
+    return source
 
 
 @pytest.fixture(scope="module")
 def computed(tmp_path_factory):
     capture, folder = Colour(), tmp_path_factory.mktemp("stereo")
-    return capture, folder, _tracker(capture, folder)
+    return capture, folder, _source(capture, folder)
 
 
-def _against_truth(capture, tracker):
+def _against_truth(capture, source):
     """Relative errors where there is a depth, the share of pixels that have one, errors in standard deviations."""
     errors, sure, true = [], [], 0
     for index in FRAMES:
         truth = capture.room[index].depth_m
-        found = tracker._depth.depth(index)
+        found = source._depth.depth(index)
         true += np.count_nonzero(truth)
         if found is not None:
             both = (truth > 0) & (found[0] > 0)
@@ -79,27 +80,27 @@ def _against_truth(capture, tracker):
 
 
 def test_the_room_is_measured(computed) -> None:
-    capture, _, tracker = computed
-    errors, share, in_sigmas = _against_truth(capture, tracker)
+    capture, _, source = computed
+    errors, share, in_sigmas = _against_truth(capture, source)
     assert np.median(errors) < 0.01
     assert share > 0.4
     assert 0.1 < np.median(in_sigmas) < 1.5
-    frame = tracker.completed(capture[10])
+    frame = source.complete(capture[10])
     assert frame.depth_m.shape == frame.color.shape[:2]
     assert frame.depth_m.dtype == np.float32
     assert frame.depth_sigma_m.dtype == np.float32
     assert (frame.depth_sigma_m[frame.depth_m > 0] > 0).all()
-    assert tracker.track(frame).status == "keyframe"
+    assert known.load(known.Options(), capture).track(frame).status == "keyframe"
 
 
 def test_what_was_computed_is_taken_up_again(computed) -> None:
-    capture, folder, tracker = computed
-    before = tracker._depth.depth(10)
+    capture, folder, source = computed
+    before = source._depth.depth(10)
     times = {path: path.stat().st_mtime_ns for path in (folder / "depth").iterdir()}
     removed = {folder / "depth" / name for name in ("surface.npz", "000010.depth.npz")}
     for path in removed:
         path.unlink()
-    again = _tracker(capture, folder)
+    again = _source(capture, folder)
     np.testing.assert_array_equal(again._depth.depth(10)[0], before[0])
     made_again = removed | {folder / "depth" / "layout.npz"}
     assert {p for p in times if p.stat().st_mtime_ns != times[p]} == made_again
@@ -115,13 +116,13 @@ def test_a_damaged_surface_is_told(computed, tmp_path: Path) -> None:
         arrays = dict(stored)
     np.savez(path, **{**arrays, "triangles": arrays["triangles"] + len(arrays["vertices"])})
     with pytest.raises(MapError, match=r"surface.npz is damaged"):
-        _tracker(capture, tmp_path)
+        _source(capture, tmp_path)
     np.savez(path, **{**arrays, "sigma_m": arrays["sigma_m"][:-1]})
     with pytest.raises(MapError, match=r"surface.npz is damaged: its arrays"):
-        _tracker(capture, tmp_path)
+        _source(capture, tmp_path)
     path.write_bytes(b"")
     with pytest.raises(MapError, match=r"surface.npz is damaged"):
-        _tracker(capture, tmp_path)
+        _source(capture, tmp_path)
 
 
 def test_a_damaged_layout_is_told(computed, tmp_path: Path) -> None:
@@ -135,13 +136,13 @@ def test_a_damaged_layout_is_told(computed, tmp_path: Path) -> None:
     for name, damaged in (("support", arrays["support"][:-1]), ("offsets", arrays["offsets"][:-1])):
         np.savez(path, **{**arrays, name: damaged})
         with pytest.raises(MapError, match=r"layout.npz is damaged: it has"):
-            _tracker(capture, tmp_path)
+            _source(capture, tmp_path)
     np.savez(path, **{name: array for name, array in arrays.items() if name != "outermost"})
     with pytest.raises(MapError, match=r"layout.npz is damaged"):
-        _tracker(capture, tmp_path)
+        _source(capture, tmp_path)
     path.unlink()
     with pytest.raises(MapError, match=r"layout.npz is missing"):
-        _tracker(capture, tmp_path)
+        _source(capture, tmp_path)
 
 
 def test_images_that_show_nothing_are_told(tmp_path: Path) -> None:
@@ -158,8 +159,8 @@ def test_images_that_show_nothing_are_told(tmp_path: Path) -> None:
 
 
 def test_points_are_where_surfaces_are(computed) -> None:
-    capture, _, tracker = computed
-    scan = triangulate(capture, tracker.T_world_cam, FRAMES, Progress())
+    capture, _, _ = computed
+    scan = triangulate(capture, known.load(known.Options(), capture).T_world_cam, FRAMES, Progress())
     assert len(scan.points) > 500
     frame = capture.room[10]
     seen = scan.points[scan.seen_point[scan.seen_frame == 10]]
@@ -176,16 +177,16 @@ def test_points_are_where_surfaces_are(computed) -> None:
 def test_broken_frames_are_done_without(tmp_path: Path) -> None:
     capture = Colour()
     capture.broken = {5}
-    tracker = _tracker(capture, tmp_path, range(10))
-    assert tracker._depth.depth(5) is None
-    assert tracker._depth.depth(4) is not None
+    source = _source(capture, tmp_path, range(10))
+    assert source._depth.depth(5) is None
+    assert source._depth.depth(4) is not None
 
 
 def test_a_network_fills_what_stereo_leaves_empty(tmp_path: Path) -> None:
     network = write_network(tmp_path / "n.onnx")
     capture = Colour()
-    plain = _tracker(capture, tmp_path / "a", range(8))
-    fused = _tracker(capture, tmp_path / "b", range(8), network=str(network))
+    plain = _source(capture, tmp_path / "a", range(8))
+    fused = _source(capture, tmp_path / "b", range(8), network=str(network))
     counts = [[np.count_nonzero(t._depth.depth(i)[0]) for i in range(2, 6)] for t in (plain, fused)]
     assert (np.array(counts[1]) >= counts[0]).all()
 
@@ -197,7 +198,7 @@ def test_a_camera_that_only_turns_measures_nothing(tmp_path: Path) -> None:
         return T
 
     with pytest.raises(TrackingError, match="sideways"):
-        _tracker(Colour(), tmp_path, range(8), turned)
+        _source(Colour(), tmp_path, range(8), turned)
 
 
 @pytest.mark.parametrize("given", [{"size": 10}, {"neighbours": 0}, {"agreeing": 0}])

@@ -14,9 +14,7 @@ from freeocc3d.capture.lenses import Lens
 from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, TrackingError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.transforms import umeyama
-from freeocc3d.core.types import Intrinsics
-from freeocc3d.depth import multi_view_stereo
-from freeocc3d.tracking import given_poses
+from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.tracking.sfm import colmap_reconstruction, mapping, structure_from_motion
 from freeocc3d.tracking.sfm.reconstruction import Reconstruction
 from freeocc3d.tracking.sfm.structure_from_motion import Recipe
@@ -182,35 +180,25 @@ def test_scans_that_give_no_poses_are_told_apart(tmp_path: Path) -> None:
             reconstructed([np.ascontiguousarray(image) for image in taken], by, folder)
 
 
-class StereoStub:
-    """Depth of the nominal 2 metres for every frame with a pose."""
-
-    def __init__(self, folder: Path, options: multi_view_stereo.Options):
-        self.folder = folder
-
-    def compute(self, capture: Any, found: Reconstruction, frames: range, progress: Progress, prepared: Any) -> None:
-        self.found, self.shape = found, capture[0].color.shape[:2]
-
-    def depth(self, index: int) -> tuple[np.ndarray, np.ndarray] | None:
-        if not self.found.has_pose[index]:
-            return None
-        return np.full(self.shape, 2.0, np.float32), np.full(self.shape, 0.01, np.float32)
-
-
-def tracked(found: Reconstruction, folder: Path, monkeypatch: pytest.MonkeyPatch, **options: Any) -> ColmapTracker:
-    """A tracker of the walk whose reconstruction is saved already, with stereo stubbed."""
+def tracked(found: Reconstruction, folder: Path, **options: Any) -> ColmapTracker:
+    """A tracker of the walk whose reconstruction is saved already."""
     found.save(folder / "reconstruction.npz")
-    monkeypatch.setattr(given_poses, "StereoDepth", StereoStub)
     images, _, camera = walk()
     tracker = colmap.load(Options(**options), Photographs(images, camera))
     assert tracker.offline
-    tracker.stereo = multi_view_stereo.Options()
     tracker.prepare(folder, range(len(images)), Progress())
     return tracker
 
 
-def test_the_tracker_gives_poses_depth_and_what_became_of_frames(
-    room: tuple[Reconstruction, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def two_metres_deep(tracker: ColmapTracker, index: int) -> Frame:
+    """The frame as it is tracked, with the depth that a depth source may have given it."""
+    frame = tracker.prepare_frame(tracker._capture[index])
+    depth = 2.0 if np.isfinite(tracker.T_world_cam[index]).all() else 0.0
+    return replace(frame, depth_m=np.full_like(frame.depth_m, depth))
+
+
+def test_the_tracker_gives_poses_points_and_what_became_of_frames(
+    room: tuple[Reconstruction, Path], tmp_path: Path
 ) -> None:
     found, _ = room
     T, apart, chosen = found.T_world_cam.copy(), found.apart.copy(), found.chosen.copy()
@@ -218,31 +206,31 @@ def test_the_tracker_gives_poses_depth_and_what_became_of_frames(
     apart[12:] = True
     chosen[3] = False
     altered = replace(found, T_world_cam=T, apart=apart, chosen=chosen)
-    tracker = tracked(altered, tmp_path, monkeypatch)
+    tracker = tracked(altered, tmp_path)
     for index in range(8):
-        frame = tracker.completed(tracker._capture[index])
+        frame = two_metres_deep(tracker, index)
         assert frame.intrinsics == found.rectified.intrinsics
-        assert frame.depth_m[0, 0] == 2.0
         tracker.track(frame)
     state = tracker.state()
-    later = tracked(altered, tmp_path, monkeypatch)
-    later.restore(state, [later.completed(later._capture[int(i)]) for i in state["keyframe_index"]])
+    later = tracked(altered, tmp_path)
+    later.restore(state, [two_metres_deep(later, int(i)) for i in state["keyframe_index"]])
     for index in range(8, 16):
-        later.track(later.completed(later._capture[index]))
+        later.track(two_metres_deep(later, index))
     trajectory = later.trajectory(later._capture.timestamps)
     assert trajectory.status[0] == "keyframe"
     assert trajectory.status[3] == "unused"
     assert trajectory.status[10:].tolist() == ["lost"] * 2 + ["apart"] * 4
     np.testing.assert_allclose(trajectory.T_world_cam[9], found.T_world_cam[9], atol=1e-6)
+    posed = tracker.posed_points()
+    np.testing.assert_array_equal(posed.T_world_cam, T)
+    np.testing.assert_array_equal(posed.points[posed.seen_point], found.points[found.seen_point])
 
 
-def test_frames_are_undistorted(
-    room: tuple[Reconstruction, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_are_undistorted(room: tuple[Reconstruction, Path], tmp_path: Path) -> None:
     found, _ = room
     bent = replace(found, lens=Lens(found.lens.camera, (-0.2, 0.0, 0.0, 0.0)))
-    tracker = tracked(bent, tmp_path, monkeypatch)
-    frame = tracker.completed(tracker._capture[0])
+    tracker = tracked(bent, tmp_path)
+    frame = tracker.prepare_frame(tracker._capture[0])
     assert frame.intrinsics == bent.rectified.intrinsics != bent.lens.camera
     np.testing.assert_array_equal(frame.color, bent.rectified.color(tracker._capture[0].color))
 

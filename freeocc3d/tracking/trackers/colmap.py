@@ -13,9 +13,8 @@ from ...capture.base import Capture
 from ...core.errors import ConfigError
 from ...core.progress import Progress
 from ...core.types import Frame, Trajectory
-from ...depth.multi_view_stereo import Scan
 from ...settings.registry import require_positive
-from ..base import Tracked
+from ..base import PosedPoints, Tracked
 from ..given_poses import GivenTracker
 from ..sfm.colmap_reconstruction import read_model
 from ..sfm.reconstruction import Reconstruction
@@ -66,24 +65,29 @@ def load(options: Options, capture: Capture) -> ColmapTracker:
 
 
 class ColmapTracker(GivenTracker):
-    """Poses stand when ``prepare`` is done; frames that were not chosen are "unused", those of smaller models "apart".
-    Frames are given as a pinhole camera would have taken them."""
+    """Poses are known when ``prepare`` is done; frames that were not chosen are "unused", those of smaller models
+    "apart". Frames are given as a pinhole camera would have taken them."""
 
     world: ClassVar[str] = "OpenCV camera axes of the model's world, in units of half the median depth of its points"
     estimates_camera = True
 
     def __init__(self, options: Options, capture: Capture):
-        super().__init__(np.full((len(capture), 4, 4), np.nan), options.keyframe_overlap, capture)
+        super().__init__(np.full((len(capture), 4, 4), np.nan), options.keyframe_overlap)
         self.options = options
+        self._capture = capture
         self.offline, self.metric = True, capture.options.scale is not None
         self.reconstruction: Reconstruction | None = None
 
-    def scan(self, folder: Path, frames: range, progress: Progress) -> Scan:
-        found = self._reconstructed(folder, frames, progress)
+    def prepare(self, folder: Path, frames: range, progress: Progress) -> None:
+        found = self._reconstruct(folder, frames, progress)
         self.reconstruction, self.T_world_cam, self.warnings = found, found.T_world_cam, found.warnings
-        return found
 
-    def _reconstructed(self, folder: Path, frames: range, progress: Progress) -> Reconstruction:
+    def posed_points(self) -> PosedPoints:
+        assert self.reconstruction is not None, "prepare comes first"
+        found = self.reconstruction
+        return PosedPoints(found.T_world_cam, found.points, found.seen_frame, found.seen_point)
+
+    def _reconstruct(self, folder: Path, frames: range, progress: Progress) -> Reconstruction:
         options, scale = self.options, self._capture.options.scale
         if options.model is not None:
             found = read_model(Path(options.model).expanduser(), self._capture).normalised()
@@ -92,7 +96,7 @@ class ColmapTracker(GivenTracker):
             found = reconstruct_poses(self._capture, frames, folder, recipe, progress)
         return found if scale is None else found.scaled(scale)
 
-    def as_pinhole(self, frame: Frame) -> Frame:
+    def prepare_frame(self, frame: Frame) -> Frame:
         """Undistorted."""
         assert self.reconstruction is not None, "prepare comes first"
         rectified = self.reconstruction.rectified

@@ -62,7 +62,7 @@ def load(options: Options, capture: Capture) -> FileTracker:
     scale = _scale(T_world_cam, capture, options)
     T_world_cam[:, :3, 3] *= scale
     scaled = None if points is None else points * np.float32(scale)
-    tracker = FileTracker(T_world_cam, options.keyframe_overlap, capture, scaled)
+    tracker = FileTracker(T_world_cam, options.keyframe_overlap, scaled)
     tracker.metric = capture.has_depth or options.scale is not None or capture.options.scale is not None
     return tracker
 
@@ -77,15 +77,13 @@ class FileTracker(GivenTracker):
         self,
         T_world_cam: NDArray[np.float64],
         keyframe_overlap: float,
-        capture: Capture,
         points: NDArray[np.float32] | None = None,
     ):
-        super().__init__(T_world_cam, keyframe_overlap, capture)
+        super().__init__(T_world_cam, keyframe_overlap)
         self._points = points
-        self.offline = self.offline and points is None
+        self.brings_depth = points is not None
 
-    def completed(self, frame: Frame) -> Frame:
-        frame = super().completed(frame)
+    def prepare_frame(self, frame: Frame) -> Frame:
         T_world_cam = self.T_world_cam[frame.index]
         if self._points is None or not np.isfinite(T_world_cam).all():
             return frame

@@ -33,7 +33,7 @@ def load(options: Options, capture: Capture) -> KnownTracker:
         raise TrackingError(f"{capture.path} brings no poses: use tracking.backend=rgbd, which estimates them.")
     none = np.full((4, 4), np.nan)
     given = np.stack([none if pose is None else pose for pose in stated])
-    tracker = KnownTracker(given, options.keyframe_overlap, capture)
+    tracker = KnownTracker(given, options.keyframe_overlap)
     tracker.metric = capture.metric_poses
     return tracker
 

@@ -1,0 +1,53 @@
+"""Multi-view stereo as a depth source: depth of colour images whose poses are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..capture.base import Capture
+from ..core.errors import TrackingError
+from ..core.progress import Progress
+from ..core.types import Frame
+from ..tracking.base import PosedPoints, Tracker
+from .base import DepthSource
+from .multi_view_stereo import Options, StereoDepth
+from .sparse_points import triangulate
+
+_SUREST_M = 5e-4  # a standard deviation of 0 would weigh infinitely
+
+
+class StereoSource(DepthSource):
+    """Depth of a capture that has none, by multi-view stereo from the poses that a tracker has ahead."""
+
+    offline = True
+
+    def __init__(self, capture: Capture, options: Options):
+        self._capture, self._options = capture, options
+        self._depth: StereoDepth | None = None
+
+    def prepare(self, tracker: Tracker, folder: Path, frames: range, progress: Progress) -> None:
+        self._depth = StereoDepth(folder / "depth", self._options)
+        scan = self._posed_points(tracker, frames, progress)
+        self._depth.compute(self._capture, scan, frames, progress, tracker.prepare_frame)
+
+    def complete(self, frame: Frame) -> Frame:
+        assert self._depth is not None, "prepare comes first"
+        found = self._depth.depth(frame.index)
+        if found is None:
+            return frame
+        return replace(frame, depth_m=found[0], depth_sigma_m=np.maximum(found[1], np.float32(_SUREST_M)))
+
+    def _posed_points(self, tracker: Tracker, frames: range, progress: Progress) -> PosedPoints:
+        """The tracker's, or points that are triangulated from its poses."""
+        if (found := tracker.posed_points()) is not None:
+            return found
+        T_world_cam = tracker.poses_ahead()
+        if T_world_cam is None:
+            raise TrackingError(
+                f"{self._capture.path} has no depth, and this tracker estimates poses frame by frame, from which depth "
+                "cannot be measured: take tracking.backend=colmap, known or file."
+            )
+        return triangulate(self._capture, T_world_cam, frames, progress)
