@@ -21,8 +21,8 @@ def measure_splat() -> Figures:
     """Gaussians a second through layer 4's projection, beside what the machine needs for its arithmetic alone."""
     import numpy as np
 
+    from freeocc3d.core.voxel_keys import unpack_voxels
     from freeocc3d.occupancy import splat
-    from freeocc3d.occupancy.voxel_blocks import unpack
 
     options, origin = splat.Options(voxel_size=SPLAT_VOXEL_SIZE_M), np.zeros(3)
 
@@ -30,7 +30,7 @@ def measure_splat() -> Figures:
         mark = time.perf_counter()
         bins = splat.bin_gaussians(gaussians, origin, options)
         mark = lap(seconds, "sort into blocks", mark)
-        splat.compute_probability(bins, unpack(bins.packed))
+        splat.compute_probability(bins, unpack_voxels(bins.packed))
         lap(seconds, "evaluate", mark)
         return bins
 

@@ -181,11 +181,11 @@ class _Scene:
         """mIoU over the classes present of the voxels' nearest words."""
         import numpy as np
 
+        from freeocc3d.core.voxel_keys import unpack_voxels
         from freeocc3d.occupancy import build, splat
-        from freeocc3d.occupancy.voxel_blocks import unpack
         from freeocc3d.query import word_query
 
-        means = splat.compute_posterior_mean(self.bins, unpack(self.bins.packed), self.slots, features)
+        means = splat.compute_posterior_mean(self.bins, unpack_voxels(self.bins.packed), self.slots, features)
         nearest = word_query.nearest_word(build.normalize_rows(means)[self.inside], self.words)
         return self.miou((nearest + 1).astype(np.uint8))
 
@@ -211,12 +211,12 @@ def _slots(occupancy: Any, bins: Any) -> Any:
     import numpy as np
 
     from freeocc3d.core.types import OCCUPIED
-    from freeocc3d.occupancy.voxel_blocks import pack
+    from freeocc3d.core.voxel_keys import pack_voxels
 
     occupied = occupancy.state == OCCUPIED
     slots = np.full(occupied.shape, -1, np.int32)
     slots[occupied] = np.arange(np.count_nonzero(occupied))
-    return slots[np.searchsorted(pack(occupancy.keys), bins.packed)]
+    return slots[np.searchsorted(pack_voxels(occupancy.keys), bins.packed)]
 
 
 def lifting_lines(figures: Figures) -> list[Line]:

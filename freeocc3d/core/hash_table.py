@@ -6,6 +6,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from .voxel_keys import pack_index
+
+packed_key = njit(cache=True, nogil=True)(pack_index)
+"""``pack_index`` for compiled code."""
+
 
 @njit(cache=True, nogil=True)
 def find_slot(table: NDArray[np.int64], key: int) -> int:

@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 AXIS_BITS = 21
-"""Of a key, for each axis: indices lie in [-2^20, 2^20)."""
+"""Of a key, for each axis."""
+
+KEY_LIMIT = 1 << AXIS_BITS - 1
+"""Indices lie in [-KEY_LIMIT, KEY_LIMIT) along each axis. Single precision of positions ends far earlier: a kilometre
+from the origin it costs tenths of a millimetre."""
 
 
-def packed_voxels(index: NDArray[np.integer]) -> NDArray[np.int64]:
+def pack_index(i: Any, j: Any, k: Any) -> Any:
+    """One integer for three indices, in their order: for numbers, int64 arrays and tensors, and compiled code alike."""
+    return ((i + KEY_LIMIT) << 2 * AXIS_BITS) | ((j + KEY_LIMIT) << AXIS_BITS) | (k + KEY_LIMIT)
+
+
+def pack_voxels(index: NDArray[np.integer]) -> NDArray[np.int64]:
     """(V, 3) indices, |i| < 2^20, to (V,) one integer each, in the order of (i, j, k)."""
-    i = index.astype(np.int64) + (1 << AXIS_BITS - 1)
-    return (i[:, 0] << 2 * AXIS_BITS) + (i[:, 1] << AXIS_BITS) + i[:, 2]
+    return np.asarray(pack_index(*index.astype(np.int64).T))
 
 
-def unpacked_voxels(packed: NDArray[np.int64]) -> NDArray[np.int32]:
-    """The inverse of ``packed_voxels``."""
+def unpack_voxels(packed: NDArray[np.int64]) -> NDArray[np.int32]:
+    """The inverse of ``pack_voxels``."""
     mask = (1 << AXIS_BITS) - 1
     index = np.stack((packed >> 2 * AXIS_BITS, (packed >> AXIS_BITS) & mask, packed & mask), axis=1)
-    return np.asarray(index - (1 << AXIS_BITS - 1), np.int32)
+    return np.asarray(index - KEY_LIMIT, np.int32)
 
 
 def contains(ascending: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.bool_]:

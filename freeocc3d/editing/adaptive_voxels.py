@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..core.errors import MapError
-from ..core.hash_table import build_table, find_row
+from ..core.hash_table import build_table, find_row, packed_key
 from ..core.progress import Progress
 from ..core.transforms import depth_sigma
 from ..core.types import BLOCK, OCCUPIED, Gaussians, Occupancy, PosedFrame
+from ..core.voxel_keys import pack_voxels, unpack_voxels
 from ..gaussians.surface_cells import cell_keys
 from ..language.feature_codec import Codec
 from ..occupancy import build, carve, levels, splat
-from ..occupancy.voxel_blocks import pack, packed_key, unpack
 from ..settings import registry
 from ..settings.config import Config
 from ..storage import store
@@ -80,9 +80,9 @@ def build_adaptive(
     count = count_halvings(base.voxel_size, finest)
     changing = _changing(gaussians.means, features)
     tree = cKDTree(gaussians.means) if len(gaussians) else None
-    occupied = np.sort(pack(base.keys[(base.state == OCCUPIED).any(axis=1)]))
+    occupied = np.sort(pack_voxels(base.keys[(base.state == OCCUPIED).any(axis=1)]))
     split = _detailed(occupied, gaussians, changing, base.origin, base.voxel_size) if count else occupied[:0]
-    whole = ~np.isin(pack(base.keys), split)
+    whole = ~np.isin(pack_voxels(base.keys), split)
     found: list[Gaussians] = []
     leaves: list[NDArray[np.int64]] = []
     for level in range(1, count + 1):
@@ -91,7 +91,7 @@ def build_adaptive(
         size = base.voxel_size / 2**level
         region = Blocks(split, base.origin, 2 * BLOCK * size)
         made = lift_gaussians(posed, region, size, settings, T_world_keyframe, progress)
-        parts = np.sort(pack(levels.subdivide_keys(unpack(split))))
+        parts = np.sort(pack_voxels(levels.subdivide_keys(unpack_voxels(split))))
         split = parts[:0]
         if level < count and tree is not None and len(made):
             nearest = np.asarray(tree.query(made.means, workers=-1)[1])
@@ -191,7 +191,7 @@ def _detailed(
     uneven = (n >= _FEWEST) & (off_plane > np.hypot(_UNEVEN * voxel_size, noise))
     uneven |= np.bincount(cube, changing) > 0
     uneven &= noise <= 0.5 * voxel_size  # smaller voxels than that would show the noise
-    of_block = pack(index[first[uneven]].astype(np.int64) // (BLOCK // _CUBE))
+    of_block = pack_voxels(index[first[uneven]].astype(np.int64) // (BLOCK // _CUBE))
     return np.intersect1d(blocks, of_block)
 
 

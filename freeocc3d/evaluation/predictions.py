@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from ..capture import associate
 from ..core.errors import FreeOccError
 from ..core.types import BLOCK, OCCUPIED, UNKNOWN, Gaussians, PosedFrame
+from ..core.voxel_keys import unpack_voxels
 from ..gaussians import anchors
 from ..gaussians.splat_ply import read_standard_ply
 from ..language.encoders.base import TextEncoder, TextFeatures
 from ..occupancy import build, carve, splat
-from ..occupancy.voxel_blocks import unpack
 from ..query import word_query
 from ..settings import registry
 from ..settings.config import Config
@@ -82,7 +82,7 @@ def predict_from_gaussians(
     splatting = _splatting(settings, truth)
     moved = anchors.align_gaussians(gaussians, alignment.scale, alignment.rotation, alignment.translation)
     bins = splat.bin_gaussians(moved, truth.origin, splatting, truth.shape)
-    keys = unpack(bins.packed)
+    keys = unpack_voxels(bins.packed)
     probability = splat.compute_probability(bins, keys)
     block, local = np.nonzero(probability >= splatting.threshold)
     voxels = keys[block] * BLOCK + np.stack((local // 64, local // 8 % 8, local % 8), axis=1)

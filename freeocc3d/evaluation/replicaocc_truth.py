@@ -29,6 +29,7 @@ from ..core.errors import ConfigError, FrameError, FreeOccError
 from ..core.progress import Progress
 from ..core.transforms import back_project, invert, transform
 from ..core.types import FREE, UNKNOWN, Frame
+from ..core.voxel_keys import KEY_LIMIT, pack_voxels, unpack_voxels
 from ..settings import config, registry
 from ..settings.registry import require_positive
 from . import scored_classes as taxonomy
@@ -37,7 +38,6 @@ from .true_occupancy import GroundTruth
 _LARGEST_GRID = 1 << 29
 _ROWS_BEFORE_MERGE = 4_000_000
 _MOST_CLASSES = 254
-_FARTHEST_VOXEL = 1 << 20
 UNLABELLED = "occupied"
 """Class of every surface where a capture has no class images."""
 
@@ -139,9 +139,8 @@ class Votes:
         pixels = np.stack((u, v), axis=1).astype(np.float64) * step
         points = transform(T_world_cam, back_project(pixels, depth[v, u].astype(np.float64), frame.intrinsics))
         index = np.floor((points - self.options.lattice_offset) / self.options.voxel_size).astype(np.int64)
-        index += _FARTHEST_VOXEL
-        inside = ((index >= 0) & (index < 2 * _FARTHEST_VOXEL)).all(axis=1)
-        voxel = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+        inside = ((index >= -KEY_LIMIT) & (index < KEY_LIMIT)).all(axis=1)
+        voxel = pack_voxels(index)
         label = labels[::step, ::step][v, u].astype(np.int64)
         order = np.lexsort((label[inside], voxel[inside]))
         pairs = np.stack((voxel[inside][order], label[inside][order]), axis=1)
@@ -160,10 +159,9 @@ class Votes:
         start = np.flatnonzero(np.diff(voxel[order], prepend=-1))
         enough = np.add.reduceat(count[order], start) >= self.options.min_points
         first = order[start[enough]]
-        mask = (1 << 21) - 1
-        key = voxel[first]
-        voxels = np.stack((key >> 42, (key >> 21) & mask, key & mask), axis=1) - _FARTHEST_VOXEL
-        return voxels, np.where(label[first] > 0, label[first], UNKNOWN).astype(np.uint8)
+        return unpack_voxels(voxel[first]).astype(np.int64), np.where(label[first] > 0, label[first], UNKNOWN).astype(
+            np.uint8
+        )
 
     def _append(self, pairs: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
         """Add (P, 2) sorted pairs (voxel, label) with their counts, equal ones summed."""

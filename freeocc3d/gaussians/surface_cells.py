@@ -10,13 +10,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..core.hash_table import build_table, find_slot
+from ..core.hash_table import build_table, find_slot, packed_key
 from ..core.transforms import back_project, transform
 from ..core.types import PosedFrame
+from ..core.voxel_keys import pack_voxels
 from .depth_edges import is_at_edge, mask_away_from_edges
 from .depth_noise import said, sigma_at, sigma_image
 
-_PER_AXIS = 1 << 20
 """Cells on either side of the world's origin, along each axis."""
 
 
@@ -111,8 +111,7 @@ class CellSums:
 
 def cell_keys(points_world: NDArray[np.float64], cell_size: float) -> NDArray[np.int64]:
     """(N, 3) metres to (N,) one integer per cell; cells within 2**20 of the origin along each axis are told apart."""
-    index = np.floor(points_world / cell_size).astype(np.int64) + _PER_AXIS
-    return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+    return pack_voxels(np.floor(points_world / cell_size).astype(np.int64))
 
 
 def cells_reference(posed: PosedFrame, step: int, edge: float, cell_size: float) -> Cells:
@@ -165,10 +164,10 @@ def _add_frame(  # type: ignore[no-untyped-def]
             wx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * depth + T[0, 3]
             wy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * depth + T[1, 3]
             wz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * depth + T[2, 3]
-            i = np.int64(math.floor(wx / cell_size)) + _PER_AXIS
-            j = np.int64(math.floor(wy / cell_size)) + _PER_AXIS
-            k = np.int64(math.floor(wz / cell_size)) + _PER_AXIS
-            row, used = _row_of((i << 42) | (j << 21) | k, used, table, rows, keys)
+            i = np.int64(math.floor(wx / cell_size))
+            j = np.int64(math.floor(wy / cell_size))
+            k = np.int64(math.floor(wz / cell_size))
+            row, used = _row_of(packed_key(i, j, k), used, table, rows, keys)
             sigma = sigma_at(sigma_m, v, u, depth)
             w = 1.0 / (sigma * sigma)
             sums[row, 0] += w

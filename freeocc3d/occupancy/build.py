@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, PosedFrame
+from ..core.voxel_keys import pack_voxels, unpack_voxels
 from . import carve, splat
-from .voxel_blocks import pack, unite_keys, unpack
+from .voxel_blocks import unite_keys
 
 
 def build_occupancy(
@@ -34,7 +35,7 @@ def build_occupancy(
     shape, within = None, None
     if blocks is not None:
         shape = (BLOCK * blocks[0], BLOCK * blocks[1], BLOCK * blocks[2])
-        within = pack(np.stack(np.unravel_index(np.arange(np.prod(blocks)), blocks), axis=1))
+        within = pack_voxels(np.stack(np.unravel_index(np.arange(np.prod(blocks)), blocks), axis=1))
     bins = splat.bin_gaussians(gaussians, origin, splatting, shape, least_scale)
 
     evidence = carve.DepthEvidence(origin, size, carving, within)
@@ -59,18 +60,18 @@ def build_blocks(
     free, hits = evidence.at(packed)
     probability = np.zeros((len(packed), BLOCK**3), np.float32)
     splatted = np.searchsorted(packed, bins.packed)
-    probability[splatted] = splat.compute_probability(bins, unpack(bins.packed))
+    probability[splatted] = splat.compute_probability(bins, unpack_voxels(bins.packed))
     state = classify(probability, free, hits, splatting, carving)
 
     slots = np.full(state.shape, -1, np.int32)
     occupied = state == OCCUPIED
     slots[occupied] = np.arange(np.count_nonzero(occupied))
     values = np.concatenate((gaussians.colors.astype(np.float16), features), axis=1)  # 0…255 are exact
-    means = splat.compute_posterior_mean(bins, unpack(bins.packed), slots[splatted], values)
+    means = splat.compute_posterior_mean(bins, unpack_voxels(bins.packed), slots[splatted], values)
     return Occupancy(
         voxel_size=splatting.voxel_size,
         origin=evidence.origin,
-        keys=unpack(packed),
+        keys=unpack_voxels(packed),
         probability=probability,
         free=free,
         hits=hits,

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from ..core.errors import ConfigError
 from ..core.transforms import back_project, invert, transform
 from ..core.types import BLOCK, Frame
+from ..core.voxel_keys import unpack_voxels
 from ..settings.registry import require_positive
-from .voxel_blocks import find_blocks_along_rays, unpack
+from .voxel_blocks import find_blocks_along_rays
 
 _NARROW = 64
 """Of the image's width: where no depth is measured within one such part of a pixel, the pixel is amid a wide patch, and
@@ -171,7 +172,7 @@ class DepthEvidence:
         camera = frame.intrinsics
         T_cam_world = invert(T_world_cam)
         _count(
-            unpack(packed),
+            unpack_voxels(packed),
             self._row[np.searchsorted(self.packed, packed)],
             (T_cam_world[:3, :3] * self.voxel_size).astype(np.float32),
             (T_cam_world[:3, :3] @ self.origin + T_cam_world[:3, 3]).astype(np.float32),

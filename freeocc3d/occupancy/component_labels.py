@@ -6,9 +6,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..core.hash_table import build_table, find_row
+from ..core.hash_table import build_table, find_row, packed_key
 from ..core.types import BLOCK
-from .voxel_blocks import pack, packed_key, unpack
+from ..core.union_find import find_root, join_sets
+from ..core.voxel_keys import pack_voxels, unpack_voxels
 
 _VOXELS = BLOCK**3
 SPARSEST = 16
@@ -18,21 +19,13 @@ SPARSEST = 16
 def label_lattice(voxels: NDArray[np.int32]) -> NDArray[np.int32] | None:
     """(V,) component number of each of (V, 3) distinct voxels, in the order in which the components come first; voxels
     that share a face, edge or corner are connected. None for voxels that lie too far apart for this way."""
-    packed = pack(voxels >> 3)
+    packed = pack_voxels(voxels >> 3)
     starts = np.flatnonzero(np.diff(packed, prepend=packed[:1] - 1))  # a map's voxels come block by block
     blocks = np.unique(packed[starts])
     if len(voxels) < SPARSEST * len(blocks):
         return None
     table, rows = build_table(blocks, len(blocks))
-    return np.asarray(_connected(voxels, packed, unpack(blocks), table, rows))
-
-
-@njit(cache=True)
-def _root(parent: NDArray[np.int32], voxel: int) -> int:
-    while parent[voxel] != voxel:
-        parent[voxel] = parent[parent[voxel]]
-        voxel = parent[voxel]
-    return voxel
+    return np.asarray(_connected(voxels, packed, unpack_voxels(blocks), table, rows))
 
 
 @njit(cache=True)
@@ -68,12 +61,11 @@ def _connected(
                             continue
                         there = at[side, ((x & 7) * BLOCK + (y & 7)) * BLOCK + (z & 7)]
                         if there >= 0:
-                            a, c = _root(parent, here), _root(parent, there)
-                            parent[max(a, c)] = min(a, c)
+                            join_sets(parent, here, there)
     number = np.empty(len(voxels), np.int32)
     count = 0
     for n in range(len(voxels)):  # a root is the first of its component
-        root = _root(parent, n)
+        root = find_root(parent, n)
         if root == n:
             number[n] = count
             count += 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.voxel_keys import AXIS_BITS, contains, packed_voxels
+from ..core.voxel_keys import AXIS_BITS, contains, pack_voxels
 from ..language import word_matching
 
 
@@ -42,11 +42,11 @@ def _touching_larger(
     voxels: NDArray[np.int32], rows: NDArray[np.int64], size: int, rows_larger: NDArray[np.int64], larger: int
 ) -> NDArray[np.int64]:
     """(2, P) pairs of rows of voxels of one size that touch voxels of a larger one."""
-    keys = packed_voxels(voxels[rows_larger] // larger)
+    keys = pack_voxels(voxels[rows_larger] // larger)
     order = np.argsort(keys)
     ascending, pairs = keys[order], [np.zeros((2, 0), np.int64)]
     for step in np.ndindex(3, 3, 3):
-        wanted = packed_voxels((voxels[rows] + (np.array(step) - 1) * size) // larger)
+        wanted = pack_voxels((voxels[rows] + (np.array(step) - 1) * size) // larger)
         found = contains(ascending, wanted)
         pairs.append(np.stack((rows[found], rows_larger[order[np.searchsorted(ascending, wanted[found])]])))
     return np.concatenate(pairs, axis=1)
@@ -59,7 +59,7 @@ def _touching(voxels: NDArray[np.int32]) -> NDArray[np.int64]:
     the four columns that hold half of the 26 neighbours but for the one above.
     """
     n = len(voxels)
-    keys = packed_voxels(voxels)
+    keys = pack_voxels(voxels)
     order = np.argsort(keys)
     ascending = np.append(keys[order], np.full(3, np.iinfo(np.int64).max))
     here = np.arange(n)

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import OCCUPIED, Frame, Gaussians, Occupancy
+from ..core.voxel_keys import pack_voxels, unpack_voxels
 from . import build, carve, splat
 from .levels import mask_known_blocks, select_blocks
-from .voxel_blocks import pack, unite_keys, unpack
+from .voxel_blocks import unite_keys
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,9 @@ class IncrementalOccupancy:
 
 def _merged(old: Occupancy | None, new: Occupancy) -> Occupancy:
     """The new blocks in place of the old ones of the same keys, those that say nothing left out, keys ascending."""
-    parts = [new] if old is None else [select_blocks(old, ~np.isin(pack(old.keys), pack(new.keys))), new]
+    parts = [new] if old is None else [select_blocks(old, ~np.isin(pack_voxels(old.keys), pack_voxels(new.keys))), new]
     parts = [select_blocks(part, mask_known_blocks(part)) for part in parts]
-    packed = np.concatenate([pack(part.keys) for part in parts])
+    packed = np.concatenate([pack_voxels(part.keys) for part in parts])
     order = np.argsort(packed)
     arrays = {
         name: np.concatenate([getattr(part, name) for part in parts])[order]
@@ -102,7 +103,7 @@ def _merged(old: Occupancy | None, new: Occupancy) -> Occupancy:
     first = np.cumsum(count) - count
     rows = np.repeat(first[order] - (np.cumsum(count[order]) - count[order]), count[order]) + np.arange(count.sum())
     return new.replace(
-        keys=unpack(packed[order]),
+        keys=unpack_voxels(packed[order]),
         features=np.concatenate([part.features for part in parts])[rows],
         colors=np.concatenate([part.colors for part in parts])[rows],
         **arrays,

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
+from ..core.voxel_keys import pack_voxels, unpack_voxels
 from .build import normalize_rows
-from .voxel_blocks import pack, unpack
 
 PER_BLOCK = "keys", "probability", "free", "hits", "state"
 """Arrays of an ``Occupancy`` with a row for each block."""
@@ -80,7 +80,7 @@ def make_uniform(occupancy: Occupancy, level: int = 0) -> Occupancy:
         arrays = {name: np.concatenate((array[~deep], blocks[name])) for name, array in arrays.items()}
         keys = np.concatenate((keys[~deep], parents))
         levels = np.concatenate((levels[~deep], np.full(len(parents), levels.max() - 1)))
-    order = np.argsort(pack(keys))
+    order = np.argsort(pack_voxels(keys))
     at = arrays.pop("rows")[order]
     at = at[arrays["state"][order] == OCCUPIED]
     return Occupancy(
@@ -110,7 +110,7 @@ def _joined(
 ) -> tuple[NDArray[np.int32], dict[str, NDArray[np.generic]], NDArray[np.float16], NDArray[np.uint8]]:
     """Blocks put together to those of the level before: their keys and arrays, and features and colours with rows
     added for the new voxels. Where a block's sibling is not there, nothing is known."""
-    parents, row = np.unique(pack(keys >> 1), return_inverse=True)
+    parents, row = np.unique(pack_voxels(keys >> 1), return_inverse=True)
     octant = (keys & 1) @ np.array((4, 2, 1))
     half = BLOCK // 2
 
@@ -148,4 +148,4 @@ def _joined(
         colors = np.concatenate((colors, np.rint(mean_color).astype(np.uint8)))
         features = np.concatenate((features, normalize_rows(mean_feature)))
     made |= {"state": placed(joined), "rows": placed(rows.reshape(joined.shape))}
-    return unpack(parents), made, features, colors
+    return unpack_voxels(parents), made, features, colors

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.transforms import invert, transform
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
-from ..core.voxel_keys import contains, packed_voxels, unpacked_voxels
+from ..core.voxel_keys import contains, pack_voxels, unpack_voxels
 
 _BLOCKS_AT_ONCE = 1024
 _LOCAL = np.stack(np.unravel_index(np.arange(BLOCK**3), (BLOCK,) * 3), axis=1)
@@ -26,7 +26,7 @@ def resample_occupancy(
     that no surface gets holes: thin things are found where they were, and never lost.
     """
     T_old_new = invert(T_new_old)
-    size, packed = occupancy.voxel_size, packed_voxels(occupancy.keys)
+    size, packed = occupancy.voxel_size, pack_voxels(occupancy.keys)
     order = np.argsort(packed)
     ascending = packed[order]
     rows_of = np.full(occupancy.state.shape, -1, np.int32)
@@ -41,7 +41,7 @@ def resample_occupancy(
     for start in range(0, len(keys), _BLOCKS_AT_ONCE):
         part = slice(start, start + _BLOCKS_AT_ONCE)
         voxel = np.floor(corners[part, None] / size + offsets).astype(np.int64).reshape(-1, 3)
-        block = packed_voxels(voxel >> 3)
+        block = pack_voxels(voxel >> 3)
         found = contains(ascending, block)
         at = order[np.searchsorted(ascending, block[found])]
         local = (voxel[found] & 7) @ np.array((64, 8, 1))
@@ -52,7 +52,7 @@ def resample_occupancy(
 
     centers = transform(T_new_old, occupancy.centers(occupancy.occupied_voxels()))
     voxel = np.floor((centers - origin) / size).astype(np.int64)
-    row = np.searchsorted(packed_voxels(keys), packed_voxels(voxel >> 3))
+    row = np.searchsorted(pack_voxels(keys), pack_voxels(voxel >> 3))
     local = (voxel & 7) @ np.array((64, 8, 1))
     missed = states[row, local] != OCCUPIED
     row, local = row[missed], local[missed]
@@ -86,7 +86,7 @@ def _covering(occupancy: Occupancy, T_new_old: NDArray[np.float64], origin: NDAr
     high = np.floor((center + reach) / edge).astype(np.int64)
     most = (high - low).max(axis=0, initial=0) + 1
     parts = [
-        packed_voxels((low + step)[(low + step <= high).all(axis=1)])
+        pack_voxels((low + step)[(low + step <= high).all(axis=1)])
         for step in itertools.product(*(range(int(n)) for n in most))
     ]
-    return unpacked_voxels(np.unique(np.concatenate(parts)))
+    return unpack_voxels(np.unique(np.concatenate(parts)))

@@ -41,12 +41,13 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from ..core.errors import ConfigError
-from ..core.hash_table import build_table, find_row
+from ..core.half_floats import widen_halves
+from ..core.hash_table import build_table, find_row, packed_key
 from ..core.threads import count_threads
 from ..core.types import BLOCK, Gaussians
 from ..settings.registry import require_positive
 from .gaussian_mass import integrate_boxes
-from .voxel_blocks import find_touched_blocks, packed_key, unite_keys
+from .voxel_blocks import find_touched_blocks, unite_keys
 
 _PROBABILISTIC, _POISSON, _INTEGRATED, _RELEASED = range(4)
 _MODES = {"probabilistic": _PROBABILISTIC, "poisson": _POISSON, "integrated": _INTEGRATED, "released": _RELEASED}
@@ -397,10 +398,7 @@ def _load(values: NDArray[np.generic], g: int, bits: NDArray[np.int32], row: NDA
 @overload(_load)
 def _load_of_kind(values, g, bits, row):  # type: ignore[no-untyped-def]
     def halves(values, g, bits, row):  # type: ignore[no-untyped-def]
-        for d in range(len(row)):  # exponents are smaller by 112 until they are scaled, which is exact
-            bits[d] = (np.int32(values[g, d] & 0x7FFF) << 13) | (np.int32(values[g, d] >> 15) << 31)
-        for d in range(len(row)):
-            row[d] *= np.float32(2.0**112)
+        widen_halves(values[g], bits, row)
 
     def floats(values, g, bits, row):  # type: ignore[no-untyped-def]
         for d in range(len(row)):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..core.errors import ConfigError, DependencyError
 from ..core.types import BLOCK
-from .voxel_blocks import KEY_LIMIT, pack
+from ..core.voxel_keys import pack_index, pack_voxels
 
 if TYPE_CHECKING:
     from .splat import Bins
@@ -77,7 +77,7 @@ def _pairs(
     bins: Bins, keys: NDArray[np.int32], device: torch.device, at_once: int = _PAIRS
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Gaussian, voxel (row of its block * 512 + local index) and squared distance of the pairs within the cutoff."""
-    packed = pack(keys)
+    packed = pack_voxels(keys)
     order = np.argsort(packed)
     sorted_keys = torch.from_numpy(packed[order]).to(device)
     block_row = torch.from_numpy(order).to(device)
@@ -102,8 +102,7 @@ def _pairs(
             + d[:, 1] * (f[:, 3] * d[:, 1] + 2 * f[:, 4] * d[:, 2])
             + f[:, 5] * d[:, 2] ** 2
         )
-        block = (voxel >> 3) + KEY_LIMIT
-        key = (block[:, 0] << 42) | (block[:, 1] << 21) | block[:, 2]
+        key = pack_index(*(voxel >> 3).unbind(1))
         at = torch.searchsorted(sorted_keys, key).clamp(max=max(len(sorted_keys) - 1, 0))
         kept = (squared <= float(bins.squared_cutoff)) & (sorted_keys[at] == key)
         inside = voxel[kept] & 7

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Occupancy
-from ..core.voxel_keys import contains, packed_voxels
+from ..core.voxel_keys import contains, pack_voxels
 
 
 def find_exposed_faces(
@@ -34,7 +34,7 @@ def build_faces(
     """
     edges = np.ones(len(voxels), np.int32) if edges is None else edges
     sizes = np.unique(edges)
-    ascending = {size: np.sort(packed_voxels(voxels[edges == size] // size)) for size in sizes}
+    ascending = {size: np.sort(pack_voxels(voxels[edges == size] // size)) for size in sizes}
     corners, rows = [], []
     for size in sizes:
         own = np.flatnonzero(edges == size)
@@ -44,7 +44,7 @@ def build_faces(
                 neighbour[:, axis] += size * (2 * side - 1)
                 hidden = np.zeros(len(own), bool)
                 for other in sizes[sizes >= size]:  # the neighbour, or a larger voxel that holds it
-                    hidden |= contains(ascending[other], packed_voxels(neighbour // other))
+                    hidden |= contains(ascending[other], pack_voxels(neighbour // other))
                 exposed = own[~hidden]
                 b, c = (axis + 1) % 3, (axis + 2) % 3
                 turn = [(0, 0), (1, 0), (1, 1), (0, 1)] if side else [(0, 0), (0, 1), (1, 1), (1, 0)]

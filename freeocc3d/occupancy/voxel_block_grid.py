@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError
 from ..core.types import BLOCK, OCCUPIED, Occupancy
-from .voxel_blocks import pack
+from ..core.voxel_keys import pack_voxels
 
 _PER_VOXEL = {"probability": np.float32, "free": np.uint16, "hits": np.uint16, "state": np.uint8}
 _OF_OCCUPIED = {"color": np.uint8, "feature": np.float32}
@@ -78,7 +78,7 @@ def from_voxel_block_grid(
         raise FreeOccError("The VoxelBlockGrid has no attributes 'probability' and 'state': it holds no occupancy.")
     edge = round(len(places) ** (1 / 3))
     keys = (keys[:, None] * edge + places[None]).reshape(-1, 3)
-    order = np.argsort(pack(keys))
+    order = np.argsort(pack_voxels(keys))
     per_voxel = {
         name: arrays[name][order, :, 0].astype(kind) if name in arrays else np.zeros((len(keys), BLOCK**3), kind)
         for name, kind in _PER_VOXEL.items()

@@ -8,17 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..core.hash_table import put_key
+from ..core.hash_table import packed_key, put_key
 from ..core.types import BLOCK
-from ..core.voxel_keys import packed_voxels, unpacked_voxels
-
-KEY_LIMIT = 1 << 20
-"""Block indices lie in [-KEY_LIMIT, KEY_LIMIT) along each axis. Single precision of positions ends far earlier: a
-kilometre from the origin it costs tenths of a millimetre."""
-
-
-pack, unpack = packed_voxels, unpacked_voxels
-"""(B, 3) block indices to (B,) integers and back."""
 
 
 def unite_keys(*packed: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -36,12 +27,6 @@ def find_blocks_along_rays(
     edge = BLOCK * voxel_size
     ends = (np.asarray(points_world, np.float64) - origin) / edge
     return np.sort(_walked((np.asarray(center_world, np.float64) - origin) / edge, ends))
-
-
-@njit(cache=True)
-def packed_key(i: int, j: int, k: int) -> int:
-    """``pack`` for one block index."""
-    return ((i + KEY_LIMIT) << 42) | ((j + KEY_LIMIT) << 21) | (k + KEY_LIMIT)
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import ConfigError, MapError
 from ..core.types import Occupancy
-from ..core.voxel_keys import packed_voxels
+from ..core.voxel_keys import pack_voxels
 from .regions import Region
 from .word_query import QueryResult
 
@@ -213,7 +213,7 @@ class _Space:
             lower = self.voxels[rows[self.edges[rows] == edge]]
             points.append((lower[:, None] + steps).reshape(-1, 3))
         every = np.concatenate(points)
-        return every[np.unique(packed_voxels(every), return_index=True)[1]]
+        return every[np.unique(pack_voxels(every), return_index=True)[1]]
 
 
 class _References:

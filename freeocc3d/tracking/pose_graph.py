@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.sparse import coo_array, coo_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from ..core.transforms import invert, measure_pose_difference, nearest_rigid
 
@@ -59,14 +59,12 @@ def drop_unsupported_closures(
 def find_connected_components(submap: Sequence[int], edges: Sequence[Edge]) -> list[list[int]]:
     """Rows of the keyframes that hang together, the largest piece first: those of one submap, and of submaps that an
     edge ties."""
-    root = {name: name for name in submap}
-    for edge in edges:
-        old, new = root[submap[edge.source]], root[submap[edge.target]]
-        root = {name: new if value == old else value for name, value in root.items()}
-    rows: dict[int, list[int]] = {}
-    for k, name in enumerate(submap):
-        rows.setdefault(root[name], []).append(k)
-    return sorted(rows.values(), key=lambda piece: (-len(piece), piece[0]))
+    names, own = np.unique(np.asarray(submap, np.int64), return_inverse=True)
+    ends = own[np.array([(edge.source, edge.target) for edge in edges], np.int64).reshape(-1, 2)].T
+    graph = coo_array((np.ones(ends.shape[1], bool), tuple(ends)), shape=(len(names), len(names)))
+    piece = connected_components(graph, directed=False)[1][own]
+    rows = [np.flatnonzero(piece == number).tolist() for number in np.unique(piece)]
+    return sorted(rows, key=lambda rows: (-len(rows), rows[0]))
 
 
 def optimize_component(

@@ -10,6 +10,7 @@ from test_main import refused, run
 
 from freeocc3d import load_map
 from freeocc3d.capture.builtin_room import CUP_HEIGHT, CUPS
+from freeocc3d.core import voxel_keys
 from freeocc3d.core.errors import ConfigError, MapError
 from freeocc3d.core.types import FREE, OCCUPIED, Gaussians
 from freeocc3d.editing import adaptive_voxels
@@ -58,11 +59,11 @@ def flat(n: int, z: float = 0.0, depth: float = 1.0) -> Gaussians:
 def detailed(gaussians: Gaussians, features: np.ndarray) -> list[tuple[int, ...]]:
     """Keys of the blocks of 8 cm voxels that would be cut."""
     changing = adaptive_voxels._changing(gaussians.means, features)
-    everywhere = adaptive_voxels.pack(
+    everywhere = voxel_keys.pack_voxels(
         np.array([(i, j, k) for i in range(-1, 3) for j in range(-1, 3) for k in range(-1, 2)])
     )
     found = adaptive_voxels._detailed(np.sort(everywhere), gaussians, changing, np.zeros(3), 0.08)
-    return [tuple(key) for key in adaptive_voxels.unpack(found).tolist()]
+    return [tuple(key) for key in voxel_keys.unpack_voxels(found).tolist()]
 
 
 def test_a_wall_of_one_kind_is_left_alone_wherever_it_leans() -> None:
@@ -124,7 +125,9 @@ def test_down_to_the_finest_only_along_the_line_where_the_meaning_changes() -> N
 
 
 def test_points_near_blocks() -> None:
-    region = adaptive_voxels.Blocks(adaptive_voxels.pack(np.array([(0, 0, 0), (-1, 2, 0)])), np.array((1.0, 0, 0)), 0.5)
+    region = adaptive_voxels.Blocks(
+        voxel_keys.pack_voxels(np.array([(0, 0, 0), (-1, 2, 0)])), np.array((1.0, 0, 0)), 0.5
+    )
     points = np.array([(1.1, 0.1, 0.1), (0.9, 1.2, 0.3), (1.55, 0.2, 0.2), (1.7, 0.2, 0.2), (0.8, 0.2, 0.2)])
     np.testing.assert_array_equal(region.contains(points, 0.0), [True, True, False, False, False])
     np.testing.assert_array_equal(region.contains(points, 0.1), [True, True, True, False, False])

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scenes import CAMERA, wall_frame
 
+from freeocc3d.core import voxel_keys
 from freeocc3d.core.transforms import project
 from freeocc3d.core.types import Frame
-from freeocc3d.occupancy import carve, voxel_blocks
+from freeocc3d.occupancy import carve
 
 V = 0.08
 ORIGIN = np.array([-2.0, -2.0, 0.0])
@@ -22,7 +23,7 @@ def evidence_of(frame: Frame, T=None, options: carve.Options = OPTIONS):
     packed = evidence.add(frame, T)
     np.testing.assert_array_equal(packed, evidence.packed)
     local = np.stack((np.arange(512) // 64, np.arange(512) // 8 % 8, np.arange(512) % 8), axis=1)
-    centers = ORIGIN + ((voxel_blocks.unpack(packed)[:, None] * 8 + local) + 0.5) * V
+    centers = ORIGIN + ((voxel_keys.unpack_voxels(packed)[:, None] * 8 + local) + 0.5) * V
     return evidence.free, evidence.hits, centers
 
 
@@ -118,7 +119,7 @@ def test_no_block_is_missed_however_small_blocks_are(sigma: float | None) -> Non
     if sigma is not None:
         frame = replace(frame, depth_sigma_m=np.full_like(frame.depth_m, sigma))
         behind = carve.DepthEvidence(ORIGIN, 0.02, OPTIONS).visible_blocks(frame, np.eye(4))
-        assert voxel_blocks.unpack(behind)[:, 2].max() == int((4.0 + 3 * sigma) / 0.16)
+        assert voxel_keys.unpack_voxels(behind)[:, 2].max() == int((4.0 + 3 * sigma) / 0.16)
     for voxel_size in (0.08, 0.02):
         found = set(carve.DepthEvidence(ORIGIN, voxel_size, OPTIONS).visible_blocks(frame, np.eye(4)).tolist())
         edge = 8 * voxel_size
@@ -126,7 +127,7 @@ def test_no_block_is_missed_however_small_blocks_are(sigma: float | None) -> Non
         middles = (keys + 0.5) * edge
         pixels, _ = project(middles, CAMERA)
         inside = (pixels > 0).all(axis=1) & (pixels < (CAMERA.width - 1, CAMERA.height - 1)).all(axis=1)
-        wanted = voxel_blocks.pack(np.floor((middles[inside] - ORIGIN) / edge).astype(int))
+        wanted = voxel_keys.pack_voxels(np.floor((middles[inside] - ORIGIN) / edge).astype(int))
         assert len(wanted) > 50
         assert set(wanted.tolist()) <= found
 
@@ -175,9 +176,9 @@ def test_visible_blocks_hold_every_voxel_that_an_image_says_something_about() ->
     for frame, T in looks(4):
         few = carve.DepthEvidence(ORIGIN, V, OPTIONS)
         packed = few.add(frame, T)
-        around = (voxel_blocks.unpack(packed)[:, None] + np.indices((3, 3, 3)).reshape(3, -1).T - 1).reshape(-1, 3)
+        around = (voxel_keys.unpack_voxels(packed)[:, None] + np.indices((3, 3, 3)).reshape(3, -1).T - 1).reshape(-1, 3)
         wide = carve.DepthEvidence(ORIGIN, V, OPTIONS)
-        wide._make_room(np.unique(voxel_blocks.pack(around)))
+        wide._make_room(np.unique(voxel_keys.pack_voxels(around)))
         wide._count(wide.packed, frame, T, 1)
         for narrow, broad in ((few.free, wide.free), (few.hits, wide.hits)):
             assert narrow.sum() >= 0.985 * broad.sum()  # the rest lies in blocks that the image's border grazes
@@ -194,7 +195,7 @@ def test_log_odds_are_the_sensor_models_and_noise_widens_it() -> None:
         evidence = carve.DepthEvidence(np.zeros(3), 0.08, options)
         evidence.add(wall_frame(depth), np.eye(4))
         hit = np.argwhere(evidence.hits > 0)
-        layers = voxel_blocks.unpack(evidence.packed)[hit[:, 0], 2] * 8 + hit[:, 1] % 8
+        layers = voxel_keys.unpack_voxels(evidence.packed)[hit[:, 0], 2] * 8 + hit[:, 1] % 8
         thickness.append(len(np.unique(layers)))
     assert thickness[0] == 1
     assert thickness[1] >= 3  # half a voxel either side, plus sigma: 2 mm at 1 m, 7 cm at 6 m, and as much noise

@@ -5,10 +5,10 @@ import pytest
 from scenes import lifted, posed, random_gaussians, wall_frame
 
 from freeocc3d.core.types import Gaussians, Occupancy
+from freeocc3d.core.voxel_keys import pack_voxels
 from freeocc3d.gaussians import anchors
 from freeocc3d.occupancy import build, carve, splat
 from freeocc3d.occupancy.incremental import IncrementalOccupancy
-from freeocc3d.occupancy.voxel_blocks import pack
 
 ORIGIN = np.array([0.3, -0.2, 0.05])
 
@@ -85,7 +85,7 @@ def test_only_the_blocks_that_a_keyframe_touches_are_made_again(monkeypatch: pyt
     scene.add(5)
     after = scene.map.update()
     assert len(made[0]) < 0.7 * len(everything.keys)
-    before, now = (dict(zip(pack(o.keys).tolist(), o.probability, strict=True)) for o in (everything, after))
+    before, now = (dict(zip(pack_voxels(o.keys).tolist(), o.probability, strict=True)) for o in (everything, after))
     for key in before.keys() - set(made[0].tolist()):
         np.testing.assert_array_equal(before[key], now[key])
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scenes import gaussians, random_gaussians
 
+from freeocc3d.core import voxel_keys
 from freeocc3d.core.errors import ConfigError, DependencyError
 from freeocc3d.core.transforms import quats_to_rotations
 from freeocc3d.core.types import Gaussians
-from freeocc3d.occupancy import splat, splat_reference, splat_torch, voxel_blocks
+from freeocc3d.occupancy import splat, splat_reference, splat_torch
 from freeocc3d.occupancy.gaussian_mass import integrate_boxes
 
 V = 0.08
@@ -21,7 +22,7 @@ def project(g: Gaussians, origin=(0.0, 0.0, 0.0), least=0.0, **options):
     """Bins, block keys, probabilities (B, 512) and voxel centres (B * 512, 3)."""
     origin = np.asarray(origin, float)
     bins = splat.bin_gaussians(g, origin, splat.Options(voxel_size=V, **options), least_scale=least)
-    keys = voxel_blocks.unpack(bins.packed)
+    keys = voxel_keys.unpack_voxels(bins.packed)
     centers = origin + ((keys[:, None] * 8 + LOCAL).reshape(-1, 3) + 0.5) * V
     return bins, keys, splat.compute_probability(bins, keys), centers
 

@@ -10,9 +10,9 @@ from scenes import lifted, posed, wall_frame
 
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.types import OCCUPIED, Occupancy
+from freeocc3d.core.voxel_keys import pack_voxels
 from freeocc3d.occupancy import build, carve, splat
 from freeocc3d.occupancy.voxel_block_grid import from_voxel_block_grid, to_voxel_block_grid
-from freeocc3d.occupancy.voxel_blocks import pack
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_blocks_of_sixteen_are_cut() -> None:
     grid.attribute("state")[rows.to(o3c.int64)] = o3c.Tensor(state)
     occupancy = from_voxel_block_grid(grid, 0.05)
     assert len(occupancy.keys) == 8
-    assert (np.diff(pack(occupancy.keys)) > 0).all()
+    assert (np.diff(pack_voxels(occupancy.keys)) > 0).all()
     np.testing.assert_array_equal(occupancy.occupied_voxels(), [[-16 + 14, 9, 32 + 3]])
 
 
