@@ -22,7 +22,6 @@ from ..core import tum_files
 from ..core.errors import CaptureError
 from ..core.transforms import invert, is_rigid
 from .base import Capture
-from .colmap_models import colmap_folder, read_colmap_model
 
 SAME_TIME_S = 0.02
 """Poses whose timestamps differ by no more belong together: the tolerance of the TUM RGB-D benchmark."""
@@ -120,6 +119,8 @@ def _checked(found: PoseFile) -> PoseFile:
 
 
 def _read_folder(folder: Path) -> PoseFile:
+    from .colmap_models import colmap_folder
+
     if files := sorted(folder.glob("*.pose.txt")):
         T = np.stack([np.loadtxt(file).reshape(4, 4) for file in files])
         return _checked(PoseFile(folder, T, names=tuple(file.name for file in files)))
@@ -165,6 +166,8 @@ def _read_nerfstudio(path: Path) -> PoseFile:
 
 
 def _read_colmap(folder: Path) -> PoseFile:
+    from .colmap_models import read_colmap_model
+
     model = read_colmap_model(folder)
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     if not images:
