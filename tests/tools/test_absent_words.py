@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from itertools import pairwise
 from pathlib import Path
 
+import pytest
+from benchmark import absent_words, report
+from benchmark.processes import PartFailed
+from benchmark_runs import run_benchmark
 from helpers import data_folder, models_folder
-
-TOOLS = Path(__file__).parents[2] / "tools"
-sys.path.insert(0, str(TOOLS))
-
-
-import absent_words  # noqa: E402
-import benchmark  # noqa: E402
 
 
 def test_names_of_what_is_there_in_any_words_are_not_absent() -> None:
@@ -42,30 +37,21 @@ def test_a_scene_holds_what_its_truth_holds() -> None:
 def test_a_map_of_class_images_is_not_asked_in_vain() -> None:
     models_folder()
     bedroom = data_folder() / "house" / "bedroom"
-    done = subprocess.run(
-        [sys.executable, str(TOOLS / "absent_words.py"), str(bedroom), "--json"],
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert done.returncode == 0, done.stderr
-    (row,) = json.loads(done.stdout.splitlines()[-1])
+    (row,) = json.loads(run_benchmark("--captures", bedroom, "--variants", "absent_words", "--json"))["measurements"][
+        "absent_words"
+    ]
     assert row["absent"] == 200
     assert row["all_absent"] > 1000
     assert row["absent_answered"] <= 0.05
     assert row["present_found"] > 0.9
-    table = benchmark.markdown(
-        {"rows": [], "kernels": {}, "each": {"absent_words": [row, {"capture": "x", "error": "no names"}]}}
+    table = report.write_markdown(
+        {"rows": [], "measurements": {"absent_words": [row, {"capture": "x", "error": "no names"}]}}
     )
-    assert "| bedroom, `labels`: 200 absent names that return a region | 0.0% | ≤ 5 % |" in table
+    assert "| house/bedroom, `labels`: 200 absent names that return a region | 0.0% | ≤ 5 % |" in table
     assert "not available, no names" in table
 
 
 def test_a_capture_of_which_nothing_is_known_is_told(tmp_path: Path) -> None:
     models_folder()
-    done = subprocess.run(
-        [sys.executable, str(TOOLS / "absent_words.py"), str(tmp_path)], capture_output=True, text=True, timeout=600
-    )
-    assert done.returncode == 1
-    assert "name it in SEEN" in done.stderr
-    assert "Traceback" not in done.stderr
+    with pytest.raises(PartFailed, match="name it in SEEN"):
+        absent_words.measure_absent_words(str(tmp_path))

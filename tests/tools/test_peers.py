@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmark import peers
 from numpy.typing import NDArray
 from scenes import CAMERA, wall_frame
 
@@ -17,9 +17,6 @@ from freeocc3d.capture.base import Capture
 from freeocc3d.core.errors import DependencyError, FrameError
 from freeocc3d.core.transforms import invert
 from freeocc3d.core.types import Frame
-
-sys.path.append(str(Path(__file__).parents[2] / "tools"))
-peers = importlib.import_module("peers")
 
 PEERS = [peers.tsdf_occupied, peers.back_projected_occupied, peers.octomap_occupied]
 DISTANCE_M = 2.0

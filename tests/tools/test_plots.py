@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from benchmark import plots
 
 pytest.importorskip("matplotlib")
-sys.path.append(str(Path(__file__).parents[2] / "tools"))
-plots = importlib.import_module("plots")
+
 
 ROWS = [
     {"capture": "kitchen", "variant": "ours", "iou": 0.651, "ms_per_frame": {"track": 12.0, "carve": 9.0}},

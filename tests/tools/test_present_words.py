@@ -3,30 +3,16 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
+from benchmark import present_words, report
+from benchmark_runs import run_benchmark
 from helpers import data_folder
-
-TOOLS = Path(__file__).parents[2] / "tools"
-sys.path.insert(0, str(TOOLS))
-
-
-import benchmark  # noqa: E402
-import present_words  # noqa: E402
 
 
 def test_classes_of_a_real_room_are_found_by_their_names() -> None:
     bedroom = data_folder() / "house" / "bedroom"
-    done = subprocess.run(
-        [sys.executable, str(TOOLS / "present_words.py"), str(bedroom), "--json"],
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert done.returncode == 0, done.stderr
-    (row,) = json.loads(done.stdout.splitlines()[-1])
+    printed = run_benchmark("--captures", bedroom, "--variants", "present_words", "--json")
+    (row,) = json.loads(printed)["measurements"]["present_words"]
     found = row["classes"]
     assert {"bed", "wall", "floor", "trash can"} <= set(found)
     assert sum(own["iou"] >= present_words.ENOUGH for own in found.values()) >= 0.8 * len(found)
@@ -36,8 +22,8 @@ def test_classes_of_a_real_room_are_found_by_their_names() -> None:
     assert set(row["cold_seconds"]) == {"text", "--json", "--json --views"}
     assert 0 < row["loaded_seconds"] <= row["loaded_most_seconds"]
     rows = [row, {"capture": "x", "error": "lost"}]
-    table = benchmark.markdown({"rows": [], "kernels": {}, "each": {"present_words": rows}})
-    assert "| bedroom, `labels`: bathtub and bicycle that return a region | 0 | 0 |" in table
+    table = report.write_markdown({"rows": [], "measurements": {"present_words": rows}})
+    assert "| house/bedroom, `labels`: bathtub and bicycle that return a region | 0 | 0 |" in table
     assert "not available, lost" in table
 
 
@@ -51,7 +37,7 @@ def test_rows_name_what_falls_short() -> None:
         "cold_seconds": {"text": 0.5}, "loaded_seconds": 0.01, "loaded_most_seconds": 0.02,
         "loaded_processor_seconds": 0.005,
     }  # fmt: skip
-    lines = present_words.present_lines([row])
+    lines = present_words.present_words_lines([row])
     assert lines[0][1] == "1 of 2, 50%; fan: IoU 0.30, of whose voxels 40% are occupied"
     assert lines[1] == ("room, `labels`: bathtub that return a region", "1", "0")
     assert lines[2][1] == "10.0, 20.0 ms (5.0 ms of the processor)"

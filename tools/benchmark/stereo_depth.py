@@ -22,7 +22,7 @@ from freeocc3d.depth.sparse_points import triangulate
 from freeocc3d.tracking.rgbd import focal_calibration
 from freeocc3d.tracking.trackers import known
 
-Figures = dict[str, Any]
+from .figures import Figures
 
 ASKED = "<= 1.5 % (rendered), <= 3 % (kitchen), >= 40 % kept"
 _CLOSE = 0.01  # metres from frame to frame: below it every fifth frame is used, above it every third
@@ -95,7 +95,7 @@ def _spacing(capture: Capture) -> float:
     return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
 
 
-def stereo_lines(rows: list[Figures]) -> list[str]:
+def tabulate_stereo(rows: list[Figures]) -> list[str]:
     """Table of ``measure_stereo`` of several captures, each with its name as "capture"."""
     if not rows:
         return []

@@ -9,18 +9,18 @@ from __future__ import annotations
 import os
 import statistics
 import tempfile
-import time
 from pathlib import Path
 from typing import Any, get_args
 
-Figures = dict[str, Any]
-Line = tuple[str, str, str]
+from .figures import Figures, Line
+from .timing import time_fastest
 
 SHAPE = {"hidden_size": 384, "num_hidden_layers": 6, "num_attention_heads": 6, "intermediate_size": 1536}
 """Of the image and the text tower: a third of ViT-B/16's weights in half of its layers."""
 DIMENSION, PATCH = 512, 16
 FRAME = 480, 640
 WORDS = ("chair", "table", "red sofa", "a plant on the window sill")
+RUNS = 7
 _EDGE_PIXELS, _STRIDE = 16, 4
 
 
@@ -55,9 +55,9 @@ def measure_encoders() -> Figures:
                 {
                     "precision": precision,
                     "bytes": package.bytes,
-                    "frame_seconds": _fastest(lambda e=encoder: e.patches(rgb)),
-                    "upsampled_frame_seconds": _fastest(lambda e=encoder: e.encode(frame)),
-                    "text_seconds": _fastest(lambda t=text: t.embed(list(WORDS))) / len(WORDS),
+                    "frame_seconds": time_fastest(lambda e=encoder: e.patches(rgb), RUNS),
+                    "upsampled_frame_seconds": time_fastest(lambda e=encoder: e.encode(frame), RUNS),
+                    "text_seconds": time_fastest(lambda t=text: t.embed(list(WORDS)), RUNS) / len(WORDS),
                     "patch_cosine": float((patches * exact[0]).sum(axis=-1).min()),
                     "text_cosine": float((words * exact[1]).sum(axis=-1).min()),
                 }
@@ -118,15 +118,6 @@ def measure_edges() -> Figures:
         for way, features in found.items():
             right[way].append(float(((features @ names.T).argmax(axis=-1) == true)[near].mean()))
     return {way: statistics.mean(shares) for way, shares in right.items()}
-
-
-def _fastest(work: Any, repeats: int = 7) -> float:
-    times = []
-    for _ in range(repeats):
-        mark = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - mark)
-    return min(times)
 
 
 def encoders_lines(figures: Figures) -> list[Line]:

@@ -1,20 +1,14 @@
 """The altered captures of the benchmark are what their names say, and what is measured on them is told."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from benchmark import tracking_stress
 from helpers import data_folder
 from scenes import wall_frame
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-import stress
-
 
 def test_sequences_are_what_their_names_say() -> None:
-    sequences = stress.sequences(120)
+    sequences = tracking_stress.sequences(120)
     assert list(sequences["full"].frames) == list(range(120))
     assert list(sequences["every 3rd frame"].frames) == list(range(0, 120, 3))
     assert list(sequences["reversed"].frames) == list(range(119, -1, -1))
@@ -25,7 +19,7 @@ def test_sequences_are_what_their_names_say() -> None:
 
 
 def test_changes_touch_what_they_should() -> None:
-    sequences, frame = stress.sequences(120), wall_frame(2.0)
+    sequences, frame = tracking_stress.sequences(120), wall_frame(2.0)
     black = sequences["20 black frames"].change(70, frame)
     assert not black.color.any()
     np.testing.assert_array_equal(black.depth_m, frame.depth_m)
@@ -47,12 +41,12 @@ def test_changes_touch_what_they_should() -> None:
 
 def test_a_sequence_of_a_real_scan_is_measured() -> None:
     capture = str(data_folder() / "house" / "bedroom")
-    figures = stress.stress(capture, "every 3rd frame")
+    figures = tracking_stress.measure_sequence(capture, "every 3rd frame")
     assert figures["ate_rmse_m"] < 0.01
     assert (figures["frames"], figures["with_pose"]) == (87, 87)
     assert figures["submaps"] == [[0, 86, 87]]
-    header, line = stress.stress_table([{"capture": "a", "sequence": "every 3rd frame", **figures}])
-    assert len(header) == len(line)
+    _, header, _, line = tracking_stress.tabulate_stress([{"capture": "a", "sequence": "every 3rd frame", **figures}])
+    assert header.count("|") == line.count("|")
     assert "87 of 87" in line
 
 
@@ -62,6 +56,15 @@ def test_what_could_not_be_measured_is_no_figure() -> None:
         {"capture": "a", "sequence": "reversed", "ate_rmse_m": 0.01, "frames": 3, "with_pose": 2,
          "status": {"lost": 1, "tracked": 2}, "submaps": [[0, 2, 3]]},
     ]  # fmt: skip
-    _, broken, fine = stress.stress_table(rows)
+    *_, broken, fine = tracking_stress.tabulate_stress(rows)
     assert "not available, it broke" in broken
-    assert fine[2:6] == ("1.00", "–", "2 of 3", "1")
+    assert fine.split(" | ")[2:6] == ["1.00", "–", "2 of 3", "1"]
+
+
+def test_lengths_that_could_not_be_measured_are_no_figures() -> None:
+    one = {"frames": 250, "seconds": 5.0, "keyframes": 9, "bytes_per_keyframe": 2e5}
+    *_, fine, broken = tracking_stress.tabulate_lengths(
+        [{"capture": "a", **one}, {"capture": "b", "error": "no depth"}]
+    )
+    assert fine == "| a | 250 | 5.0 | 20.0 | 9 | 200 |"
+    assert broken.startswith("| b | not available, no depth |")

@@ -14,13 +14,15 @@ from freeocc3d.capture import open_capture, select_frames
 from freeocc3d.capture.base import Capture, Options
 from freeocc3d.capture.focal_correction import Reregistered
 from freeocc3d.capture.read_ahead import read_ahead
+from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.types import Frame, Trajectory
 from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors
 from freeocc3d.tracking.rgbd import focal_calibration
 from freeocc3d.tracking.trackers import rgbd
 from freeocc3d.tracking.trajectory_alignment import Poses, align_trajectories
 
-Figures = dict[str, Any]
+from .figures import Figures, tabulate
+
 Change = Callable[[int, Frame], Frame]
 
 LENGTHS = (250, 500, 1000)
@@ -102,7 +104,7 @@ def tracked(captures: Iterable[tuple[Capture, Shown]]) -> tuple[rgbd.RgbdTracker
     return tracker, tracker.trajectory(np.arange(position, dtype=np.float64)), seconds
 
 
-def stress(capture: str, name: str) -> Figures:
+def measure_sequence(capture: str, name: str) -> Figures:
     """One sequence of a capture: ATE against its poses, and what became of its frames."""
     scan = opened(capture)
     sequence = sequences(len(scan))[name]
@@ -129,13 +131,25 @@ def stress(capture: str, name: str) -> Figures:
     return figures
 
 
-def glued(captures: list[str]) -> Figures:
+def measure_stress(capture: str) -> Figures:
+    """Every sequence of a capture, as "cases"."""
+    cases = []
+    for name in sequences(0):
+        try:
+            cases.append({"sequence": name, **measure_sequence(capture, name)})
+        except FreeOccError as error:
+            cases.append({"sequence": name, "error": str(error)})
+    return {"cases": cases}
+
+
+def measure_glued(captures: list[str]) -> Figures:
     """Two captures of different places as if they were one: which frames the submaps hold."""
     scans = [opened(capture) for capture in captures]
     tracker, trajectory, seconds = tracked([(scan, Shown(range(len(scan)))) for scan in scans])
     expected = [list(range(len(scans[0]))), list(range(len(scans[0]), sum(map(len, scans))))]
     found = [submap.frames.tolist() for submap in tracker.submaps()]
     return {
+        "sequence": "glued",
         "frames": len(trajectory),
         "seconds": seconds,
         "apart_as_they_are": sorted(found) == expected,
@@ -143,7 +157,7 @@ def glued(captures: list[str]) -> Figures:
     }
 
 
-def lengths(capture: str) -> Figures:
+def measure_lengths(capture: str) -> Figures:
     """Seconds of layer 1 on the first 250, 500, 1000 frames, and what it keeps of a keyframe."""
     rows = []
     for count in LENGTHS:
@@ -160,7 +174,7 @@ def lengths(capture: str) -> Figures:
         rows.append(
             {"frames": count, "seconds": calibrated + seconds, "keyframes": len(views), "bytes_per_keyframe": size}
         )
-    return {"rows": rows}
+    return {"cases": rows}
 
 
 def _bytes(value: Any) -> int:
@@ -185,13 +199,15 @@ def _pieces(tracker: rgbd.RgbdTracker, trajectory: Trajectory) -> Figures:
     }
 
 
-def stress_table(rows: list[Figures]) -> list[tuple[str, ...]]:
-    """A header and a line for each altered sequence."""
-    full = {row["capture"]: row["ate_rmse_m"] for row in rows if row["sequence"] == "full" and "ate_rmse_m" in row}
-    lines: list[tuple[str, ...]] = [("capture", "sequence", "ATE cm", "x full", "with a pose", "lost", "submaps")]
+def tabulate_stress(rows: list[Figures]) -> list[str]:
+    """A line for each altered sequence."""
+    full = {row["capture"]: row["ate_rmse_m"] for row in rows if row.get("sequence") == "full" and "ate_rmse_m" in row}
+    lines: list[tuple[str, ...]] = []
     for row in rows:
         if "error" in row:
-            lines.append((row["capture"], row["sequence"], f"not available, {row['error']}", "–", "–", "–", "–"))
+            lines.append(
+                (row["capture"], row.get("sequence", "–"), f"not available, {row['error']}", "–", "–", "–", "–")
+            )
             continue
         ate, base = row.get("ate_rmse_m"), full.get(row["capture"])
         lost = row["status"].get("lost", 0)
@@ -209,14 +225,15 @@ def stress_table(rows: list[Figures]) -> list[tuple[str, ...]]:
                 f"{len(row['submaps'])}: {submaps}",
             )
         )
-    return lines
+    return tabulate(("capture", "sequence", "ATE cm", "x full", "with a pose", "lost", "submaps"), lines)
 
 
-def length_table(rows: list[Figures]) -> list[tuple[str, ...]]:
-    """A header and a line for each length."""
-    lines: list[tuple[str, ...]] = [("capture", "frames", "layer 1, s", "ms/frame", "keyframes", "kB a keyframe")]
-    return lines + [
-        (
+def tabulate_lengths(rows: list[Figures]) -> list[str]:
+    """A line for each length."""
+    lines = [
+        (row["capture"], f"not available, {row['error']}", "–", "–", "–", "–")
+        if "error" in row
+        else (
             row["capture"],
             str(row["frames"]),
             f"{row['seconds']:.1f}",
@@ -226,6 +243,7 @@ def length_table(rows: list[Figures]) -> list[tuple[str, ...]]:
         )
         for row in rows
     ]
+    return tabulate(("capture", "frames", "layer 1, s", "ms/frame", "keyframes", "kB a keyframe"), lines)
 
 
 def warm_up(capture: str) -> Figures:

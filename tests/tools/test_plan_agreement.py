@@ -1,25 +1,16 @@
 """What the benchmark says of plans for robots, and of exporters, on cases that are known."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-TOOLS = Path(__file__).parents[2] / "tools"
-sys.path.insert(0, str(TOOLS))
-
-import benchmark  # noqa: E402
-import exporters  # noqa: E402
-import plans  # noqa: E402
-from plans import FREE, OCCUPIED, UNKNOWN  # noqa: E402
+from benchmark import exports, plan_agreement, report
+from benchmark.plan_agreement import FREE, OCCUPIED, UNKNOWN
 
 
 def test_who_knows_a_cell_decides_over_what_agreement_is() -> None:
     true = np.array([[FREE] * 5 + [OCCUPIED] * 2 + [UNKNOWN]], np.uint8)
     ours = np.array([[FREE, FREE, OCCUPIED, FREE, UNKNOWN, OCCUPIED, FREE, FREE]], np.uint8)
     told = np.array([[FREE] * 4 + [UNKNOWN, OCCUPIED, UNKNOWN, UNKNOWN]], np.uint8)
-    found = plans.agreement(ours, true, told)
+    found = plan_agreement.agreement(ours, true, told)
     assert found["cells_known_to_truth"] == 7
     assert found["known_to_both"] == pytest.approx(6 / 7)
     assert found["measured"] == pytest.approx(5 / 7)
@@ -36,22 +27,20 @@ def test_exports_of_a_map_are_measured_in_processes_of_their_own(tmp_path, monke
 
     few = {"capture": {"stride": 40}, "tracking": {"backend": "known"}, "fitting": {"passes": 0}}
     reconstruct("builtin:room", tmp_path / "room", few)
-    chosen = {name: exporters.EXPORTS[name] for name in (exporters.BT, "nav2, with costs of three words")}
-    monkeypatch.setattr(exporters, "EXPORTS", chosen)
-    figures = exporters.measure_map(str(tmp_path / "room"))
+    chosen = {name: exports.EXPORTS[name] for name in (exports.BT, "nav2, with costs of three words")}
+    monkeypatch.setattr(exports, "EXPORTS", chosen)
+    figures = exports.measure_map_exports(str(tmp_path / "room"))
     for row in figures["exports"].values():
         assert row["seconds"] > 0
         assert row["bytes"] > 500
         assert row["peak_memory_bytes"] > 5e7
     if figures["octomap"]:
         assert figures["octomap"]["same"]
-    lines = benchmark.markdown({"rows": [], "kernels": {}, "each": {"exports": [{"capture": "room", **figures}]}})
+    lines = report.write_markdown({"rows": [], "measurements": {"exports": [{"capture": "room", **figures}]}})
     assert "|   octomap .bt | " in lines
     assert "| 10 s, 2 GB |" in lines
 
 
 def test_exports_that_were_not_measured_are_told() -> None:
-    lines = benchmark.markdown(
-        {"rows": [], "kernels": {}, "each": {"exports": [{"capture": "a", "error": "no poses"}]}}
-    )
+    lines = report.write_markdown({"rows": [], "measurements": {"exports": [{"capture": "a", "error": "no poses"}]}})
     assert lines.splitlines()[-1] == "exports of a: not available, no poses"

@@ -8,7 +8,7 @@ from typing import Any
 EVERY = 10
 
 
-def held_out(loaded: Any) -> dict[str, Any]:
+def measure_held_out(loaded: Any) -> dict[str, Any]:
     """PSNR and depth error on every tenth frame that has a pose and is no keyframe, at the map's own poses."""
     from freeocc3d.capture.focal_correction import Reregistered
     from freeocc3d.evaluation.scoring import reopen_capture

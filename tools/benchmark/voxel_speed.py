@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import statistics
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
-from kernels import surface_gaussians
-
-Figures = dict[str, Any]
-Line = tuple[str, str, str]
+from .figures import Figures, Line
+from .folders import MODELS
+from .machine_speed import copy_bytes_per_second
+from .surface_gaussians import surface_gaussians
 
 FEATURES, GAUSSIANS = 512, 200_000
 VOXELS, WORDS = 1_000_000, 20
-MODELS = (
-    Path(os.environ.get("FREEOCC3D_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data").parent / "models"
-)
 
 
 def measure_voxels() -> Figures:
@@ -37,7 +33,6 @@ def _features() -> Figures:
     """Gaussians a second with 512-dimensional features, from binning to normalised voxels; the floor is the reading of
     each feature from memory once."""
     import numpy as np
-    from kernels import copy_bytes_per_second
 
     from freeocc3d.occupancy import build, carve, splat
 

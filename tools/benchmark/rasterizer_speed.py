@@ -7,8 +7,7 @@ import statistics
 import time
 from typing import Any
 
-Figures = dict[str, Any]
-Line = tuple[str, str, str]
+from .figures import Figures, Line
 
 GAUSSIANS, WIDTH, HEIGHT = 300_000, 320, 240
 _LAYERS = 3

@@ -1,4 +1,4 @@
-"""Figures of poses from colour alone, beside those of pycolmap's own pipeline at its defaults on the same images."""
+"""Figures of poses from color alone, and those of pycolmap's own pipeline at its defaults on the same images."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-Figures = dict[str, Any]
+from .figures import Figures, tabulate
 
 STAGES = ("features", "matching", "mapping", "adjustment")
 LONG, STRIDES = 1000, (5, 3)
 """Every 5th frame of captures of this many or more, every 3rd of others."""
 
 
-def measure_mono(capture: str) -> Figures:
+def measure_poses_from_color(capture: str) -> Figures:
     """Share of the images that are placed, ATE after Sim(3), seconds of wall and processor: ours and pycolmap's, which
     is told that all images have one camera. Depth is not read, poses only to score."""
     import numpy as np
@@ -24,7 +24,7 @@ def measure_mono(capture: str) -> Figures:
     from freeocc3d.tracking.sfm.structure_from_motion import Recipe, reconstruct_poses
 
     opened = open_capture(capture, Options(depth=False))
-    frames = range(0, len(opened), stride(len(opened)))
+    frames = range(0, len(opened), choose_stride(len(opened)))
     true = np.stack([_or_none(opened.pose(index)) for index in frames])
     with tempfile.TemporaryDirectory() as folder:
         watch = _Watch()
@@ -43,8 +43,8 @@ def measure_mono(capture: str) -> Figures:
     return {"frames": len(frames), "ours": ours, "pycolmap": _defaults(opened, frames, true)}
 
 
-def stride(frames: int) -> int:
-    """Of a capture of so many frames, every how many-th is used where colour alone is read."""
+def choose_stride(frames: int) -> int:
+    """Of a capture of so many frames, every how many-th is used where color alone is read."""
     return STRIDES[frames < LONG]
 
 
@@ -122,7 +122,7 @@ def _scores(T_world_cam: Any, true: Any) -> Figures:
     return {"placed": float(placed.mean()), "ate_rmse_m": float(np.sqrt((errors**2).sum(axis=1).mean()))}
 
 
-def mono_lines(rows: list[Figures]) -> list[str]:
+def tabulate_poses_from_color(rows: list[Figures]) -> list[str]:
     """A table, two lines a capture."""
     table = []
     for row in rows:
@@ -136,15 +136,15 @@ def mono_lines(rows: list[Figures]) -> list[str]:
             total = f"{sum(one['seconds'].values()):.0f}"
             cells = [f"{100 * one['placed']:.1f}", ate, *stages, total, f"{one['cpu_seconds']:.0f}"]
             table.append([row["capture"], f"{who}, {row['frames']} images", *cells])
-    if not table:
-        return []
-    titles = [
-        "capture",
-        "poses from colour",
-        "placed %",
-        "ATE cm",
-        *(f"{stage} s" for stage in STAGES),
-        "wall s",
-        "CPU s",
-    ]
-    return ["", *(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *table))]
+    return tabulate(
+        [
+            "capture",
+            "poses from color",
+            "placed %",
+            "ATE cm",
+            *(f"{stage} s" for stage in STAGES),
+            "wall s",
+            "CPU s",
+        ],
+        table,
+    )

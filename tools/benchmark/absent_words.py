@@ -1,7 +1,4 @@
-#!/usr/bin/env python3
-"""Asks maps for things that are not there: how often something is returned all the same. Part of tools/benchmark.py.
-
-    python tools/absent_words.py [CAPTURE ...] [--json]
+"""Asks maps for things that are not there: how often something is returned all the same.
 
 A capture with class images is mapped with the encoder ``labels``, another with ``segmenter`` and the network beside the
 captures. The words are names of LVIS and Objects365 (``clip_text_names.npz``), evenly spread over those that name
@@ -12,19 +9,15 @@ classes, what one sees in its images (``SEEN``).
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-Figures = dict[str, Any]
+from .figures import Figures, Line, tabulate_asked
+from .folders import MODELS
+from .processes import PartFailed
 
-DATA = Path(os.environ.get("FREEOCC3D_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
-MODELS = DATA.parent / "models"
 ABSENT = 200
 ASKED = 0.05
 
@@ -59,18 +52,18 @@ def spread(names: list[str]) -> list[str]:
     return [names[int((n + 0.5) * len(names) / ABSENT)] for n in range(ABSENT)] if len(names) > ABSENT else names
 
 
-def measure_words(capture: str) -> Figures:
+def measure_absent_words(capture: str) -> Figures:
     """Shares of absent names, and of the present classes' names, that return a region."""
     from freeocc3d.core.progress import Progress
     from freeocc3d.pipeline.run import reconstruct
 
     if not MODELS.is_dir():
-        raise SystemExit(f"there are no names to ask for: {MODELS} is missing")
+        raise PartFailed(f"there are no names to ask for: {MODELS} is missing")
     names = [str(name) for name in np.load(MODELS / "clip_text_names.npz")["names"]]
     present = scene_classes(Path(capture))
     seen = list(present or SEEN.get(Path(capture).name, ()))
     if not seen:
-        raise SystemExit(f"what {capture} shows is not known: name it in SEEN of tools/absent_words.py")
+        raise PartFailed(f"what {capture} shows is not known: name it in SEEN of tools/benchmark/absent_words.py")
     language = {"encoder": "labels"} if present else {"encoder": "segmenter", "segmenter": SEGMENTER}
     tracking = {"backend": "known"} if present else {}
     settings = {"language": language, "tracking": tracking, "fitting": {"passes": 0}}
@@ -115,7 +108,12 @@ def scene_classes(capture: Path) -> tuple[str, ...]:
     return names if len(truth.classes) > 2 else ()
 
 
-def words_lines(rows: list[Figures]) -> list[tuple[str, str, str]]:
+def tabulate_absent_words(rows: list[Figures]) -> list[str]:
+    """A table of all captures."""
+    return tabulate_asked(absent_words_lines(rows))
+
+
+def absent_words_lines(rows: list[Figures]) -> list[Line]:
     """Rows of a table: what, measured, asked."""
     lines = []
     for row in rows:
@@ -134,24 +132,3 @@ def words_lines(rows: list[Figures]) -> list[tuple[str, str, str]]:
             (f"{where}: {row['present']} present classes that are found", f"{row['present_found']:.0%}{missing}", "")
         )
     return lines
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("captures", nargs="*", type=Path, help="folders of scans [default: those of the data folder]")
-    parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
-    given = parser.parse_args()
-    captures = given.captures or [DATA / name for name in ("7scenes-kitchen", "house/bedroom", "house/living")]
-    rows = [{"capture": path.name, **measure_words(str(path.resolve()))} for path in captures]
-    if given.json:
-        print(json.dumps(rows))
-        return
-    for line in words_lines(rows):
-        print(f"| {' | '.join(line)} |")
-    for row in rows:
-        for word, answer in row["answered"].items():
-            print(f"{row['capture']}: {word!r} as {answer['understood']!r}: {answer['voxels']:.2%} of the voxels")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,52 +1,19 @@
-"""Figures of layer 3: what is left of mistaken class images after fusion, and the speed of lifting."""
+"""What layer 3 leaves of mistakes in class images: mIoU after the fusion of images with flipped regions."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from kernels import copy_bytes_per_second
+from .figures import Figures, tabulate
 
-Figures = dict[str, Any]
-Line = tuple[str, str, str]
-
-GAUSSIANS, DIMENSION = 100_000, 512
-GRIDS = ((30, 40), (120, 160))
-"""Cells of the features that are lifted: a ViT's patches, and features upsampled to a quarter of the image."""
 FLIPPED, SEEDS, CELL_PX = 0.2, (0, 1, 2), 48
 KINDS = ("superpixels", "components")
 """Regions whose label is flipped: what a jittered grid of ``CELL_PX`` cuts each class into, or its connected parts."""
 
 
-def measure_lifting() -> Figures:
-    """Bytes a second of the fusion of 512-dimensional features: of every Gaussian in view its feature is read, and its
-    sum is read and written."""
-    import numpy as np
-
-    from freeocc3d.language.feature_fusion import FeatureFusion
-    from freeocc3d.language.visibility import VisibleGaussians
-
-    rng = np.random.default_rng(0)
-    rows = np.arange(GAUSSIANS, dtype=np.int32)
-    pixels = rng.permutation(480 * 640)[:GAUSSIANS].astype(np.int32)
-    seen = VisibleGaussians(rows, pixels, np.ones(GAUSSIANS, np.float32), (480, 640))
-    moved = GAUSSIANS * DIMENSION * (2 + 4 + 4)
-    found: Figures = {"copy_bytes_per_second": copy_bytes_per_second()}
-    for grid in GRIDS:
-        features = rng.normal(size=(*grid, DIMENSION)).astype(np.float16)
-        fusion = FeatureFusion(GAUSSIANS, DIMENSION, 0.6)
-        times = []
-        for _ in range(6):
-            mark = time.perf_counter()
-            fusion.add(seen, features)
-            times.append(time.perf_counter() - mark)
-        found["{} x {}".format(*grid)] = moved / min(times)
-    return found
-
-
-def measure_fusion(map_path: Path) -> Figures:
+def measure_fusion(map_path: str) -> Figures:
     """mIoU of a map of class images, as a share of that of the nearest true labels at the same voxels, and what is left
     when a share of each keyframe's regions shows a class at random: ours, plain averages, the last keyframe's word."""
     from freeocc3d.evaluation import scoring
@@ -219,23 +186,11 @@ def _slots(occupancy: Any, bins: Any) -> Any:
     return slots[np.searchsorted(pack_voxels(occupancy.keys), bins.packed)]
 
 
-def lifting_lines(figures: Figures) -> list[Line]:
-    """What was measured, and what is asked for."""
-    copy = figures["copy_bytes_per_second"]
-    return [
-        (
-            f"512-d features lifted, {grid} cells",
-            f"{1e-9 * figures[grid]:.1f} GB/s: {figures[grid] / copy:.2f} of a copy's {1e-9 * copy:.1f}",
-            "1/3",
-        )
-        for grid in ("{} x {}".format(*grid) for grid in GRIDS)
-    ]
-
-
-def fusion_lines(figures: Figures) -> list[str]:
+def tabulate_fusion(measured: list[Figures]) -> list[str]:
     """A table of mIoU, a row a capture and kind of flips."""
     rows = []
-    for capture, found in figures.items():
+    for found in measured:
+        capture = found["capture"]
         if "error" in found:
             rows.append([capture, f"not available, {found['error']}", "–", "–", "–", "–"])
             continue
@@ -243,7 +198,6 @@ def fusion_lines(figures: Figures) -> list[str]:
             runs = found[kind] if isinstance(found[kind], list) else [found[kind]]
             cells = [" / ".join(f"{100 * run[way]:.1f}" for run in runs) for way in ("ours", "mean", "last")]
             rows.append([capture, kind, f"{100 * found['nearest_true_label']:.1f}", *cells])
-    if not rows:
-        return []
-    titles = ["capture", f"{100 * FLIPPED:.0f} % flipped", "nearest true label", "mIoU ours", "mean", "last keyframe"]
-    return ["", *(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *rows))]
+    return tabulate(
+        ["capture", f"{100 * FLIPPED:.0f} % flipped", "nearest true label", "mIoU ours", "mean", "last keyframe"], rows
+    )

@@ -1,33 +1,30 @@
-#!/usr/bin/env python3
-"""How well a map's plan for robots agrees with the truth's. Part of tools/benchmark.py.
+"""How well a map's plan for robots agrees with the truth's.
 
-    python tools/plans.py MAP [--picture OUT.png] [--json]
-
-The plan is what `export --format nav2` writes. The truth's is made by the same rule of the voxels of the capture's
-ground truth, at the centres of the plan's cells. Which cells are "known" is a matter of who knows them, so that three
-figures are given: over the cells that both know, over all that the truth knows, and over those of them that the
-capture's depth images tell of. The last two differ where the truth was made from depth that the capture does not hold:
-without noise, and beyond the sensor's range seen through up to it.
+The plan is what ``export --format nav2`` writes. The truth's is made by the same rule of the voxels of the capture's
+ground truth, at the centers of the plan's cells. There are three figures, by who knows a cell: over the cells that both
+know, over all that the truth knows, and over those of them that the capture's depth images reach. The last two differ
+where the truth was made from depth that the capture does not hold: without noise, and with space beyond the sensor's
+range seen through up to it.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-Figures = dict[str, Any]
-Line = tuple[str, str, str]
+from .figures import Figures, Line
+
+PLAN_PICTURE = "plan.png"
+"""Ours, the truth's, and the truth's of what was measured: left in the folder that the map is in."""
 
 FREE, UNKNOWN, OCCUPIED = 254, 205, 0
 _EVERY = 4  # frames that are asked what they tell of
 
 
-def measure_plan(map_path: str, picture: str | None = None) -> Figures:
+def measure_plan(map_path: str) -> Figures:
     """Agreement of a map's plan with that of its capture's ground truth."""
     import cv2
     import yaml
@@ -69,10 +66,10 @@ def measure_plan(map_path: str, picture: str | None = None) -> Figures:
 
     true = plan_of(truth.labels)
     measured = plan_of(np.where(_measured(capture, truth), truth.labels, 255))
-    if picture:
-        bar = np.full((8, plan.shape[1]), 128, np.uint8)
-        side = np.concatenate((plan, bar, true, bar, measured)).T[::-1]
-        cv2.imwrite(picture, cv2.resize(side, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST))
+    bar = np.full((8, plan.shape[1]), 128, np.uint8)
+    side = np.concatenate((plan, bar, true, bar, measured)).T[::-1]
+    picture = str(Path(map_path).parent / PLAN_PICTURE)
+    cv2.imwrite(picture, cv2.resize(side, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST))
     return agreement(plan, true, measured)
 
 
@@ -143,23 +140,5 @@ def plan_lines(figures: Figures) -> list[Line]:
         ("  of all that the truth knows", percent["agree_of_truth"], "90 %"),
         ("  the truth's free cells that are called occupied", percent["free_called_occupied"], "0 %"),
         ("  the truth's occupied cells that are called free", percent["occupied_called_free"], "0 %"),
-        ("  free cells that hang together, through doors", percent["free_in_one_piece"], "100 %"),
+        ("  free cells that are connected, through doors", percent["free_in_one_piece"], "100 %"),
     ]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("map", help="folder of a map whose capture has a ground truth")
-    parser.add_argument("--picture", metavar="PNG", help="ours, the truth's, and the truth's of what was measured")
-    parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
-    given = parser.parse_args()
-    figures = measure_plan(given.map, given.picture)
-    if given.json:
-        print(json.dumps(figures))
-        return
-    for line in plan_lines(figures):
-        print(f"| {' | '.join(line)} |")
-
-
-if __name__ == "__main__":
-    main()

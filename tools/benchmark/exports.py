@@ -1,29 +1,20 @@
-#!/usr/bin/env python3
-"""Every exporter on a map of a capture: seconds, peak memory and bytes. Part of tools/benchmark.py.
+"""Every exporter on a map of a capture: seconds, peak memory and bytes.
 
-    python tools/exporters.py MAP [--json]
-    python tools/benchmark.py --variants exports --captures SCAN
-
-Each runs as `freeocc3d export` does, in a process of its own, start and loading of the map included. The `.bt` stands
-beside what OctoMap itself writes of the same voxels, and the plan for robots beside the truth's (tools/plans.py).
+Each runs as ``freeocc3d export`` does, in a process of its own, start and loading of the map included. The ``.bt``
+is compared with what OctoMap itself writes of the same voxels, and the plan for robots with the truth's. This process
+maps nothing itself, and loads no voxels before all is exported: a process begins with the peak of the one that starts
+it.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
-import plans
-
-Figures = dict[str, Any]
-Line = tuple[str, str, str]
+from .figures import Figures, Line
+from .plan_agreement import measure_plan, plan_lines
+from .processes import COMMAND, run_timed
 
 SECONDS, BYTES = 10, 2e9
 """What is asked of each at 4 cm."""
@@ -61,11 +52,11 @@ def measure_exports(capture: str) -> Figures:
     )
     with tempfile.TemporaryDirectory() as folder:
         made = str(Path(folder) / "map")
-        _timed(["reconstruct", capture, "-o", made, *(f"--set={setting}" for setting in settings)])
-        return measure_map(made)
+        run_timed([*COMMAND, "reconstruct", capture, "-o", made, *(f"--set={setting}" for setting in settings)])
+        return measure_map_exports(made)
 
 
-def measure_map(map_path: str) -> Figures:
+def measure_map_exports(map_path: str) -> Figures:
     """Seconds, peak bytes and bytes written of each of EXPORTS; OctoMap's own file; the plan's agreement."""
     from freeocc3d.storage.store import load_map
 
@@ -77,7 +68,8 @@ def measure_map(map_path: str) -> Figures:
             path = Path(folder) / name / file
             path.parent.mkdir()
             chosen = [f"--set={key}={words if value == 'WORDS' else value}" for key, value in options.items()]
-            seconds, peak = _timed(["export", map_path, "--format", kind, "-o", str(path), *chosen])
+            command = [*COMMAND, "export", map_path, "--format", kind, "-o", str(path), *chosen]
+            seconds, peak, _ = run_timed(command)
             size = sum(each.stat().st_size for each in path.parent.rglob("*") if each.is_file())
             rows[name] = {"seconds": seconds, "peak_memory_bytes": peak, "bytes": size}
         own = Path(folder) / "own.bt"
@@ -88,23 +80,7 @@ def measure_map(map_path: str) -> Figures:
     counts = loaded.manifest["counts"]["voxels"]
     figures = {"voxel_size_m": loaded.occupancy.finest, "voxels": counts, "exports": rows, "octomap": octomap}
     truth = Path(loaded.manifest["capture"]["path"]) / "ground_truth.npz"
-    return {**figures, **({"plan": plans.measure_plan(map_path)} if truth.is_file() else {})}
-
-
-def _timed(arguments: list[str]) -> tuple[float, int]:
-    """Wall seconds and peak resident bytes of a command of freeocc3d. A process begins with the peak of the one that
-    starts it, which therefore has to be small: it maps nothing itself, and loads no voxels before all is exported."""
-    command = [sys.executable, "-m", "freeocc3d.cli", *arguments]
-    with tempfile.TemporaryFile("w+") as said:
-        mark = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
-        _, status, usage = os.wait4(process.pid, 0)
-        seconds = time.perf_counter() - mark
-        process.returncode = os.waitstatus_to_exitcode(status)
-        said.seek(0)
-        if process.returncode:
-            raise SystemExit(said.read().strip() or f"{arguments[0]} ended with {process.returncode}")
-    return seconds, usage.ru_maxrss * 1024
+    return {**figures, **({"plan": measure_plan(map_path)} if truth.is_file() else {})}
 
 
 def _octomaps_own(made: Any, path: Path) -> bool:
@@ -138,22 +114,5 @@ def exports_lines(figures: Figures) -> list[Line]:
     if octomap := figures["octomap"]:
         same = "the same bytes" if octomap["same"] else "other bytes"
         measured = f"{octomap['bt_bytes']:,} of {octomap['octomaps_bytes']:,} bytes, {same}"
-        lines.append(("  .bt beside OctoMap's own", measured, "no larger"))
-    return [*lines, *(plans.plan_lines(figures["plan"]) if "plan" in figures else [])]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("map", help="map folder")
-    parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
-    given = parser.parse_args()
-    figures = measure_map(given.map)
-    if given.json:
-        print(json.dumps(figures))
-        return
-    for line in exports_lines(figures):
-        print(f"| {' | '.join(line)} |")
-
-
-if __name__ == "__main__":
-    main()
+        lines.append(("  .bt and OctoMap's own", measured, "no larger"))
+    return [*lines, *(plan_lines(figures["plan"]) if "plan" in figures else [])]

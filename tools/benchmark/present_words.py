@@ -1,8 +1,4 @@
-#!/usr/bin/env python3
-"""Asks maps for what is there: how well the voxels of a class are found by its name, and how soon. Part of
-tools/benchmark.py.
-
-    python tools/present_words.py [CAPTURE ...] [--json]
+"""Asks maps for what is there: how well the voxels of a class are found by its name, and how soon.
 
 A capture is mapped with its class images and poses, and its Gaussians are projected on the truth's lattice, as
 ``freeocc3d evaluate`` does: a half-voxel shift between two lattices would be taken for an error of the answer. Asked is
@@ -12,12 +8,7 @@ the voxels of the classes that the name means, over voxels that the truth knows.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -25,16 +16,16 @@ from typing import Any
 
 import numpy as np
 
-Figures = dict[str, Any]
+from .figures import Figures, Line, tabulate_asked
+from .processes import COMMAND, run_inside, run_timed
 
-DATA = Path(os.environ.get("FREEOCC3D_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 LEAST = 30
 ENOUGH = 0.5
 ABSENT = ("bathtub", "bicycle")
 COLD_STARTS = 5
 
 
-def measure_present(capture: str) -> Figures:
+def measure_present_words(capture: str) -> Figures:
     """IoU of each class, absent words that return something, and seconds of queries."""
     from freeocc3d.core.progress import Progress
     from freeocc3d.pipeline.run import reconstruct
@@ -43,9 +34,8 @@ def measure_present(capture: str) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         made = reconstruct(capture, Path(folder) / "map", settings, progress=Progress())
         found = classes_found(made, Path(capture) / "ground_truth.npz")
-        command = [sys.executable, __file__, "--seconds", str(made.path)]  # nothing is imported there for other reasons
-        timed = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-        return {**found, **timed}
+        # A process that imports nothing for other reasons.
+        return {**found, **run_inside("present_words:time_queries", map_path=str(made.path))}
 
 
 def classes_found(scan_map: Any, truth_path: Path) -> Figures:
@@ -99,7 +89,7 @@ def classes_found(scan_map: Any, truth_path: Path) -> Figures:
     return {"classes": rows, "absent": absent, "absent_answered": answered}
 
 
-def seconds(map_path: Path) -> Figures:
+def time_queries(map_path: str) -> Figures:
     """Of a process that answers one word, in text, in JSON and with all details; and of one word after the other, each
     for the first time, in a loaded map: median, longest, and median of the processor's time, on which other programs
     have no part."""
@@ -116,13 +106,8 @@ def seconds(map_path: Path) -> Figures:
         of_processor.append(time.process_time() - mark_of_processor)
     cold = {}
     for options in ((), ("--json",), ("--json", "--views")):
-        command = [sys.executable, "-m", "freeocc3d.cli", "query", str(map_path), words[0], *options]
-        runs = []
-        for _ in range(COLD_STARTS):
-            mark = time.perf_counter()
-            subprocess.run(command, check=True, capture_output=True)
-            runs.append(time.perf_counter() - mark)
-        cold[" ".join(options) or "text"] = statistics.median(runs)
+        command = [*COMMAND, "query", map_path, words[0], *options]
+        cold[" ".join(options) or "text"] = statistics.median(run_timed(command)[0] for _ in range(COLD_STARTS))
     return {
         "cold_seconds": cold,
         "loaded_seconds": statistics.median(times),
@@ -131,7 +116,12 @@ def seconds(map_path: Path) -> Figures:
     }
 
 
-def present_lines(rows: list[Figures]) -> list[tuple[str, str, str]]:
+def tabulate_present_words(rows: list[Figures]) -> list[str]:
+    """A table of all captures."""
+    return tabulate_asked(present_words_lines(rows))
+
+
+def present_words_lines(rows: list[Figures]) -> list[Line]:
     """Rows of a table: what, measured, asked."""
     lines = []
     for row in rows:
@@ -162,31 +152,3 @@ def present_lines(rows: list[Figures]) -> list[tuple[str, str, str]]:
             for options, taken in row["cold_seconds"].items()
         ]
     return lines
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("captures", nargs="*", type=Path, help="folders of scans [default: those of the data folder]")
-    parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
-    parser.add_argument("--seconds", type=Path, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.seconds is not None:
-        print(json.dumps(seconds(given.seconds)))
-        return
-    captures = given.captures or [DATA / name for name in ("house/bedroom", "house/living")]
-    rows = [{"capture": path.name, **measure_present(str(path.resolve()))} for path in captures]
-    if given.json:
-        print(json.dumps(rows))
-        return
-    for line in present_lines(rows):
-        print(f"| {' | '.join(line)} |")
-    for row in rows:
-        for name, own in row["classes"].items():
-            print(
-                f"{row['capture']}: {name}: {own['voxels']} voxels, IoU {own['iou']:.2f}, {own['occupied']:.0%} "
-                f"occupied, IoU where both are occupied {own['iou_occupied']:.2f}, {own['regions']} regions"
-            )
-
-
-if __name__ == "__main__":
-    main()

@@ -31,6 +31,8 @@ from freeocc3d.core.errors import DependencyError, FrameError
 from freeocc3d.core.transforms import back_project, invert, transform
 from freeocc3d.core.types import Frame
 
+from .timing import Seconds, lap, start_steps
+
 SLAM_VOXEL_SIZE_M = 0.01
 SLAM_DEPTH_MIN_M, SLAM_DEPTH_MAX_M = 0.1, 6.0
 SLAM_DEPTH_DIFF_M = 0.07
@@ -59,8 +61,6 @@ at 640 x 480, less than a voxel."""
 MIN_SEEN_FACES = 1.0
 """Seen area, in faces of a voxel, from which on a voxel is occupied. A pixel counts the area that it covers at its
 depth, so that the far side of a room is held to the same as the near one."""
-
-Seconds = dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def dense_slam(capture: Capture, frames: Sequence[int]) -> tuple[NDArray[np.floa
     measured = o3d.t.pipelines.slam.Frame(height, width, camera, device)
     rendered = o3d.t.pipelines.slam.Frame(height, width, camera, device)
 
-    seconds = dict.fromkeys(("decode", "track", "integrate", "synthesise"), 0.0)
+    seconds = start_steps("decode", "track", "integrate", "synthesise")
     poses = np.full((len(capture), 4, 4), np.nan)
     failures = 0
     for count, index in enumerate(frames):
@@ -110,7 +110,7 @@ def dense_slam(capture: Capture, frames: Sequence[int]) -> tuple[NDArray[np.floa
         depth = np.rint(frame.depth_m * SLAM_UNITS_PER_METRE).astype(np.uint16)
         measured.set_data_from_image("depth", o3d.t.geometry.Image(depth))
         measured.set_data_from_image("color", o3d.t.geometry.Image(frame.color))
-        mark = _lap(seconds, "decode", mark)
+        mark = lap(seconds, "decode", mark)
         if count > 0:
             try:
                 result = model.track_frame_to_model(
@@ -119,15 +119,15 @@ def dense_slam(capture: Capture, frames: Sequence[int]) -> tuple[NDArray[np.floa
                 T_world_cam = T_world_cam @ result.transformation
             except RuntimeError:
                 failures += 1
-        mark = _lap(seconds, "track", mark)
+        mark = lap(seconds, "track", mark)
         poses[index] = T_world_cam.numpy()
         model.update_frame_pose(count, T_world_cam)
         model.integrate(measured, SLAM_UNITS_PER_METRE, SLAM_DEPTH_MAX_M, SLAM_TRUNCATION_VOXELS)
-        mark = _lap(seconds, "integrate", mark)
+        mark = lap(seconds, "integrate", mark)
         model.synthesize_model_frame(
             rendered, SLAM_UNITS_PER_METRE, SLAM_DEPTH_MIN_M, SLAM_DEPTH_MAX_M, SLAM_TRUNCATION_VOXELS, False
         )
-        _lap(seconds, "synthesise", mark)
+        lap(seconds, "synthesise", mark)
     return poses, seconds, failures
 
 
@@ -161,7 +161,7 @@ def surface_area(
         TSDF_VOXEL_SIZE_M,
         device=core.Device("CPU:0"),
     )
-    seconds = dict.fromkeys(("decode", "integrate", "extract"), 0.0)
+    seconds = start_steps("decode", "integrate", "extract")
     integrated = 0
     for frame in _decoded(capture, frames_with_pose(T_world_cam, every), seconds):
         if not frame.depth_m.any():
@@ -173,12 +173,12 @@ def surface_area(
         blocks = grid.compute_unique_block_coordinates(depth, camera, T_cam_world, *reach)
         grid.integrate(blocks, depth, camera, T_cam_world, *reach)
         integrated += 1
-        _lap(seconds, "integrate", mark)
+        lap(seconds, "integrate", mark)
     mark = time.perf_counter()
     corners = _corners(grid) if integrated else np.zeros((0, 3, 3))
     a, b, c = corners.transpose(1, 0, 2)
     area = lattice.total(corners.mean(axis=1), 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    _lap(seconds, "extract", mark)
+    lap(seconds, "extract", mark)
     return area, seconds
 
 
@@ -208,7 +208,7 @@ def seen_area(
     capture: Capture, T_world_cam: NDArray[np.float64], lattice: Lattice, every: int
 ) -> tuple[NDArray[np.float64], Seconds]:
     """(X, Y, Z) square metres that the depth pixels in each voxel cover at their depth, summed over the frames."""
-    seconds = dict.fromkeys(("decode", "count"), 0.0)
+    seconds = start_steps("decode", "count")
     area = np.zeros(lattice.shape)
     for frame in _decoded(capture, frames_with_pose(T_world_cam, every), seconds):
         mark = time.perf_counter()
@@ -216,7 +216,7 @@ def seen_area(
         camera = frame.intrinsics
         covered = (PIXEL_STRIDE * points_cam[:, 2]) ** 2 / (camera.fx * camera.fy)
         area += lattice.total(transform(T_world_cam[frame.index], points_cam), covered)
-        _lap(seconds, "count", mark)
+        lap(seconds, "count", mark)
     return area, seconds
 
 
@@ -237,17 +237,17 @@ def octomap_occupied(
         raise DependencyError("OctoMap is measured through pyoctomap: pip install 'pyoctomap>=1.2'.") from error
 
     tree = pyoctomap.OcTree(lattice.voxel_size)
-    seconds = dict.fromkeys(("decode", "insert", "read"), 0.0)
+    seconds = start_steps("decode", "insert", "read")
     for frame in _decoded(capture, frames_with_pose(T_world_cam, every), seconds):
         mark = time.perf_counter()
         T_tree_cam = T_world_cam[frame.index].copy()
         T_tree_cam[:3, 3] -= lattice.origin  # a tree's cells lie at multiples of their size: now they are the voxels
         tree.insertPointCloud(transform(T_tree_cam, _points(frame)), T_tree_cam[:3, 3].copy())
-        _lap(seconds, "insert", mark)
+        lap(seconds, "insert", mark)
     mark = time.perf_counter()
     centers = (np.indices(lattice.shape).reshape(3, -1).T + 0.5) * lattice.voxel_size
     occupied = tree.getLabels(centers).reshape(lattice.shape) == 1
-    _lap(seconds, "read", mark)
+    lap(seconds, "read", mark)
     return occupied, seconds
 
 
@@ -259,7 +259,7 @@ def _decoded(capture: Capture, frames: NDArray[np.int64], seconds: Seconds) -> I
             frame = capture[int(index)]
         except FrameError:
             continue
-        _lap(seconds, "decode", mark)
+        lap(seconds, "decode", mark)
         yield frame
 
 
@@ -269,9 +269,3 @@ def _points(frame: Frame) -> NDArray[np.float64]:
     rows, columns = np.nonzero(depth_m > 0)
     pixels = PIXEL_STRIDE * np.stack((columns, rows), axis=1).astype(np.float64)
     return back_project(pixels, depth_m[rows, columns].astype(np.float64), frame.intrinsics)
-
-
-def _lap(seconds: Seconds, step: str, mark: float) -> float:
-    now = time.perf_counter()
-    seconds[step] += now - mark
-    return now

@@ -13,7 +13,16 @@ from pathlib import Path
 
 import yaml
 
-FOLDER = Path(__file__).resolve().parents[1] / "configs" / "ablations"
+from .folders import REPOSITORY
+
+FOLDER = REPOSITORY / "configs" / "ablations"
+
+OURS = "rgbd"
+"""The variant whose poses the peers ``ours_*`` use, and whose map is asked."""
+
+UNFITTED, MONO = "rgbd_no_fitting", "mono"
+TRUE_POSES, TRUE_CLASSES = "rgbd_true_poses", "rgbd_true_poses_closed_set"
+"""Ablations that others are compared with."""
 
 _TRY = """
 import sys
@@ -31,35 +40,35 @@ for path in sys.argv[1:]:
 
 
 @dataclass(frozen=True)
-class Variant:
+class Ablation:
     """title: what it is.  table: where the paper has it.  lacking: why it cannot run, one sentence; empty if it can.
-    colour_alone: whether it does without depth."""
+    color_alone: whether it does without depth."""
 
     name: str
     title: str
     table: str
     path: Path
     lacking: str
-    colour_alone: bool
+    color_alone: bool
 
 
-def names() -> list[str]:
+def list_ablations() -> list[str]:
     """Of all ablations."""
     return sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 
-def all_variants() -> dict[str, Variant]:
+def read_ablations() -> dict[str, Ablation]:
     """Every ablation by name, in the order of the names."""
     paths = sorted(FOLDER.glob("*.yaml"))
     command = [sys.executable, "-c", _TRY, *map(str, paths)]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-    return {path.stem: _variant(path, refused) for path, refused in zip(paths, said, strict=True)}
+    return {path.stem: _read_ablation(path, refused) for path, refused in zip(paths, said, strict=True)}
 
 
-def _variant(path: Path, refused: str) -> Variant:
+def _read_ablation(path: Path, refused: str) -> Ablation:
     text = path.read_text(encoding="utf-8")
     comments = [line[1:].strip() for line in text.splitlines() if line.startswith("#")]
     facts = dict(line.split(": ", 1) for line in comments[1:] if line.startswith(("table: ", "needs: ")))
     lacking = f"needs {facts['needs']}" if refused and "needs" in facts else refused
     capture = (yaml.safe_load(text) or {}).get("capture") or {}
-    return Variant(path.stem, comments[0], facts.get("table", ""), path, lacking, capture.get("depth") is False)
+    return Ablation(path.stem, comments[0], facts.get("table", ""), path, lacking, capture.get("depth") is False)

@@ -1,0 +1,155 @@
+"""Every variant by name: ablations, peers, and what else is measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from . import ablations
+from .ablations import OURS, TRUE_CLASSES, TRUE_POSES
+from .peer_rows import PEERS
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What is measured in a process of its own, besides the rows of ablations and peers.
+
+    measure: ``module:function`` that returns figures.  given: its arguments: none, ``capture``, ``captures`` (two) or
+    ``map_path``.  map_of: the ablation whose map it asks.  lines: ``module:function`` from one process's figures to
+    lines of what was measured and what is asked for.  table: instead of it, from all rows to lines of Markdown.
+    """
+
+    title: str
+    given: Literal["nothing", "capture", "captures", "map"]
+    measure: str
+    lines: str = ""
+    table: str = ""
+    map_of: str = ""
+
+
+MEASUREMENTS = {
+    "splat": Measurement(
+        "Gaussians a second through layer 4's projection, and what its arithmetic and memory need at least",
+        "nothing",
+        "splat_speed:measure_splat",
+        lines="splat_speed:splat_lines",
+    ),
+    "voxels": Measurement(
+        "layer 4 without the projection: features in voxels, carving, codes, updates, adaptive voxels",
+        "nothing",
+        "voxel_speed:measure_voxels",
+        lines="voxel_speed:voxels_lines",
+    ),
+    "query": Measurement(
+        "seconds of a query, from a cold start and in a loaded map",
+        "map",
+        "query_speed:measure_query",
+        lines="query_speed:query_lines",
+        map_of=OURS,
+    ),
+    "rasterizer": Measurement(
+        "forward and backward of 300,000 Gaussians: compiled, plain PyTorch, and gsplat on a GPU",
+        "nothing",
+        "rasterizer_speed:measure_rasterizer",
+        lines="rasterizer_speed:rasterizer_lines",
+    ),
+    "encoders": Measurement(
+        "model packages: size, seconds and error of each precision; what guided upsampling gains",
+        "nothing",
+        "encoder_precision:measure_encoders",
+        lines="encoder_precision:encoders_lines",
+    ),
+    "lifting": Measurement(
+        "bytes a second of the fusion of 512-dimensional features",
+        "nothing",
+        "lifting_speed:measure_lifting",
+        lines="lifting_speed:lifting_lines",
+    ),
+    "stress": Measurement(
+        "layer 1 on altered captures: what it reaches, what it loses, and whether it reports the loss",
+        "capture",
+        "tracking_stress:measure_stress",
+        table="tracking_stress:tabulate_stress",
+    ),
+    "glued": Measurement(
+        "layer 1 on two captures as if they were one, which must stay two submaps",
+        "captures",
+        "tracking_stress:measure_glued",
+        table="tracking_stress:tabulate_stress",
+    ),
+    "lengths": Measurement(
+        "layer 1 on the first 250, 500 and 1000 frames: seconds, and bytes of a keyframe",
+        "capture",
+        "tracking_stress:measure_lengths",
+        table="tracking_stress:tabulate_lengths",
+    ),
+    "absent_words": Measurement(
+        "names of things that are not there: how often a region is returned all the same",
+        "capture",
+        "absent_words:measure_absent_words",
+        table="absent_words:tabulate_absent_words",
+    ),
+    "present_words": Measurement(
+        "names of the classes that are there: how much of each is found, and how soon",
+        "capture",
+        "present_words:measure_present_words",
+        table="present_words:tabulate_present_words",
+    ),
+    "exports": Measurement(
+        "every exporter at 4 cm: seconds, memory, bytes; the plan for robots against the truth's",
+        "capture",
+        "exports:measure_exports",
+        lines="exports:exports_lines",
+    ),
+    "plan": Measurement(
+        f"the plan for robots of the map of {OURS} against the truth's",
+        "map",
+        "plan_agreement:measure_plan",
+        lines="plan_agreement:plan_lines",
+        map_of=OURS,
+    ),
+    "poses_from_color": Measurement(
+        "poses from color alone: placed images, ATE and seconds, and those of pycolmap's pipeline at its defaults",
+        "capture",
+        "poses_from_color:measure_poses_from_color",
+        table="poses_from_color:tabulate_poses_from_color",
+    ),
+    "stereo_depth": Measurement(
+        "depth by multi-view stereo from color at true poses, against the capture's depth",
+        "capture",
+        "stereo_depth:measure_stereo",
+        table="stereo_depth:tabulate_stereo",
+    ),
+    "fusion": Measurement(
+        f"class images with regions flipped at random, fused in the map of {TRUE_CLASSES}",
+        "map",
+        "fusion_of_mistakes:measure_fusion",
+        table="fusion_of_mistakes:tabulate_fusion",
+        map_of=TRUE_CLASSES,
+    ),
+}
+
+SUITES: dict[str, tuple[tuple[str, ...], tuple[str, ...] | None]] = {
+    "quick": (
+        ("house/bedroom",),
+        (OURS, TRUE_POSES, TRUE_CLASSES, *PEERS, "splat", "voxels", "query", "rasterizer", "encoders", "lifting")
+        + ("lengths",),
+    ),
+    "full": (("7scenes-kitchen", "house/bedroom", "house/living"), None),
+}
+"""Captures of the data folder, and variants (None = all)."""
+
+
+def list_names() -> list[str]:
+    """Of all variants."""
+    return [*ablations.list_ablations(), *PEERS, *MEASUREMENTS]
+
+
+def describe_variants() -> list[str]:
+    """A line for each variant, with what is lacking for it."""
+    lines = []
+    for name, ablation in ablations.read_ablations().items():
+        lacking = f": not available, {ablation.lacking}" if ablation.lacking else ""
+        lines.append(f"{name:<38} {ablation.title}{lacking}")
+    titles = PEERS | {name: measurement.title for name, measurement in MEASUREMENTS.items()}
+    return [*lines, *(f"{name:<38} {title}" for name, title in titles.items())]
