@@ -21,6 +21,7 @@ import yaml
 from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, ConfigError
+from ..settings.presets import find_preset
 from ..settings.registry import nearest
 
 CLASSES_JSON = "classes.json"
@@ -61,7 +62,12 @@ class ClassFile:
 
 
 def read_class_file(path: Path) -> ClassFile:
-    """Raises CaptureError: no such file, not of this form, a name that becomes none of the classes."""
+    """What a file says, or a preset by its name, such as ``nyu40_to_embodiedocc``.
+
+    Raises ConfigError: no such preset. Raises CaptureError: no such file, not of this form, a name that becomes none of
+    the classes.
+    """
+    path = find_preset(path, "classes")
     content = _content(path)
     if isinstance(content, list):
         content = {"classes": content}

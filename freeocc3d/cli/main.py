@@ -46,7 +46,10 @@ def _options(
 def reconstruct(
     capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Folder of a scan, a video, or builtin:room.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="MAP", help="Map folder to write.")],
-    config_file: Annotated[Path | None, typer.Option("--config", help="YAML file with options.")] = None,
+    config_file: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE|NAME", help="YAML file with options, or a preset: mono, rgbd, …"),
+    ] = None,
     overrides: Set = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
     overwrite: Overwrite = False,
@@ -243,7 +246,7 @@ def evaluate(
         str | None,
         typer.Option("--align", help="se3, sim3 or none. [default: se3; sim3 for maps of unknown scale]"),
     ] = None,
-    classes: Annotated[Path | None, typer.Option("--classes", metavar="FILE", help="Classes to score.")] = None,
+    classes: Annotated[Path | None, typer.Option("--classes", metavar="FILE|NAME", help="Classes to score.")] = None,
     split: Annotated[
         Path | None, typer.Option("--split", metavar="FILE", help="Score the scenes that this file lists.")
     ] = None,

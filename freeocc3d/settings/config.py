@@ -17,6 +17,7 @@ import yaml
 
 from ..core.errors import ConfigError
 from . import registry
+from .presets import find_preset
 from .registry import Option
 
 SECTIONS: dict[str, tuple[str, str | None]] = {
@@ -43,12 +44,14 @@ def default() -> Config:
 
 
 def load(path: Path | None, overrides: Iterable[str] = ()) -> Config:
-    """The configuration of a YAML file (or the defaults) with ``section.key=value`` overrides applied.
+    """The configuration of a YAML file or of a preset (``mono``), or the defaults, with overrides applied.
 
+    path: None = the defaults.  overrides: ``section.key=value``.
     Raises ConfigError: unreadable or invalid YAML, unknown key, wrong type, malformed override.
     """
     values: dict[str, Any] = {}
     if path is not None:
+        path = find_preset(path)
         try:
             loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
         except OSError as error:

@@ -1,0 +1,49 @@
+"""Files that come with freeocc3d and go by name: configurations, ablations and classes.
+
+They lie in ``configs/`` of the repository. The folder ``preset_files`` next to this module is a link to it, so that a
+wheel holds them too.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from ..core.errors import ConfigError
+from .registry import nearest
+
+FOLDER = Path(__file__).parent / "preset_files"
+_ABLATIONS = "ablations"
+
+
+def find_preset(given: str | Path, kind: Literal["configuration", "classes"] = "configuration") -> Path:
+    """The file that a path or a name means: ``mono`` is ``configs/mono.yaml``, ``rgbd_no_loops`` and
+    ``ablations/rgbd_no_loops`` are files of ``configs/ablations``, and with kind "classes" ``nyu40_to_embodiedocc`` is
+    one of ``configs/classes``.
+
+    A file that exists comes before a preset. What has a suffix, or is an absolute path, is no name: it is returned
+    unchanged. Raises ConfigError for an unknown name.
+    """
+    path = Path(given)
+    if path.is_file() or path.suffix or path.is_absolute():
+        return path
+    folders = (FOLDER / "classes",) if kind == "classes" else (FOLDER, FOLDER / _ABLATIONS)
+    for folder in folders:
+        if (found := folder / f"{path}.yaml").is_file():
+            return found
+    known = list_presets(kind)
+    raise ConfigError(
+        f"There is no file '{given}', and nothing of that name comes with freeocc3d{nearest(str(given), known)}: name "
+        f"a file, or one of {', '.join(known)}."
+    )
+
+
+def list_presets(kind: Literal["configuration", "classes"] = "configuration") -> list[str]:
+    """Names that ``find_preset`` knows, ablations last."""
+    if kind == "classes":
+        return _names(FOLDER / "classes")
+    return [*_names(FOLDER), *(f"{_ABLATIONS}/{name}" for name in _names(FOLDER / _ABLATIONS))]
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(path.stem for path in folder.glob("*.yaml"))
