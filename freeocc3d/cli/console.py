@@ -5,24 +5,41 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from ..core.progress import Progress
 
+
+def flag(name: str, help_text: str) -> Any:
+    """An option that is given or not, for ``Annotated[bool, …]``; its help names no kind of value."""
+    return typer.Option(name, metavar="", help=help_text)
+
+
 MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="Map folder.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set one option; repeatable.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what exists.")]
+NewMap = Annotated[Path, typer.Option("-o", "--output", metavar="MAP", help="Map folder to write.")]
+Json = Annotated[bool, flag("--json", "Print one JSON document and nothing else.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set one option; repeatable. See 'freeocc3d list'."),
+]
+Overwrite = Annotated[bool, flag("--overwrite", "Replace what exists.")]
 
 
 class ConsoleProgress(Progress):
-    """Progress on stderr: one line that is redrawn on a terminal, a line per stage and warning elsewhere."""
+    """Progress on stderr: one line that is redrawn on a terminal, a line per stage and warning elsewhere. Used as a
+    context, it ends its line in any case."""
 
     def __init__(self) -> None:
         self._name, self._total, self._start, self._drawn = "", None, 0.0, 0.0  # type: tuple[str, int | None, float, float]
         self._on_terminal = sys.stderr.isatty()
+
+    def __enter__(self) -> ConsoleProgress:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
 
     def stage(self, name: str, total: int | None = None) -> None:
         self.close()

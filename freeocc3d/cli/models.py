@@ -19,18 +19,15 @@ app = typer.Typer(help="Fetch, export, list and verify the networks that encoder
 @app.command("pull")
 def models_pull(
     name: Annotated[
-        str, typer.Argument(metavar="NAME|REPO", help="OWNER/NAME on the Hugging Face hub, or a short one.")
+        str, typer.Argument(metavar="NAME|REPO", help="OWNER/NAME on the Hugging Face hub, or a short name.")
     ],
-    revision: Annotated[str, typer.Option("--revision", help="Branch, tag or commit.")] = "main",
+    revision: Annotated[str, typer.Option("--revision", metavar="NAME", help="Branch, tag or commit.")] = "main",
 ) -> None:
     """Fetch a model package, or a checkpoint to export, from the Hugging Face hub."""
     from ..language import model_hub
 
-    progress = ConsoleProgress()
-    try:
+    with ConsoleProgress() as progress:
         folder = model_hub.pull_package(name, revision, progress)
-    finally:
-        progress.close()
     if folder.parent.name == model_hub.CHECKPOINTS:
         print(f"{folder}: a checkpoint, to be exported: freeocc3d models export {folder} -o {folder.name}")
     else:
@@ -48,31 +45,46 @@ def models_export(
         ),
     ],
     output: Annotated[
-        str, typer.Option("-o", "--output", metavar="NAME", help="Folder to write; a plain name: in the models folder.")
+        str,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="NAME",
+            help="Folder to write. A name without a slash is a folder of the models folder.",
+        ),
     ],
     precision: Annotated[
-        Precision, typer.Option("--precision", help="Of the weights; fp16 and int8 are smaller and faster.")
+        Precision, typer.Option("--precision", help="Precision of the weights; fp16 and int8 are smaller and faster.")
     ] = "fp32",
     tokenizer: Annotated[
         Path | None,
-        typer.Option("--tokenizer", metavar="FOLDER", help="Where the tokenizer is, if not in CHECKPOINT."),
+        typer.Option("--tokenizer", metavar="FOLDER", help="Folder of the tokenizer, if it is not CHECKPOINT."),
     ] = None,
     text: Annotated[
-        str | None, typer.Option("--text", metavar="CLIP", help="Checkpoint of the CLIP that gives a DINOv2 its words.")
+        str | None, typer.Option("--text", metavar="CLIP", help="Checkpoint of the CLIP that reads words for a DINOv2.")
     ] = None,
     text_head: Annotated[
         Path | None,
-        typer.Option("--text-head", metavar="FILE", help="Safetensors file of Talk2DINO's projection, with --text."),
+        typer.Option(
+            "--text-head", metavar="FILE", help="With --text: safetensors file with the projection of Talk2DINO."
+        ),
     ] = None,
     license_name: Annotated[
         str | None,
-        typer.Option("--license", "--licence", metavar="NAME", help="Of the weights, if not what the model card says."),
+        typer.Option(
+            "--license",
+            "--licence",
+            metavar="NAME",
+            help="License of the weights, if the model card does not state it.",
+        ),
     ] = None,
 ) -> None:
     """Turn a checkpoint into a model package: ONNX networks, tokenizer and manifest.
 
-    CHECKPOINT holds config.json with model.safetensors, or open_clip_config.json with open_clip_model.safetensors, and
-    for words tokenizer.json, or vocab.json with merges.txt. Weights are read from safetensors files only.
+    CHECKPOINT holds config.json with model.safetensors, or
+    open_clip_config.json with open_clip_model.safetensors.
+    Words also need tokenizer.json, or vocab.json with merges.txt.
+    Weights are read from safetensors files only.
     """
     from ..language.model_export.export_checkpoint import export_checkpoint
 
@@ -112,7 +124,9 @@ def models_list(as_json: Json = False) -> None:
 
 @app.command("verify")
 def models_verify(
-    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME|FOLDER]...", help="[default: all]")] = None,
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="NAME|FOLDER", help="Model packages.", show_default="all")
+    ] = None,
 ) -> None:
     """Compare the content of every file with the hash in its model's manifest."""
     from ..language import model_packages

@@ -4,189 +4,265 @@ from __future__ import annotations
 
 import json
 import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from .. import __version__
 from ..core.atomic_files import refuse_existing
 from ..core.errors import FreeOccError
-from .console import ConsoleProgress, Json, MapPath, Overwrite
+from .console import ConsoleProgress, Json, MapPath, Overwrite, flag
+from .option_groups import grouped
+
+if TYPE_CHECKING:
+    from ..query.questions import Question
+    from ..query.regions import Region
+    from ..query.word_query import QueryResult
+    from ..storage.store import Map
 
 
-def query(
-    map_path: MapPath,
+@dataclass(frozen=True)
+class Asked:
+    """What to look for."""
+
     words: Annotated[
-        list[str] | None, typer.Argument(metavar="WORD...", help="Words or quoted phrases.", show_default=False)
-    ] = None,
-    as_json: Json = False,
-    interactive: Annotated[
-        bool,
-        typer.Option(
-            "--interactive", help="Keep the map loaded and answer each line of the input, phrases separated by commas."
-        ),
-    ] = False,
-    top: Annotated[int | None, typer.Option("--top", metavar="K", help="At most K regions a word.")] = None,
-    threshold: Annotated[float | None, typer.Option("--threshold", help="Least score, 0…1.")] = None,
-    scores: Annotated[str | None, typer.Option("--scores", help="cosine, softmax or relevancy.")] = None,
-    ply: Annotated[Path | None, typer.Option("--ply", help="Write the map as PLY, matches coloured.")] = None,
-    picture: Annotated[Path | None, typer.Option("--picture", help="Write a picture, matches coloured (PNG).")] = None,
-    html: Annotated[
-        Path | None, typer.Option("--html", help="Write one page: regions, the map, and what the camera saw of them.")
-    ] = None,
+        list[str] | None, typer.Argument(metavar="WORD", help="Words or quoted phrases.", show_default=False)
+    ] = None
+    negative: Annotated[
+        list[str] | None, typer.Option("--not", metavar="WORD", help="What the words do not mean; repeatable.")
+    ] = None
     class_names: Annotated[
         list[str] | None,
         typer.Option("--class", metavar="NAME", help="All voxels of a class of the map's vocabulary; repeatable."),
-    ] = None,
-    list_classes: Annotated[bool, typer.Option("--classes", help="List the map's vocabulary, and do no more.")] = False,
+    ] = None
     image: Annotated[
-        Path | None, typer.Option("--image", help="Look for what a picture shows, where the map's encoder can.")
-    ] = None,
+        Path | None, typer.Option("--image", metavar="FILE", help="What a picture shows, if the map's encoder can.")
+    ] = None
     image_box: Annotated[
         tuple[int, int, int, int] | None,
-        typer.Option("--box", metavar="X0 Y0 X1 Y1", help="With --image: only these pixels of it, the last included."),
-    ] = None,
-    negative: Annotated[
-        list[str] | None, typer.Option("--not", metavar="WORD", help="What is not meant; repeatable.")
-    ] = None,
-    within: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        typer.Option("--within", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Regions whose centroid is in a box, map frame."),
-    ] = None,
+        typer.Option("--box", metavar="X0 Y0 X1 Y1", help="With --image: only these pixels, both corners included."),
+    ] = None
+    interactive: Annotated[
+        bool,
+        flag("--interactive", "Keep the map loaded and answer each line of the input. Commas separate phrases."),
+    ] = False
+    list_classes: Annotated[bool, flag("--classes", "Only list the classes of the map's vocabulary.")] = False
+
+    @property
+    def questions(self) -> int:
+        """How many answers there will be."""
+        return len(self.words or ()) + len(self.class_names or ()) + (self.image is not None)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the regions must be."""
+
     near: Annotated[
         str | None,
-        typer.Option("--near", metavar="WORD[:METRES]", help="Regions with a gap to WORD of at most METRES [0.5]."),
-    ] = None,
-    on: Annotated[str | None, typer.Option("--on", metavar="WORD", help="Regions that stand on WORD.")] = None,
-    pick: Annotated[str | None, typer.Option("--pick", help="Only the largest, highest, lowest or best.")] = None,
+        typer.Option("--near", metavar="WORD[:METRES]", help="At most METRES away from WORD, 0.5 if not given."),
+    ] = None
+    on: Annotated[str | None, typer.Option("--on", metavar="WORD", help="On top of WORD.")] = None
+    within: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option("--within", metavar="X0 Y0 Z0 X1 Y1 Z1", help="With the centroid in a box, map frame, metres."),
+    ] = None
+    pick: Annotated[
+        str | None, typer.Option("--pick", metavar="WHICH", help="Only the largest, highest, lowest or best region.")
+    ] = None
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """What matches."""
+
+    top: Annotated[int | None, typer.Option("--top", metavar="K", help="At most K regions for each word.")] = None
+    threshold: Annotated[
+        float | None, typer.Option("--threshold", metavar="T", help="Lowest score of a match, -1 to 1.")
+    ] = None
+    scores: Annotated[
+        str | None,
+        typer.Option("--scores", metavar="KIND", help="How scores are computed: cosine, softmax or relevancy."),
+    ] = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What comes out."""
+
+    as_json: Json = False
     views: Annotated[
-        bool, typer.Option("--views", help="With --json: also the keyframes that show each region, and where to stand.")
-    ] = False,
+        bool,
+        flag("--views", "With --json: add keyframes that show a region, and where to stand to see it."),
+    ] = False
+    picture: Annotated[
+        Path | None, typer.Option("--picture", metavar="OUT.png", help="Draw the map with colored matches.")
+    ] = None
+    html: Annotated[
+        Path | None,
+        typer.Option("--html", metavar="OUT.html", help="Write a page with the regions, the map, and camera images."),
+    ] = None
+    ply: Annotated[
+        Path | None, typer.Option("--ply", metavar="OUT.ply", help="Write the map as a mesh with colored matches.")
+    ] = None
+    overwrite: Overwrite = False
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that are written."""
+        return [path for path in (self.ply, self.picture, self.html) if path is not None]
+
+
+@dataclass(frozen=True)
+class Closer:
+    """A closer look."""
+
     refine_to: Annotated[
         float | None,
-        typer.Option("--refine", metavar="METRES", help="Look again with finer voxels, around the best match."),
-    ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Keep the map that --refine makes.")] = None,
-    overwrite: Overwrite = False,
-) -> None:
+        typer.Option("--refine", metavar="METRES", help="Ask again with finer voxels around the best match."),
+    ] = None
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="MAP", help="Keep the map that --refine makes.")
+    ] = None
+
+
+@grouped
+def query(map_path: MapPath, asked: Asked, place: Place, ranking: Ranking, answer: Answer, closer: Closer) -> None:
     """Ask a map where something is.
 
-    score, by which regions are ranked, 0…1: how well the voxels fit the word, as if a litre that does not fit belonged
-    to the region. conf., 0…1: how probable the word is beside the other words that the map knows. A region may fit
-    badly and still be nothing else. Of a picture (--image) the confidence is the mean likeness.
+    Regions are ranked by score, 0 to 1: how well they fit the word.
+    The confidence, 0 to 1, compares the word with the others that the map knows.
+    Low score, high confidence: the word fits badly, but no other fits better.
+    For a picture (--image), the confidence is the mean similarity.
     """
-    import tempfile
-
-    from ..query.conditions import Where, near_word
+    from ..query.questions import ask
     from ..storage.store import load_map
 
-    words, class_names = words or [], class_names or []
-    questions = len(words) + len(class_names) + (image is not None)
-    if list_classes:
+    if asked.list_classes:
         print("\n".join(load_map(map_path).vocabulary))
         return
-    if interactive == bool(questions):
+    _refuse_what_does_not_go_together(asked, answer, closer)
+    for target in answer.files:
+        refuse_existing(target, answer.overwrite)
+    question = _question(asked, place, ranking)
+    loaded = load_map(map_path)
+    if asked.interactive:
+        _answer_lines(loaded, question, answer)
+        return
+    results = ask(loaded, question)
+    with tempfile.TemporaryDirectory() as folder:  # for a map that nobody keeps
+        if closer.refine_to is not None and results[0].matched:
+            output = closer.output or Path(folder) / "refined"
+            loaded = _refined(loaded, results[0].regions[0], closer.refine_to, output, answer.overwrite)
+            results = ask(loaded, question)
+        _write_files(loaded, results, answer)
+        print(_answer(map_path, loaded, results, answer))
+
+
+def _refuse_what_does_not_go_together(asked: Asked, answer: Answer, closer: Closer) -> None:
+    """Raises BadParameter, which names what to leave out or to add."""
+    if asked.interactive == bool(asked.questions):
         raise typer.BadParameter("give words to look for, --class or --image, or --interactive without any.")
-    if interactive and (ply or picture or html or refine_to is not None):
+    if asked.interactive and (answer.files or closer.refine_to is not None):
         raise typer.BadParameter(
             "--interactive answers in text or JSON: leave out --ply, --picture, --html and --refine."
         )
-    if image_box is not None and image is None:
+    if asked.image_box is not None and asked.image is None:
         raise typer.BadParameter("--box is a part of a picture: give --image, too.")
-    if negative and questions > len(words):
+    if asked.negative and asked.questions > len(asked.words or ()):
         raise typer.BadParameter("--not narrows what words mean: leave it out with --class and --image.")
-    if output is not None and refine_to is None:
+    if closer.output is not None and closer.refine_to is None:
         raise typer.BadParameter("-o keeps the map that --refine makes: give --refine METRES.")
-    if views and not as_json:
+    if answer.views and not answer.as_json:
         raise typer.BadParameter("--views adds to the document of --json: give both.")
-    if refine_to is not None and questions > 1:
+    if closer.refine_to is not None and asked.questions > 1:
         raise typer.BadParameter("--refine looks around the best match of one word.")
-    targets = [target for target in (ply, picture, html) if target is not None]
-    if len(set(targets)) < len(targets):
-        raise typer.BadParameter("--ply, --picture and --html are files of their own: give each another name.")
-    for target in targets:
-        refuse_existing(target, overwrite)
-    options: dict[str, Any] = {}
-    if top is not None:
-        options["top_k"] = top
-    if threshold is not None:
-        options["threshold"] = threshold
-    if scores is not None:
-        options["scores"] = scores
-    if any(condition is not None for condition in (within, near, on, pick)):
-        word, metres = (None, Where.near_m) if near is None else near_word(near)
-        options["where"] = Where(within, word, metres, on, pick)
-    loaded = load_map(map_path)
-    if interactive:
-        _answer_lines(loaded, {**options, "negative": negative or []}, as_json, views)
-        return
-
-    def ask(scan_map: Any) -> list[Any]:
-        results = scan_map.query_words(words, negative=negative or [], **options) if words else []
-        results += scan_map.query_classes(class_names, **options) if class_names else []
-        return results if image is None else [*results, scan_map.query_image(image, image_box, **options)]
-
-    results = ask(loaded)
-    with tempfile.TemporaryDirectory() as folder:  # for a map that nobody keeps
-        if refine_to is not None and results[0].matched:
-            loaded = _refined(loaded, results[0].regions[0], refine_to, output or Path(folder) / "refined", overwrite)
-            results = ask(loaded)
-        if ply is not None:
-            from ..export.ply import write_query_ply
-
-            write_query_ply(loaded.occupancy, results, ply, overwrite)
-        if picture is not None:
-            from ..viewer import map_pictures
-
-            map_pictures.write_query_picture(loaded, results, picture, overwrite)
-        if html is not None:
-            from ..viewer.answer_page import write_query_page
-
-            write_query_page(loaded, results, html, overwrite)
-        print(_answer(map_path, loaded, results, as_json, views))
+    if len(set(answer.files)) < len(answer.files):
+        raise typer.BadParameter("--ply, --picture and --html are different files: give each another name.")
 
 
-def _answer(map_path: Path, loaded: Any, results: list[Any], as_json: bool, views: bool) -> str:
-    from ..query import word_query as asking
+def _question(asked: Asked, place: Place, ranking: Ranking) -> Question:
+    from ..query.conditions import Where, near_word
+    from ..query.questions import Question
 
-    if not as_json:
-        unit = "" if loaded.metric else "\nLengths are not metres: the map's scale is unknown (freeocc3d scale)."
-        return asking.to_text(results, loaded.metric) + unit
-    from .region_details import details
+    where = None
+    if any(condition is not None for condition in vars(place).values()):
+        word, metres = (None, Where.near_m) if place.near is None else near_word(place.near)
+        where = Where(place.within, word, metres, place.on, place.pick)
+    options = {"top_k": ranking.top, "threshold": ranking.threshold, "scores": ranking.scores}
+    return Question(
+        words=tuple(asked.words or ()),
+        classes=tuple(asked.class_names or ()),
+        image=asked.image,
+        image_box=asked.image_box,
+        negative=tuple(asked.negative or ()),
+        where=where,
+        options={name: value for name, value in options.items() if value is not None},
+    )
 
-    return json.dumps(asking.to_json(map_path, results, details(loaded, results, views), loaded.metric))
+
+def _write_files(loaded: Map, results: list[QueryResult], answer: Answer) -> None:
+    if answer.ply is not None:
+        from ..export.ply import write_query_ply
+
+        write_query_ply(loaded.occupancy, results, answer.ply, answer.overwrite)
+    if answer.picture is not None:
+        from ..viewer.map_pictures import write_query_picture
+
+        write_query_picture(loaded, results, answer.picture, answer.overwrite)
+    if answer.html is not None:
+        from ..viewer.answer_page import write_query_page
+
+        write_query_page(loaded, results, answer.html, answer.overwrite)
 
 
-def _answer_lines(loaded: Any, options: dict[str, Any], as_json: bool, views: bool) -> None:
-    """Answer each line of the standard input until it ends. A line that cannot be answered is told why, in JSON by a
-    document with "error" in place of "results", so that every line that is not empty has its document."""
+def _answer(map_path: Path, loaded: Map, results: Sequence[QueryResult], answer: Answer) -> str:
+    from .query_answers import answers_document, answers_text
+
+    if answer.as_json:
+        from .region_details import details
+
+        more = details(loaded, results, answer.views)
+        return json.dumps(answers_document(map_path, results, more, loaded.metric))
+    unit = "" if loaded.metric else "\nThe map's scale is unknown, so lengths are not metres (see freeocc3d scale)."
+    return answers_text(results, loaded.metric) + unit
+
+
+def _answer_lines(loaded: Map, question: Question, answer: Answer) -> None:
+    """Answer each line of the standard input until it ends. A line that cannot be answered gives one sentence on
+    stderr, or with --json a document with "error" in place of "results", so that each line that is not empty has its
+    document."""
+    from dataclasses import replace
+
+    from ..query.questions import ask
+
     while True:
         if sys.stdin.isatty():
             print("> ", end="", file=sys.stderr, flush=True)
         line = sys.stdin.readline()
         if not line:
             return
-        words = [word.strip() for word in line.split(",") if word.strip()]
+        words = tuple(word.strip() for word in line.split(",") if word.strip())
         if not words:
             continue
         try:
-            results = loaded.query_words(words, **options)
-            print(_answer(loaded.path, loaded, results, as_json, views), flush=True)
+            results = ask(loaded, replace(question, words=words))
+            print(_answer(loaded.path, loaded, results, answer), flush=True)
         except FreeOccError as error:
             said = " ".join(str(error).split())
-            if as_json:
+            if answer.as_json:
                 print(json.dumps({"version": __version__, "map": str(loaded.path), "error": said}), flush=True)
             else:
                 print(f"freeocc3d: {said}", file=sys.stderr, flush=True)
 
 
-def _refined(loaded: Any, region: Any, voxel_size: float, output: Path, overwrite: bool) -> Any:
-    from ..editing import box_refinement as refining
+def _refined(loaded: Map, region: Region, voxel_size: float, output: Path, overwrite: bool) -> Any:
+    from ..editing import box_refinement
 
-    progress = ConsoleProgress()
-    box = refining.enclose_region(region, loaded.manifest["voxel_size_m"])
-    try:
-        return refining.refine_box(loaded, box, voxel_size, output, overwrite=overwrite, progress=progress)
-    finally:
-        progress.close()
+    box = box_refinement.enclose_region(region, loaded.manifest["voxel_size_m"])
+    with ConsoleProgress() as progress:
+        return box_refinement.refine_box(loaded, box, voxel_size, output, overwrite=overwrite, progress=progress)

@@ -28,7 +28,7 @@ from ..capture.base import Capture
 from ..core.errors import ConfigError, FrameError, FreeOccError
 from ..core.progress import Progress
 from ..core.transforms import back_project, invert, transform
-from ..core.types import FREE, UNKNOWN, Frame
+from ..core.types import UNKNOWN, Frame
 from ..core.voxel_keys import KEY_LIMIT, pack_voxels, unpack_voxels
 from ..settings import config, registry
 from ..settings.registry import require_positive
@@ -226,19 +226,6 @@ def _observe(
                     continue
                 measured = depth_m[row, column]
                 seen[i, j, k] = measured > 0 and depth <= measured + tolerance
-
-
-def describe_truth(truth: GroundTruth, path: Path) -> str:
-    """What was built, for people."""
-    known = truth.labels != UNKNOWN
-    occupied = known & (truth.labels != FREE)
-    counts = np.bincount(truth.labels[occupied], minlength=len(truth.classes))
-    common = ", ".join(f"{truth.classes[k]} {counts[k]:,}" for k in np.argsort(-counts, kind="stable") if counts[k])
-    x, y, z = truth.shape
-    return (
-        f"{path}: {x} x {y} x {z} voxels of {truth.voxel_size:g} m, {int(known.sum()):,} observed, "
-        f"{int(occupied.sum()):,} occupied\nclasses: {common}"
-    )
 
 
 def _this_module() -> Any:

@@ -59,7 +59,6 @@ def _page(evaluation: Evaluation) -> str:
     environment.filters |= {"percent": _percent, "cm": _cm, "count": lambda number: f"{number:,}"}
     environment.globals |= {"rgb": _rgb}
     scores = evaluation.scores
-    alone = [Evaluation((scene,), evaluation.classes, evaluation.how, evaluation.listed) for scene in evaluation.scenes]
     return environment.get_template("report.html").render(
         version=__version__,
         evaluation=evaluation,
@@ -70,7 +69,7 @@ def _page(evaluation: Evaluation) -> str:
         lists=_lists(evaluation),
         classes=_classes(evaluation),
         confusion=_confusion(evaluation) if evaluation.has_classes else None,
-        scenes=[_scene(own) for own in alone],
+        scenes=[_scene(own) for own in evaluation.by_scene],
         differences=DIFFERENCES,
         cut=CUT,
     )

@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import __version__
 from ..capture import base as capture_base
 from ..capture import open_capture
 from ..capture.base import Capture
@@ -409,131 +407,7 @@ class Evaluation:
         names = self.classes_in_miou if names is None else names
         return self.by_mask[mask].miou(names) if self.has_classes and names else None
 
-    def to_json(self) -> dict[str, Any]:
-        """The document that ``evaluate --json`` prints: fractions 0…1, metres, seconds."""
-        scores = self.scores
-        first = self.scenes[0] if len(self.scenes) == 1 else None
-        per_class = dict(zip(self.classes, scores.class_iou.tolist(), strict=True))
-        counted = self.classes_in_miou if self.has_classes else ()
-        document: dict[str, Any] = {
-            "version": __version__,
-            "scored": [scene.name for scene in self.scenes],
-            "iou": scores.iou,
-            "precision": scores.precision,
-            "recall": scores.recall,
-            "miou": self.miou(),
-            "classes_in_miou": list(counted),
-            "per_class": {name: per_class[name] for name in counted},
-            "absent": list(self.absent),
-            "miou_over": {
-                name: None if names is None else {"miou": self.miou(names), "classes": list(names)}
-                for name, names in self.miou_over.items()
-            },
-            "mask": PRIMARY_MASK,
-            "by_mask": {
-                name: {
-                    "iou": own.iou,
-                    "miou": self.miou(mask=name),
-                    "precision": own.precision,
-                    "recall": own.recall,
-                    "voxels": own.voxels,
-                }
-                for name, own in self.by_mask.items()
-            },
-            "classes": list(self.classes),
-            "ate_rmse_m": self.ate_rmse_m,
-            "frames_with_pose": _total(scene.frames_with_pose for scene in self.scenes),
-            "frames": _total(scene.frames for scene in self.scenes),
-            "align": self.how,
-            "alignment": first.alignment.to_json() if first else None,
-            "trajectory": first.errors.to_json() if first and first.errors else None,
-            "confusion": {
-                "rows_true": ["free", *self.classes],
-                "columns_predicted": ["not occupied", *self.classes, "occupied, no class"],
-                "voxels": scores.matrix.tolist(),
-            },
-            "notes": list(self.notes),
-        }
-        if first is None:
-            document["scenes"] = [
-                Evaluation((scene,), self.classes, self.how, self.listed).to_json() for scene in self.scenes
-            ]
-        return document
-
-    def to_text(self) -> str:
-        """Tables for people; per cent and centimetres."""
-        scores = self.scores
-        exact = f"precision {_percent(scores.precision)}, recall {_percent(scores.recall)}"
-        lines = [
-            f"IoU        {_percent(scores.iou)}  {exact}",
-            *(
-                f"  mask {name:<9} IoU {_percent(own.iou)}, mIoU {_percent(self.miou(mask=name))}, "
-                f"{own.voxels:,} voxels"
-                for name, own in self.by_mask.items()
-            ),
-            f"mIoU       {_percent(self.miou())}  over {_list(self.classes_in_miou)}",
-        ]
-        if self.has_classes:
-            lines += self._lists_as_text()
-        for scene in self.scenes:
-            if len(self.scenes) > 1:
-                own = Evaluation((scene,), self.classes, self.how, self.listed)
-                lines.append(f"{scene.name}: IoU {_percent(own.scores.iou)}, mIoU {_percent(own.miou())}")
-            if scene.errors is not None:
-                lines += _trajectory_lines(scene, self.how)
-        if self.has_classes:
-            lines.append("class                     IoU   true voxels")
-            order = np.argsort(-scores.class_voxels, kind="stable")
-            lines += [
-                f"  {self.classes[k]:<20} {_percent(scores.class_iou[k])}  {scores.class_voxels[k]:12,}"
-                for k in order
-                if scores.class_voxels[k]
-            ]
-        return "\n".join(lines + [f"note: {note}" for note in self.notes])
-
-    def _lists_as_text(self) -> list[str]:
-        """mIoU over the lists of classes that are usually given."""
-        lines, lacking = [], []
-        for name, names in self.miou_over.items():
-            if names is None:
-                lacking.append(name)
-            elif name == "listed":
-                absent = f", absent ones as 0: {', '.join(self.absent)}" if self.absent else ""
-                lines.append(f"  {name:<14} {_percent(self.miou(names))}  over all {len(names)} classes{absent}")
-            elif names != self.classes_in_miou:
-                lines.append(f"  {name:<14} {_percent(self.miou(names))}  over {_list(names)}")
-        named = [name for name in lacking if not name.startswith("top_")]
-        top = [name for name in lacking if name.startswith("top_")]
-        if named:
-            lines.append(f"  not available  {', '.join(named)} (the classes are other ones: map them with --classes)")
-        if top:
-            lines.append(f"  not available  {', '.join(top)} (the truth holds {len(self.scores.present)} classes)")
-        return lines
-
-
-def _trajectory_lines(scene: ScoredScene, how: str) -> list[str]:
-    errors = scene.errors
-    assert errors is not None
-    lines = [
-        f"ATE        {100 * errors.ate_rmse_m:.2f} cm RMSE, {100 * errors.errors_m.max():.2f} cm at most, "
-        f"{len(errors.errors_m)} frames, aligned by {how}"
-        + (f" (scale {scene.alignment.scale:.4f})" if how == "sim3" else "")
-    ]
-    return lines + [
-        f"  RPE over {e.distance_m:g} m   {100 * e.translation_rmse_m:.2f} cm, {e.rotation_rmse_deg:.2f} deg "
-        f"({e.pairs} pairs)"
-        for e in errors.relative
-    ]
-
-
-def _percent(fraction: float | None) -> str:
-    return "    –" if fraction is None else f"{100 * fraction:5.1f}"
-
-
-def _list(names: Sequence[str]) -> str:
-    return f"{len(names)} class{'es' if len(names) != 1 else ''}: {', '.join(names) or 'none'}"
-
-
-def _total(counts: Any) -> int | None:
-    known = [count for count in counts if count is not None]
-    return sum(known) if known else None
+    @property
+    def by_scene(self) -> list[Evaluation]:
+        """Each scene alone."""
+        return [Evaluation((scene,), self.classes, self.how, self.listed) for scene in self.scenes]

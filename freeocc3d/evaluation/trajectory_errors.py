@@ -57,8 +57,8 @@ class TrajectoryErrors:
         """Absolute trajectory error, root mean square, metres."""
         return float(np.sqrt((self.errors_m**2).mean()))
 
-    def to_json(self) -> dict[str, Any]:
-        """``trajectory`` of ``evaluate --json``."""
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values; lengths in metres, angles in degrees."""
         errors = self.errors_m
         return {
             "frames_matched": len(errors),

@@ -77,8 +77,8 @@ class TrajectoryAlignment:
         T_true_cam[..., :3, 3] = self.to_true(T_est_cam[..., :3, 3])
         return T_true_cam
 
-    def to_json(self) -> dict[str, Any]:
-        """``alignment`` of ``evaluate --json``."""
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
         return {
             "scale": self.scale,
             "rotation": self.rotation.tolist(),

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import refused, run
 from scenes import lifted, posed, wall_frame
-from test_main import refused, run
 
 from freeocc3d import load_map
 from freeocc3d.capture.builtin_room import CUP_HEIGHT, CUPS

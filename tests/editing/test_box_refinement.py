@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_main import refused, run
+from command_line import refused, run
 
 from freeocc3d.capture.builtin_room import CUP_HEIGHT, CUPS
 from freeocc3d.core.errors import MapError

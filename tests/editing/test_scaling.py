@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from test_main import refused, run
+from command_line import refused, run
 
 from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import FreeOccError, MapError
@@ -180,8 +180,8 @@ def test_the_commands_say_what_the_unit_is(room: Map, half: Map, tmp_path: Path)
     assert "edge 0.04 units\n" in run("info", half.path).stdout
     assert "edge 0.08 m\n" in run("info", room.path).stdout
     unknown, known = (run("query", scan_map.path, "red cup").stdout for scan_map in (half, room))
-    assert "Lengths are not metres" in unknown
-    assert "Lengths are not metres" not in known
+    assert "lengths are not metres" in unknown
+    assert "lengths are not metres" not in known
     assert "(m)" not in unknown
     assert "(l)" not in unknown
     (header, row), (header_m, row_l) = (text.splitlines()[1:3] for text in (unknown, known))

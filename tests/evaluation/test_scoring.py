@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import refused, run
 from helpers import data_folder
-from test_main import refused, run
 
 import freeocc3d
+from freeocc3d.cli.scores import scores_document, scores_text
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.evaluation.confusion import Prediction
 from freeocc3d.evaluation.ground_truth import load_ground_truth, save_ground_truth
@@ -50,17 +51,17 @@ def test_scenes_are_pooled_by_voxels_and_absent_classes_count_zero_in_a_list() -
     assert pooled.miou(classes) == pytest.approx((2 / 4 + 1 / 2) / 3)
     assert Evaluation((one, two), classes, "none", listed=True).miou() == pytest.approx((2 / 4 + 1 / 2) / 3)
     assert pooled.scores.iou == pytest.approx(4 / 6)
-    document = pooled.to_json()
+    document = scores_document(pooled)
     assert document["per_class"] == {"wall": pytest.approx(0.5), "sofa": pytest.approx(0.5)}
     assert [own["iou"] for own in document["scenes"]] == [1.0, pytest.approx(1 / 3)]
-    reordered = Evaluation((two, one), classes, "none").to_json()
+    reordered = scores_document(Evaluation((two, one), classes, "none"))
     for name in ("iou", "miou", "precision", "recall", "per_class", "confusion", "by_mask"):
         assert reordered[name] == document[name]
 
 
 def test_both_masks_stand_side_by_side() -> None:
     masked = scene([1, 1, 0, 0, 255], [1, 0, 1, 0, 1], ("wall",), frames=[1, 0, 0, 1, 1])
-    document = Evaluation((masked,), ("wall",), "none").to_json()
+    document = scores_document(Evaluation((masked,), ("wall",), "none"))
     assert document["mask"] == "label"
     assert document["by_mask"]["label"]["iou"] == document["iou"] == pytest.approx(1 / 3)
     assert document["by_mask"]["frames"] == {"iou": 1.0, "miou": 1.0, "precision": 1.0, "recall": 1.0, "voxels": 2}
@@ -76,17 +77,17 @@ def test_lists_of_classes_over_which_miou_is_given() -> None:
     assert scored.miou() == pytest.approx(11 / 12)
     assert scored.miou_over["top_20"] is None
     assert scored.miou_over["shared_8"] is None
-    assert "top_20, top_30, top_40 (the truth holds 12 classes)" in scored.to_text()
+    assert "top_20, top_30, top_40 (the truth holds 12 classes)" in scores_text(scored)
 
 
 def test_a_claim_without_classes_has_no_miou_which_is_not_zero() -> None:
     scored = Evaluation((scene([1, 0], None, ("wall",)),), ("wall",), "none")
-    document = scored.to_json()
+    document = scores_document(scored)
     assert document["miou"] is None
     assert document["per_class"] == {}
     assert document["classes_in_miou"] == []
     assert document["iou"] == 1.0
-    assert "mIoU           –" in scored.to_text()
+    assert "mIoU           –" in scores_text(scored)
 
 
 @pytest.fixture(scope="module")
@@ -142,9 +143,9 @@ def test_a_shifted_and_a_swapped_truth_score_what_numpy_counts(tmp_path: Path) -
     def scored(labels: Any, origin: Any = truth.origin) -> dict[str, Any]:
         save_ground_truth(GroundTruth(labels, origin, 0.08, truth.classes), tmp_path / "claim.npz", True)
         save_ground_truth(truth, tmp_path / "truth.npz", True)
-        return evaluate_scenes(
-            ScoringRequest(grid=tmp_path / "claim.npz", ground_truths=[tmp_path / "truth.npz"])
-        ).to_json()
+        return scores_document(
+            evaluate_scenes(ScoringRequest(grid=tmp_path / "claim.npz", ground_truths=[tmp_path / "truth.npz"]))
+        )
 
     occupied = known & (truth.labels > 0)
     for axis in range(3):
@@ -168,7 +169,7 @@ def test_maps_are_pooled_and_a_split_must_be_whole(bedroom: Path, tmp_path: Path
     one = evaluate_scenes(ScoringRequest(maps=[bedroom]))
     two = evaluate_scenes(ScoringRequest(maps=[bedroom, bedroom]))
     np.testing.assert_array_equal(two.scores.matrix, 2 * one.scores.matrix)
-    assert two.to_json()["frames_with_pose"] == 60
+    assert scores_document(two)["frames_with_pose"] == 60
     assert two.ate_rmse_m == pytest.approx(one.ate_rmse_m)
     (tmp_path / "split.txt").write_text("bedroom\n")
     assert evaluate_scenes(ScoringRequest(maps=[bedroom], split=tmp_path / "split.txt")).scores.iou == one.scores.iou

@@ -57,7 +57,7 @@ def test_ate_is_the_root_mean_square_of_what_alignment_leaves() -> None:
     a, b = Poses(np.arange(4.0), estimated), Poses(np.arange(4.0), true)
     errors = measure_trajectory_errors(a, b, align_trajectories(a, b))
     assert errors.ate_rmse_m == pytest.approx(0.03, rel=1e-3)
-    assert errors.to_json()["ate_m"]["max"] == pytest.approx(0.03, rel=1e-3)
+    assert errors.as_dict()["ate_m"]["max"] == pytest.approx(0.03, rel=1e-3)
 
 
 def test_a_mirrored_trajectory_keeps_its_error() -> None:
@@ -154,7 +154,7 @@ def test_errors_agree_with_evo_on_the_same_files(tmp_path: Path, how: str, seed:
     ape = metrics.APE(metrics.PoseRelation.translation_part)
     ape.process_data((evo_true, evo_est))
     theirs = ape.get_all_statistics()
-    for name, value in own.to_json()["ate_m"].items():
+    for name, value in own.as_dict()["ate_m"].items():
         assert value == pytest.approx(theirs[name], abs=1e-6), name
     assert [e.distance_m for e in own.relative] == [0.1, 0.5, 1.0, 2.0]
     for error in own.relative:

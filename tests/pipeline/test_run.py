@@ -357,7 +357,7 @@ def glued(tmp_path_factory):
 
 
 def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -> None:
-    from freeocc3d.cli import summary
+    from freeocc3d.cli.map_summary import summary_text
 
     made = freeocc3d.reconstruct(glued, tmp_path / "map")
     assert made.manifest["counts"]["submaps"] == 2
@@ -370,7 +370,7 @@ def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -
     assert [frame.index for frame in made.keyframes] == made.trajectory.keyframes.tolist()
     assert len(list((made.path / "keyframes").glob("*.color.jpg"))) == len(made.keyframes)
     assert made.gaussians.anchor_keyframe.max() < len(made.keyframes)
-    text = summary.to_text(made)
+    text = summary_text(made)
     assert "2 submaps" in text
     assert "frames 15 to 22: 8 with a pose" in text
     assert "apart, not in the map" in text

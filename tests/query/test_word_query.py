@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from itertools import product
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,7 +17,7 @@ from freeocc3d.language.encoders.base import TextEncoder, TextFeatures
 from freeocc3d.language.encoders.labels import LabelWords
 from freeocc3d.occupancy.connected_components import label_components
 from freeocc3d.query import word_query as asking
-from freeocc3d.query.word_query import Options, query, similarity, to_json, to_text
+from freeocc3d.query.word_query import Options, query, similarity
 
 SIZE = 0.1
 CLASSES = ["nothing", "cup", "sofa", "coffee table", "dining table", "wall"]
@@ -350,24 +348,6 @@ def test_results_do_not_depend_on_the_size_of_the_work_chunks(monkeypatch: pytes
     for a, b in zip(whole, parts, strict=True):
         np.testing.assert_allclose(a.scores, b.scores, atol=1e-6)
         assert [r.voxels for r in a.regions] == [r.voxels for r in b.regions]
-
-
-def test_json_has_the_documented_keys_and_is_json() -> None:
-    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1)))
-    document = json.loads(json.dumps(to_json(Path("maps/room"), query(room, WORDS, ["sofa", "unicorn"]))))
-    assert document["map"] == "maps/room"
-    sofa, unicorn = document["results"]
-    documented = {"score", "confidence", "centroid", "box_min", "box_max", "volume_m3", "voxels"}
-    assert documented <= set(sofa["regions"][0])
-    assert sofa["regions"][0]["box_max"] == [0.2, 0.2, 0.2]
-    assert (unicorn["matched"], unicorn["regions"], unicorn["understood"]) == (False, [], "")
-
-
-def test_text_names_each_word_and_region() -> None:
-    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1)))
-    text = to_text(query(room, WORDS, ["sofa", "unicorn"]))
-    assert "sofa: 1 region" in text
-    assert "unicorn: no match" in text
 
 
 def test_importing_the_query_imports_nothing_heavy() -> None:

@@ -154,6 +154,6 @@ def test_files_that_are_no_trajectory_are_refused(tmp_path: Path, text: str) -> 
 
 
 def test_the_json_form_is_plain() -> None:
-    assert TrajectoryAlignment.identity().to_json() == {
+    assert TrajectoryAlignment.identity().as_dict() == {
         "scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]
     }  # fmt: skip

@@ -63,7 +63,7 @@ def score_map(map: str, capture: str, out: str) -> Figures:
     alignment = align_trajectories(estimated, true, how)
     errors = measure_trajectory_errors(estimated, true, alignment)
     save_poses(Path(out), alignment.poses(loaded.trajectory.T_world_cam), errors, loaded.up @ alignment.rotation.T)
-    figures: Figures = {"ate_rmse_m": errors.ate_rmse_m, "trajectory": errors.to_json()}
+    figures: Figures = {"ate_rmse_m": errors.ate_rmse_m, "trajectory": errors.as_dict()}
     figures["held_out"] = measure_held_out(loaded)
     truth_path = Path(capture) / "ground_truth.npz"
     if truth_path.is_file():

@@ -55,7 +55,7 @@ def track_dense_slam(capture: str, frames: int | None, out: str) -> Figures:
         "seconds": seconds,
         "tracking_failures": failures,
         "ate_rmse_m": errors.ate_rmse_m,
-        "trajectory": errors.to_json(),
+        "trajectory": errors.as_dict(),
     }
 
 

@@ -1,4 +1,4 @@
-"""What is in a map and how it was made: what ``freeocc3d info`` says."""
+"""What is in a map and how it was made, as text and as the document of ``info --json``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 _SHOWN_NAMES = 12
 
 
-def facts(loaded: Map) -> dict[str, Any]:
+def summary_document(loaded: Map) -> dict[str, Any]:
     """What ``info --json`` prints."""
     manifest, report = loaded.manifest, loaded.report
     counts = manifest["counts"]
@@ -48,9 +48,9 @@ def facts(loaded: Map) -> dict[str, Any]:
     }
 
 
-def to_text(loaded: Map) -> str:
-    """What ``info`` prints."""
-    said = facts(loaded)
+def summary_text(loaded: Map) -> str:
+    """What ``info`` prints for people."""
+    said = summary_document(loaded)
     size = sum(said["bytes"].values())
     used = said["frames"] - said["frame_status"].get("unused", 0)
     largest, smallest = said["voxel_size_m"], said["finest_voxel_m"]

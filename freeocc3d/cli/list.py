@@ -7,16 +7,16 @@ from typing import Annotated
 
 import typer
 
-from .console import Json
+from .console import Json, flag
 
 
 def list_backends(
     kind: Annotated[
         str | None,
-        typer.Argument(metavar="[KIND]", help="Only these: readers, trackers, rasterizers, encoders, exporters."),
+        typer.Argument(metavar="KIND", help="Only these: readers, trackers, rasterizers, encoders, exporters."),
     ] = None,
     as_json: Json = False,
-    as_yaml: Annotated[bool, typer.Option("--yaml", help="Print a configuration with every key, commented.")] = False,
+    as_yaml: Annotated[bool, flag("--yaml", "Print a configuration file that explains every key.")] = False,
 ) -> None:
     """List readers, trackers, encoders and exporters with their options."""
     from ..settings import config, registry

@@ -1,0 +1,49 @@
+"""``freeocc3d demo``: the built-in room, mapped, asked and drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .console import ConsoleProgress, Overwrite
+from .map_summary import summary_text
+from .query_answers import answers_text
+
+WORDS = "red cup", "blue chair", "green plant"
+"""What the demo asks."""
+
+
+def demo(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder for the map and the pictures.")
+    ] = Path("demo"),
+    frames: Annotated[
+        int,
+        typer.Option(
+            "--frames",
+            metavar="N",
+            min=2,
+            help="Number of frames of the walk through the room. Fewer frames are faster and lie farther apart.",
+        ),
+    ] = 240,
+    overwrite: Overwrite = False,
+) -> None:
+    """Map the built-in room, ask three words, and draw pictures."""
+    from ..pipeline import run
+    from ..settings import config
+    from ..viewer import map_pictures
+
+    settings = config.load(None, [f"capture.synthetic.frames={frames}"])
+    with ConsoleProgress() as progress:
+        made = run.reconstruct("builtin:room", output / "map", settings, overwrite=overwrite, progress=progress)
+    print(summary_text(made))
+    written = [output / "map.png"]
+    map_pictures.write_map_picture(made, written[0], overwrite=overwrite)
+    results = made.query_words(list(WORDS), top_k=5)
+    print(answers_text(results))
+    for result in results:
+        written.append(output / f"query_{result.word.replace(' ', '_')}.png")
+        map_pictures.write_query_picture(made, [result], written[-1], overwrite)
+    print("pictures: " + ", ".join(str(path) for path in written))

@@ -1,0 +1,70 @@
+"""The answers to a query, as text and as the document of ``query --json``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from .. import __version__
+from ..query.regions import Region
+from ..query.word_query import QueryResult
+
+
+def answers_document(
+    map_path: Path,
+    results: Sequence[QueryResult],
+    more: Callable[[Region], dict[str, Any]] | None = None,
+    metric: bool = True,
+) -> dict[str, Any]:
+    """Plain values: metres (if ``metric``) in the map frame, fractions 0 to 1. more: gives further keys of a region."""
+    return {
+        "version": __version__,
+        "map": str(map_path),
+        "metric": metric,
+        "results": [
+            {
+                "word": result.word,
+                "matched": result.matched,
+                "understood": result.understood,
+                "note": result.note,
+                "regions": [_region(region) | (more(region) if more else {}) for region in result.regions],
+            }
+            for result in results
+        ],
+    }
+
+
+def _region(region: Region) -> dict[str, Any]:
+    return {
+        "label": region.label,
+        "score": round(region.score, 4),
+        "confidence": round(region.confidence, 4),
+        "centroid": region.centroid.round(4).tolist(),
+        "box_min": region.box_min.round(4).tolist(),
+        "box_max": region.box_max.round(4).tolist(),
+        "volume_m3": round(region.volume_m3, 6),
+        "voxels": region.voxels,
+    }
+
+
+def answers_text(results: Sequence[QueryResult], metric: bool = True) -> str:
+    """A table for people, in metres and liters, or in the map's units where these are not ``metric``."""
+    length, volume, per_unit3, digits = ("m", "l", 1000, 1) if metric else ("units", "units^3", 1, 5)
+    lines = []
+    for result in results:
+        count = len(result.regions)
+        title = f"{result.word}: {count} region{'s' if count != 1 else ''}" if count else f"{result.word}: no match"
+        lines.append(f"{title}. {result.note}".rstrip(". ") + ("." if result.note else ""))
+        if count:
+            columns = f"{f'centroid ({length})':23}  {f'size ({length})':19}  {f'volume ({volume})':>10}"
+            lines.append(f"   #  score  conf.  {columns}  voxels")
+        for number, region in enumerate(result.regions, start=1):
+            x, y, z = region.centroid
+            dx, dy, dz = region.box_max - region.box_min
+            lines.append(
+                f"  {number:2d}   {region.score:.2f}   {region.confidence:.2f}  "
+                f"{x:7.2f} {y:7.2f} {z:7.2f}  {dx:5.2f} x {dy:4.2f} x {dz:4.2f}  "
+                f"{per_unit3 * region.volume_m3:{len(f'volume ({volume})')}.{digits}f}  {region.voxels:6d}"
+            )
+    return "\n".join(lines)

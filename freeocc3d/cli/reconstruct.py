@@ -1,0 +1,61 @@
+"""``freeocc3d reconstruct``: a captured scan becomes a map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..core.errors import ConfigError
+from ..settings.config import Config
+from .console import ConsoleProgress, NewMap, Overwrite, Set, flag
+from .map_summary import summary_text
+
+_DEVICES = ("tracking", "backend"), ("fitting", "rasterizer")
+"""Section and key of the choices whose backends may have an option ``device``."""
+
+
+def reconstruct(
+    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Folder of a scan, a video file, or builtin:room.")],
+    output: NewMap,
+    config_file: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE|NAME", help="YAML file with options, or a preset such as mono."),
+    ] = None,
+    overrides: Set = None,
+    resume: Annotated[bool, flag("--resume", "Continue an interrupted run.")] = False,
+    overwrite: Overwrite = False,
+    device: Annotated[
+        str | None,
+        typer.Option("--device", metavar="DEVICE", help="Processor to compute on: cpu or cuda:0.", show_default="cpu"),
+    ] = None,
+    scale: Annotated[
+        float | None,
+        typer.Option("--scale", metavar="S", help="Metres per unit of the poses, for scans without depth."),
+    ] = None,
+) -> None:
+    """Turn a captured scan into a map."""
+    from ..pipeline import run
+    from ..settings import config
+
+    of_scale = [] if scale is None else [f"capture.scale={scale}"]
+    settings = config.load(config_file, [*(overrides or []), *of_scale])
+    if device is not None:
+        _move(settings, device)
+    with ConsoleProgress() as progress:
+        made = run.reconstruct(capture, output, settings, overwrite=overwrite, resume=resume, progress=progress)
+    print(summary_text(made))
+
+
+def _move(settings: Config, device: str) -> None:
+    """Let what can run on a device run on it. Raises ConfigError where nothing can."""
+    chosen = [(section, settings[section][key]) for section, key in _DEVICES]
+    movable = [settings[section][name] for section, name in chosen if "device" in settings[section].get(name, {})]
+    for options in movable:
+        options["device"] = device
+    if device != "cpu" and not movable:
+        raise ConfigError(
+            f"Nothing that is chosen runs on {device}: it needs fitting.rasterizer=gsplat, or "
+            "tracking.backend=odometry."
+        )
