@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.atomic_files import write_whole
 from ..core.errors import ConfigError, ExportError
+from ..core.ply_files import write_ply
 from ..core.types import OCCUPIED, Occupancy
 from ..occupancy.surface_faces import find_exposed_faces
 from ..query.word_query import QueryResult
@@ -103,20 +104,10 @@ def write_colored_ply(
 ) -> None:
     """Binary little-endian PLY with coloured vertices and, if given, quads; what describes it in comments. Raises
     OSError."""
-    vertex = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    vertex["xyz"], vertex["rgb"] = points, colors
+    vertices = np.empty(
+        len(points), [*((name, "<f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
+    )
+    for name, column in zip(vertices.dtype.names or (), (*points.T, *colors.T), strict=True):
+        vertices[name] = column
     comments = ["freeocc3d", *(f"{name} {json.dumps(value)}" for name, value in (described or {}).items())]
-    header = [
-        "ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments),
-        f"element vertex {len(points)}",
-        *(f"property float {name}" for name in "xyz"), *(f"property uchar {name}" for name in ("red", "green", "blue")),
-    ]  # fmt: skip
-    if quads is not None:
-        header += [f"element face {len(quads)}", "property list uchar int vertex_indices"]
-    with path.open("wb") as stream:
-        stream.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
-        stream.write(vertex.tobytes())
-        if quads is not None:
-            face = np.empty(len(quads), [("count", "u1"), ("corners", "<i4", 4)])
-            face["count"], face["corners"] = 4, quads
-            stream.write(face.tobytes())
+    write_ply(path, vertices, quads, comments)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..core.errors import MapError
+from ..core.errors import FreeOccError, MapError
+from ..core.ply_files import read_ply_vertices
 from ..core.types import Gaussians
 
 if TYPE_CHECKING:
@@ -41,7 +42,10 @@ def to_point_cloud(gaussians: Gaussians) -> o3d.t.geometry.PointCloud:
 
 def from_point_cloud(cloud: o3d.t.geometry.PointCloud) -> Gaussians:
     """The inverse of ``to_point_cloud``. Raises MapError if an attribute is missing."""
-    columns = {name: cloud.point[name].numpy() for name in cloud.point}
+    return _from_columns({name: cloud.point[name].numpy() for name in cloud.point})
+
+
+def _from_columns(columns: dict[str, np.ndarray]) -> Gaussians:
     fields = {"means": _take(columns, "positions", 3, np.float32), "colors": _take(columns, "colors", 3, np.uint8)}
     for name, (field, width, dtype) in _ATTRIBUTES.items():
         values = _take(columns, name, width, dtype)
@@ -64,13 +68,15 @@ def write_gaussian_ply(gaussians: Gaussians, path: Path) -> None:
 
 def read_gaussian_ply(path: Path) -> Gaussians:
     """Read what ``write_gaussian_ply`` wrote. Raises MapError."""
-    import open3d as o3d
-
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.t.io.read_point_cloud(str(path))
-    if cloud.is_empty():
-        raise MapError(f"{path} holds no points or is damaged.")
-    return from_point_cloud(cloud)
+    try:
+        rows = read_ply_vertices(path)
+    except FreeOccError as error:
+        raise MapError(str(error)) from error
+    columns = {name: np.ascontiguousarray(rows[name])[:, None] for name in rows.dtype.names or ()}
+    for name, parts in (("positions", "xyz"), ("colors", ("red", "green", "blue"))):
+        if all(part in columns for part in parts):
+            columns[name] = np.concatenate([columns[part] for part in parts], axis=1)
+    return _from_columns(columns)
 
 
 def _take(columns: dict[str, np.ndarray], name: str, width: int, dtype: type) -> np.ndarray:

@@ -2,8 +2,7 @@
 
 Format: B. Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023: ``x y z``, ``f_dc_0..2`` with rgb = 0.5 + f_dc / (2
 sqrt(pi)), ``opacity`` as a logit, ``scale_*`` as natural logarithms (one where the Gaussians are spheres), ``rot_0..3``
-wxyz, not always of unit length. Read here, not by Open3D, whose reader turns some of them into natural units, which
-ones depending on its version.
+wxyz, not always of unit length.
 """
 
 from __future__ import annotations
@@ -15,18 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError
+from ..core.ply_files import read_ply_header, read_ply_vertices, write_ply
 from ..core.types import Gaussians
 
 _SH_C0 = 0.5 / math.sqrt(math.pi)
 _LEAST_OPACITY = 1e-6  # whose logit, and that of one minus it, are finite
 _NEEDED = ("x", "y", "z", "opacity", "scale_0", "rot_0", "rot_1", "rot_2", "rot_3")
-_LONGEST_HEADER = 1 << 16
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
-    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
-}  # fmt: skip
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def read_standard_ply(path: Path) -> tuple[Gaussians, NDArray[np.int64] | None]:
@@ -76,11 +69,8 @@ def write_standard_ply(gaussians: Gaussians, path: Path) -> None:
         np.log(gaussians.scales.astype(np.float64)),
         gaussians.quats_wxyz,
     )
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
-    header += [*(f"property float {name}" for name in names), "end_header"]
-    with path.open("wb") as stream:
-        stream.write(("\n".join(header) + "\n").encode("ascii"))
-        stream.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
+    table = np.ascontiguousarray(np.concatenate(columns, axis=1), "<f4")
+    write_ply(path, table.view([(name, "<f4") for name in names])[:, 0])
 
 
 def _columns(rows: NDArray[np.void], names: list[str]) -> NDArray[np.float64]:
@@ -90,34 +80,8 @@ def _columns(rows: NDArray[np.void], names: list[str]) -> NDArray[np.float64]:
 
 def _rows(path: Path) -> NDArray[np.void]:
     """(N,) the vertices as records of their properties."""
-    try:
-        with path.open("rb") as stream:
-            text, end, _ = stream.read(_LONGEST_HEADER).partition(b"end_header\n")
-        size = path.stat().st_size
-    except OSError as error:
-        raise FreeOccError(f"Cannot read the Gaussians {path}: {(error.strerror or str(error)).lower()}.") from error
-    lines = [line.split() for line in text.decode("latin-1").splitlines() if line.strip()]
-    elements = [line for line in lines if line[0] == "element"]
-    order = next((line[1] for line in lines if line[0] == "format" and len(line) > 1), "")
-    if not text.startswith(b"ply") or not end or not elements or elements[0][1:2] != ["vertex"]:
-        raise FreeOccError(f"{path} is not a PLY file whose first element is 'vertex'.")
-    first = lines.index(elements[0]) + 1
-    last = lines.index(elements[1]) if len(elements) > 1 else len(lines)
-    properties = [line for line in lines[first:last] if line[0] == "property"]
-    names = [line[-1] for line in properties]
+    names = [line[-1] for line in read_ply_header(path).elements[0][2]]
     if missing := [name for name in _NEEDED if name not in names]:
         hint = " It is a map's own file: evaluate the map's folder." if "anchor_0" in names else ""
         raise FreeOccError(f"{path} is no 3D Gaussian splatting PLY: its vertices lack {', '.join(missing)}.{hint}")
-    if (
-        order not in _ORDERS
-        or len(set(names)) < len(names)
-        or any(len(line) != 3 or line[1] not in _TYPES for line in properties)
-    ):
-        raise FreeOccError(f"{path} is a PLY of the form '{order}'; Gaussians are stored as binary ones without lists.")
-    dtype = np.dtype([(name, _ORDERS[order] + _TYPES[kind]) for _, kind, name in properties])
-    count = int(elements[0][2]) if elements[0][2:] and elements[0][2].isdigit() else 0
-    if count == 0 or len(text) + len(end) + count * dtype.itemsize > size:
-        raise FreeOccError(
-            f"{path} is damaged or empty: its header states {count} Gaussians, its size is {size} bytes."
-        )
-    return np.fromfile(path, dtype, count, offset=len(text) + len(end))
+    return read_ply_vertices(path)

@@ -18,6 +18,7 @@ from ...core.types import Intrinsics
 from ..base import Options
 from ..camera_files import Calibration, read_json
 from ..lenses import BROWN_MODELS, PINHOLE_MODELS, Lens, lens_of
+from ..point_files import read_points
 from ..posed_images import PosedImage, PosedImages, compute_nominal_scale, resolve_inside
 from ..trajectory_files import read_trajectory
 from .photos import make_natural_key, read_header
@@ -58,7 +59,7 @@ class Reader(PosedImages):
         comes_with_depth = any("depth_file_path" in frame for frame in content["frames"])
         scale = options.scale
         if scale is None and not comes_with_depth and (points := content.get("ply_file_path")):
-            scale = compute_nominal_scale(posed, _read_points(resolve_inside(path, str(points), file)))
+            scale = compute_nominal_scale(posed, _points(resolve_inside(path, str(points), file)))
         super().__init__(path, options, posed, scale)
         self.metric_poses = comes_with_depth or options.scale is not None
 
@@ -67,13 +68,12 @@ class Reader(PosedImages):
         return (path / TRANSFORMS).is_file()
 
 
-def _read_points(file: Path) -> NDArray[np.float64]:
+def _points(file: Path) -> NDArray[np.float64]:
     """(P, 3), of a PLY file; none if it is not there or damaged, for they are not needed."""
-    import open3d as o3d
-
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(str(file), remove_nan_points=True, remove_infinite_points=True)
-    return np.asarray(cloud.points, np.float64).reshape(-1, 3)
+    try:
+        return read_points(file)
+    except CaptureError:
+        return np.zeros((0, 3))
 
 
 def _lens(stated: Mapping[str, Any], image: Path, file: Path) -> Lens:

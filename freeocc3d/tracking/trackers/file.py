@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ...capture import read_trajectory
 from ...capture.base import Capture
-from ...core.errors import CaptureError, ConfigError, TrackingError
+from ...capture.point_files import read_points
+from ...core.errors import ConfigError, TrackingError
 from ...core.transforms import invert, project, transform
 from ...core.types import Frame
 from ...settings.registry import require_positive
@@ -58,7 +59,7 @@ def load(options: Options, capture: Capture) -> FileTracker:
         raise ConfigError("tracking.backend=file needs tracking.file.path, the trajectory that is to be taken.")
     found = read_trajectory(_beside(options.path, capture))
     T_world_cam = found.of_frames(capture, options.max_time_difference)
-    points = None if options.points is None else _read_points(_beside(options.points, capture))
+    points = None if options.points is None else read_points(_beside(options.points, capture)).astype(np.float32)
     scale = _scale(T_world_cam, capture, options)
     T_world_cam[:, :3, 3] *= scale
     scaled = None if points is None else points * np.float32(scale)
@@ -113,19 +114,6 @@ def _beside(path: str, capture: Capture) -> Path:
     given = Path(path).expanduser()
     inside = (capture.path.parent if capture.path.is_file() else capture.path) / given
     return inside if not given.exists() and inside.exists() else given
-
-
-def _read_points(path: Path) -> NDArray[np.float32]:
-    """(P, 3). Raises CaptureError."""
-    import open3d as o3d
-
-    if not path.is_file():
-        raise CaptureError(f"There is no point cloud {path} (tracking.file.points).")
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(str(path), remove_nan_points=True, remove_infinite_points=True)
-    if not len(cloud.points):
-        raise CaptureError(f"{path} holds no points, or is no point cloud that can be read (PLY, PCD or XYZ).")
-    return np.asarray(cloud.points, np.float32)
 
 
 def _scale(T_world_cam: NDArray[np.float64], capture: Capture, options: Options) -> float:

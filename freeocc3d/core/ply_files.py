@@ -1,0 +1,111 @@
+"""PLY files: vertices as records, read after the header is checked against the file's size, and written.
+
+Source: G. Turk, The PLY Polygon File Format, 1994. Of the libraries, Open3D's readers change some properties of
+Gaussians to natural units, which ones depending on its version; plyfile's license (GPL) does not go with this one's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import FreeOccError
+
+_LONGEST_HEADER = 1 << 16
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_NAMES = {"f4": "float", "u1": "uchar", "i4": "int"}
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """form: such as "binary_little_endian".  elements: (name, count, lines of its properties, split into words) each.
+    length: of the header in bytes."""
+
+    form: str
+    elements: tuple[tuple[str, int, tuple[tuple[str, ...], ...]], ...]
+    length: int
+
+    @property
+    def least_bytes(self) -> int:
+        """What the elements take at least: of a list only its length, of a number in text a digit and a space."""
+        total = 0
+        for _, count, properties in self.elements:
+            kinds = [line[1] if line[0] == "list" else line[0] for line in properties]
+            total += count * (2 * len(kinds) if self.form == "ascii" else sum(int(_TYPES[kind][1]) for kind in kinds))
+        return total
+
+
+def read_ply_header(path: Path) -> PlyHeader:
+    """Raises FreeOccError: no such file, not a PLY, or the file is smaller than its header states."""
+    try:
+        with path.open("rb") as stream:
+            text, end, _ = stream.read(_LONGEST_HEADER).partition(b"end_header")
+            stream.seek(len(text) + len(end))
+            ending = stream.readline(3)
+        size = path.stat().st_size
+    except OSError as error:
+        raise FreeOccError(f"Cannot read {path}: {(error.strerror or str(error)).lower()}.") from error
+    lines = [tuple(line.split()) for line in text.decode("latin-1").splitlines() if line.strip()]
+    form, elements = "", []
+    try:
+        for first, *rest in lines[1:]:
+            if first == "format":
+                form = rest[0]
+            elif first == "element":
+                elements.append((rest[0], int(rest[1]), list[tuple[str, ...]]()))
+            elif first == "property":
+                kinds = rest[1:3] if rest[0] == "list" else rest[:1]
+                if not set(kinds) <= set(_TYPES):
+                    raise ValueError(" ".join(rest))
+                elements[-1][2].append(tuple(rest))
+    except (IndexError, ValueError) as error:
+        raise FreeOccError(f"{path} is not a PLY file: its header cannot be read ({error}).") from error
+    if not text.startswith(b"ply") or not end or not elements:
+        raise FreeOccError(f"{path} is not a PLY file.")
+    listed = tuple((name, count, tuple(properties)) for name, count, properties in elements)
+    header = PlyHeader(form, listed, len(text) + len(end) + len(ending))
+    if min(count for _, count, _ in elements) < 0 or header.length + header.least_bytes > size:
+        raise FreeOccError(f"{path} is damaged: its header states more than the {size} bytes that it has.")
+    return header
+
+
+def read_ply_vertices(path: Path) -> NDArray[np.void]:
+    """(N,) the vertices of a binary PLY as records of their properties. Raises FreeOccError."""
+    header = read_ply_header(path)
+    name, count, properties = header.elements[0]
+    names = [line[-1] for line in properties]
+    if name != "vertex" or len(set(names)) < len(names):
+        raise FreeOccError(f"{path} is not a PLY file whose first element is 'vertex'.")
+    if header.form not in _ORDERS or any(len(line) != 2 for line in properties):
+        raise FreeOccError(f"{path} is a PLY of the form '{header.form}'; only binary ones without lists are read.")
+    if not count:
+        raise FreeOccError(f"{path} is damaged or empty: its header states 0 vertices.")
+    dtype = np.dtype([(name, _ORDERS[header.form] + _TYPES[kind]) for kind, name in properties])
+    return np.fromfile(path, dtype, count, offset=header.length)
+
+
+def write_ply(
+    path: Path, vertices: NDArray[np.void], quads: NDArray[np.int32] | None = None, comments: Sequence[str] = ()
+) -> None:
+    """Binary little-endian PLY of (N,) records of numbers and, if given, (Q, 4) quads of their rows. Raises OSError."""
+    kinds = {name: vertices.dtype[name].str[1:] for name in vertices.dtype.names or ()}
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    header += [f"element vertex {len(vertices)}", *(f"property {_NAMES[kind]} {name}" for name, kind in kinds.items())]
+    if quads is not None:
+        header += [f"element face {len(quads)}", "property list uchar int vertex_indices"]
+    with path.open("wb") as stream:
+        stream.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        stream.write(vertices.astype(vertices.dtype.newbyteorder("<"), copy=False).tobytes())
+        if quads is not None:
+            face = np.empty(len(quads), [("count", "u1"), ("corners", "<i4", 4)])
+            face["count"], face["corners"] = 4, quads
+            stream.write(face.tobytes())
