@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -13,6 +14,8 @@ import pytest
 from helpers import camera_matrix, color_image, depth_image
 
 ROOT = Path(__file__).parents[2]
+pytest.importorskip("freeocc3d.settings.typed_options")
+
 PACKAGE = "example_backends"
 LONGEST = 40
 
@@ -45,9 +48,12 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(installed: Path, *words: str) -> str:
+def run(installed: Path, *commands: list[str]) -> str:
+    """What the commands print, run one after the other in one new process, in which the package is installed."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(installed), str(ROOT)])}
-    command = [sys.executable, "-m", "freeocc3d.cli", *words]
+    program = "import json, sys\nfrom freeocc3d.cli.main import app\nfor words in json.loads(sys.argv[1]):\n"
+    program += "    app(args=words, prog_name='freeocc3d', standalone_mode=False)"
+    command = [sys.executable, "-c", program, json.dumps(commands)]
     done = subprocess.run(command, cwd=installed, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -75,18 +81,22 @@ def test_there_is_an_example_of_each_kind() -> None:
 
 
 def test_the_examples_are_listed(installed: Path) -> None:
-    listed = run(installed, "list")
+    listed = run(installed, ["list"])
     for name in ("numpy_frames", "tripod", "brightness", "csv"):
         assert re.search(rf"^ +{name} ", listed, re.MULTILINE), name
 
 
 def test_the_examples_map_a_scan(installed: Path, tmp_path: Path) -> None:
     scan, made, table = write_scan(tmp_path / "scan"), tmp_path / "map", tmp_path / "map.csv"
-    chosen = ("--set", "tracking.backend=tripod", "--set", "language.encoder=brightness")
-    run(installed, "reconstruct", str(scan), "-o", str(made), *chosen, "--set", "fitting.passes=0")
-    assert "6 with a pose" in run(installed, "info", str(made))
-    assert "bright: 1 region" in run(installed, "query", str(made), "bright")
-    run(installed, "export", str(made), "--format", "csv", "-o", str(table), "--set", "least=0.6")
+    chosen = ["--set", "tracking.backend=tripod", "--set", "language.encoder=brightness", "--set", "fitting.passes=0"]
+    printed = run(
+        installed,
+        ["reconstruct", str(scan), "-o", str(made), *chosen],
+        ["query", str(made), "bright"],
+        ["export", str(made), "--format", "csv", "-o", str(table), "--set", "least=0.6"],
+    )
+    assert "6 with a pose" in printed
+    assert "bright: 1 region" in printed
     rows = np.loadtxt(table, delimiter=",", skiprows=1)
     assert len(rows) > 0
     assert rows[:, 3].min() >= 0.6
