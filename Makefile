@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test lint setup system benchmark clean
+.PHONY: demo test lint setup system benchmark docs clean
 
 demo: setup  ## build the built-in room, map it, ask it three words, write pictures to demo/
 	$(BIN)/freeocc3d demo -o demo --overwrite
@@ -17,6 +17,9 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: setup  ## build the documentation into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 benchmark: setup
 	$(BIN)/python tools/benchmark.py
@@ -35,4 +38,4 @@ system:
 	@sh tools/system_libraries.sh
 
 clean:
-	rm -rf $(VENV) demo build dist *.egg-info
+	rm -rf $(VENV) demo site build dist *.egg-info

@@ -53,9 +53,9 @@ def command_line() -> str:
     lines = [
         "# Command line",
         "",
-        "Exit status: 0 done; 1 a known error, in one line on stderr; 2 wrong usage. Results go to stdout, progress and "
-        "warnings to stderr. `--json` prints one JSON document and nothing else. `--debug` shows the traceback of an "
-        "error. `freeocc3d COMMAND --help` prints what stands here.",
+        "Exit status: 0 done; 1 a known error, in one line on stderr; 2 wrong usage. Results go to stdout, progress "
+        "and warnings to stderr. `--json` prints one JSON document and nothing else. `--debug` shows the traceback of "
+        "an error. `freeocc3d COMMAND --help` prints what stands here.",
         "",
     ]
     root = typer.main.get_command(app)
