@@ -13,6 +13,7 @@ import yaml
 
 from freeocc3d.cli.main import app
 from freeocc3d.settings import config, registry
+from freeocc3d.settings.presets import find_preset
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -74,6 +75,8 @@ def test_a_documented_command_parses(command: str, monkeypatch: pytest.MonkeyPat
         words = [word for word in words if word not in ("…", "...")]
     name, values = parsed(words)
     given = [override for override in values.get("overrides") or [] if not EXAMPLES & set(re.split(r"[.=]", override))]  # type: ignore[attr-defined]
+    if values.get("config_file") and values["config_file"] != Path("my.yaml"):
+        assert "MAP" in str(values["config_file"]) or find_preset(str(values["config_file"])).is_file()
     if name in ("reconstruct", "evaluate"):
         config.load(None, [override for override in given if "…" not in override])
     if name == "export" and values["format_name"] not in EXAMPLES | {"NAME"}:
