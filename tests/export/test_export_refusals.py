@@ -14,17 +14,18 @@ from test_octomap import of_several_sizes
 
 from freeocc3d.core.errors import ConfigError, ExportError, FreeOccError
 from freeocc3d.export import export_map
+from freeocc3d.language.encoders.labels import LabelWords
 from freeocc3d.settings import registry
 from freeocc3d.storage.keyframes import Keyframes
 
 FILES = {
     "ply": ("map.ply",), "npz": ("map.npz",), "octomap": ("map.bt", "map.ot"), "nav2": ("map.yaml",),
     "esdf": ("map.npz", "map.vdb"), "glb": ("map.glb",), "geojson": ("map.geojson",), "gaussians": ("map.ply",),
-    "poses": ("poses",),
+    "poses": ("poses",), "voxel_block_grid": ("grid.npz",),
 }  # fmt: skip
 CASES = [(kind, name) for kind, names in FILES.items() for name in names]
 OF_VOXELS = [case for case in CASES if case[0] not in ("gaussians", "poses", "geojson")]
-BESIDE = {"nav2": "map.pgm", "octomap": "map.bt.json", "gaussians": "map.ply.json"}
+BESIDE = {"voxel_block_grid": "grid.npz.json", "nav2": "map.pgm", "octomap": "map.bt.json", "gaussians": "map.ply.json"}
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,9 @@ def whole(occupancy, keyframes, T_gravity_map=Z_UP):
     scan_map = asked(scan_map) if len(occupancy.colors) else scan_map
     scan_map.gaussians = gaussians(np.random.default_rng(0).uniform(0, 1, (20, 3)), 0.02)
     scan_map.keyframes = keyframes
+    scan_map.text_encoder = LabelWords(["nothing", "cup", "table"])
+    scan_map.vocabulary = scan_map.text_encoder.contrast_words()
+    scan_map.manifest["encoder"] = {"name": "labels"}
     scan_map.trajectory.T_world_keyframe = cameras(2)
     return scan_map
 

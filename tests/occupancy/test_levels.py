@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
 from freeocc3d.occupancy import levels
-from freeocc3d.occupancy.voxel_block_grid import to_voxel_block_grid
 
 
 def some_map(keys: np.ndarray, block_levels: np.ndarray, seed: int = 0) -> Occupancy:
@@ -95,9 +93,3 @@ def test_colours_of_parts_are_averaged() -> None:
 def test_a_map_of_one_size_stays_what_it_is() -> None:
     one = some_map(np.array([(0, 0, 0), (3, -1, 2)]), np.zeros(2))
     assert levels.make_uniform(one, 0).replace(levels=one.levels).state is one.state
-    assert len(to_voxel_block_grid(one).hashmap().active_buf_indices()) == 2
-
-
-def test_open3d_has_no_grid_of_several_sizes(mixed: Occupancy) -> None:
-    with pytest.raises(FreeOccError, match="one size"):
-        to_voxel_block_grid(mixed)
