@@ -36,7 +36,7 @@ from .view_depth import measure_depth
 from .view_selection import APART, SelectedViews, select_partners
 from .watertight_surface import Surface, build_surface
 
-__all__ = ["Options", "StereoDepth", "StereoView", "depth_map"]
+__all__ = ["Options", "StereoDepth", "StereoView"]
 
 _AT_ONCE = 16  # frames
 _FILES_KEPT = 64  # in memory: images and depths of the frames around the one in work
@@ -73,16 +73,6 @@ class Options:
         require_positive(self, "neighbours", "agreeing")
         if self.size < 64:
             raise ConfigError(f"'size' must be at least 64 pixels, got {self.size}.")
-
-
-def depth_map(
-    view: StereoView, others: Sequence[StereoView], near: float, far: float, options: Options
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth of one view from ``others``, which nothing has confirmed yet: (H, W) metres, 0 = none, and its standard
-    deviation. The depth lies between ``near`` and ``far``; H, W are those of a view of ``options.size``."""
-    small, sources = _shrunk(view, options.size), [_shrunk(other, options.size) for other in others]
-    depth = measure_depth(small, sources, sources, near, far, options.device)
-    return _metres(depth.inverse, depth.sigma)
 
 
 class StereoDepth:

@@ -2,7 +2,6 @@
 
     global_occ_package/<scene>.pkl                              a scene's labelled grid
     streme_occ_new_package/{train,test,val}/<scene>_<idx>_new.pkl   which of its voxels a frame sees
-    preprocessed/<scene>.npy                                    ReplicaOcc's labelled voxels as a list
 
 Sources of the layout: the loaders that the projects publish. Wu et al., EmbodiedOcc, ICCV 2025 (global package and
 frames' masks); FreeOcc, RSS 2026 (ReplicaOcc, whose classes are named outside its packages).
@@ -94,27 +93,6 @@ def load_frames_mask(
         path = found[frame]
         _add_mask(union, _array(_load_dict(path), "mask_in_global", path), path)
     return union
-
-
-def load_preprocessed(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Points (N, 3), in the unit and frame that the file has, and labels (N,) of ReplicaOcc's
-    ``preprocessed/<scene>.npy``, whose rows are x, y, z, label.
-
-    Raises FreeOccError: no such file, damaged, not of this form.
-    """
-    try:
-        # Mapped, a file that states more rows than it has is refused before memory is taken.
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
-    except OSError as error:
-        raise FreeOccError(f"Cannot read {path}: {(error.strerror or str(error)).lower()}.") from error
-    except (ValueError, EOFError) as error:
-        raise FreeOccError(f"{path} is damaged or no array of numbers: get it from its publisher again.") from error
-    if not isinstance(table, np.ndarray) or table.dtype.kind not in "iuf" or table.ndim != 2 or table.shape[1] != 4:
-        raise FreeOccError(f"{path} must hold numbers (N, 4): x, y, z and label of a voxel a row.")
-    points = np.array(table[:, :3], np.float64)
-    if not np.isfinite(points).all():
-        raise FreeOccError(f"{path} holds points that are not finite.")
-    return points, _labels(np.array(table[:, 3]), path, "labels")
 
 
 def read_split(path: Path) -> list[str]:

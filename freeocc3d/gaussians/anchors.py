@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from ..core.errors import ConfigError
 from ..core.transforms import invert, multiply_quats, rotations_to_quats
-from ..core.types import Frame, Gaussians, Intrinsics, PosedFrame
+from ..core.types import Frame, Gaussians, PosedFrame
 from ..settings.registry import require_positive
 from . import denoising
 from .surface_cells import Cells, CellSums
@@ -224,12 +224,6 @@ def align_gaussians(gaussians: Gaussians, scale: float, R: NDArray[np.float64], 
         anchor_keyframe=gaussians.anchor_keyframe,
         anchor_cam=(scale * gaussians.anchor_cam).astype(np.float32),
     )
-
-
-def anchor_pixels(gaussians: Gaussians, intrinsics: Intrinsics) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(N, 2) pixels and (N,) depths in metres of the anchors in their keyframes, which share ``intrinsics``."""
-    x, y, z = gaussians.anchor_cam.T
-    return np.stack((intrinsics.fx * x / z + intrinsics.cx, intrinsics.fy * y / z + intrinsics.cy), axis=1), z
 
 
 def _move_each(T: NDArray[np.float64], row: NDArray[np.int32], points: NDArray[np.float32]) -> NDArray[np.float32]:

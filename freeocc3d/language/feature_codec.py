@@ -1,8 +1,8 @@
 """Small features: transform coding. A feature's coordinates along the directions in which features vary most are kept,
 with 8, 4 or 2 bits each, by what each of them adds to the error; at most 48 bytes a feature, whatever its dimension.
 
-Chosen by measurement (``tools/benchmark.py --variants codec``) over low rank with 8 bits throughout and over product
-quantisation, which both lose more at the same size. Source of the optimal uniform quantisers' steps: J. Max, Quantizing
+``tools/benchmark.py --variants voxels`` measures what coding loses; low rank with 8 bits throughout and product
+quantization lose more at the same size. Source of the optimal uniform quantisers' steps: J. Max, Quantizing
 for Minimum Distortion, IRE Trans. Inf. Theory 6(1), 1960.
 """
 
@@ -17,6 +17,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from .word_matching import MANY
+
 MOST_BYTES = 48
 """Of a code. Features of at most so many dimensions keep their own axes, 8 bits each: what never is negative decodes to
 exact zeros."""
@@ -30,7 +32,6 @@ _LEVELS = 254
 _MARGIN = 0.02
 """By which an 8-bit range is widened on either side: a normalised mean of features can lie outside of it."""
 _ROWS = 8192  # worked on at once, so that float32 copies of all rows never exist
-_MANY = 200_000  # rows from which scores are computed by compiled code
 _ONE_THREAD = 1 << 18  # multiplications of a matrix product that OpenBLAS does on one thread
 _SAMPLE = 20000  # rows that quantisers are fitted to
 
@@ -223,7 +224,7 @@ def mask_known(features: Features) -> NDArray[np.bool_]:
 
 def _compiled(count: int) -> bool:
     """Whether so many scores are left to numba, which takes longer to import than fewer to compute."""
-    return count >= _MANY or f"{__package__}.scoring" in sys.modules
+    return count >= MANY or f"{__package__}.coded_scores" in sys.modules
 
 
 def _product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:

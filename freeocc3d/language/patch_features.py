@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -76,6 +76,27 @@ class Splice:
     def mean(self) -> NDArray[np.float32]:
         """(rows, columns, C)."""
         return self._sum / self._count[..., None]
+
+
+def encode_windows(
+    rgb: NDArray[np.uint8],
+    package: Package,
+    short_side: int,
+    window: int | None,
+    encode: Callable[[NDArray[np.float32], Tiling], NDArray[np.float32]],
+) -> NDArray[np.float32]:
+    """(rows, columns, D) unit features of the patches of (H, W, 3) pixels, spliced from windows.
+
+    window: in pixels; None = the size of the model's training images.  encode: (B, 3, h patch, w patch) windows of a
+    tiling to their (B, h, w, D) features.
+    """
+    tiling = Tiling.of(
+        rgb.shape[0], rgb.shape[1], package, short_side, package.input_size if window is None else window
+    )
+    splice = Splice(tiling, package.dimension)
+    for images, corners in tiling.windows(tiling.image(rgb, package.mean, package.std)):
+        splice.add(normalize_patches(encode(images, tiling)), corners)
+    return normalize_patches(splice.mean())
 
 
 def finish_patches(patches: NDArray[np.float32], rgb: NDArray[np.uint8], stride: int) -> NDArray[np.float16]:

@@ -55,7 +55,12 @@ def test_edges_of_what_stands_in_front_stay_where_they_are() -> None:
 @pytest.mark.parametrize("size", [64, 160])
 def test_depth_maps_have_the_size_asked_for(size: int) -> None:
     view, others, depth = _views([SLANTED])
-    found, sigma = multi_view_stereo.depth_map(view, others, 1.0, 6.0, multi_view_stereo.Options(size=size))
+    small, sources = (
+        multi_view_stereo._shrunk(view, size),
+        [multi_view_stereo._shrunk(other, size) for other in others],
+    )
+    measured = measure_depth(small, sources, sources, 1.0, 6.0)
+    found, sigma = multi_view_stereo._metres(measured.inverse, measured.sigma)
     assert found.shape == sigma.shape == (round(size * 0.75), size)
     there = found > 0
     assert (sigma[there] > 0).all()

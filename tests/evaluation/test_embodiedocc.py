@@ -14,7 +14,6 @@ from freeocc3d.evaluation.embodiedocc import (
     find_package,
     load_frames_mask,
     load_global_package,
-    load_preprocessed,
     read_split,
 )
 
@@ -223,39 +222,6 @@ def test_masks_that_do_not_fit_are_refused(tmp_path: Path, mask: np.ndarray) -> 
     with pytest.raises(FreeOccError, match=r"'mask_in_global' of .*scene0000_00_00001_new.pkl is neither") as error:
         load_global_package(data_set(tmp_path, {"train/00001": mask}))
     assert one_sentence(error)
-
-
-def test_preprocessed_voxels_are_read(tmp_path: Path) -> None:
-    table = np.array([[1, 2, 3, 40], [4, 5, 6, 93]])
-    for dtype in (np.int32, np.float32):
-        np.save(tmp_path / "room0.npy", table.astype(dtype))
-        points, labels = load_preprocessed(tmp_path / "room0.npy")
-        np.testing.assert_array_equal(points, table[:, :3])
-        assert labels.tolist() == [40, 93]
-        assert labels.dtype == np.uint8
-
-
-def test_preprocessed_files_of_another_form_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "room0.npy"
-    with pytest.raises(FreeOccError, match=r"Cannot read .*: no such file"):
-        load_preprocessed(path)
-    for wrong in (np.zeros((3, 3)), np.zeros(4), np.full((2, 4), np.nan), np.full((1, 4), 256), np.array([["a"] * 4])):
-        np.save(path, wrong)
-        with pytest.raises(FreeOccError, match=r"room0.npy"):
-            load_preprocessed(path)
-    np.save(path, np.array([[{"a": 1}] * 4], object), allow_pickle=True)
-    with pytest.raises(FreeOccError, match="damaged or no array of numbers"):
-        load_preprocessed(path)
-    write(path, np.zeros((2, 4)))
-    with pytest.raises(FreeOccError, match="damaged or no array of numbers"):
-        load_preprocessed(path)
-    np.save(path, np.zeros((1000, 4)))
-    path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(FreeOccError, match="damaged or no array of numbers"):
-        load_preprocessed(path)
-    path.write_bytes(b"")
-    with pytest.raises(FreeOccError, match="damaged or no array of numbers"):
-        load_preprocessed(path)
 
 
 def test_a_split_names_each_scene_once_in_its_order(tmp_path: Path) -> None:

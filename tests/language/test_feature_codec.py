@@ -97,7 +97,7 @@ def test_cosines_are_those_of_decoded_features(dimension: int, many: bool, monke
     codec = Codec.fit(features)
     codes = codec.encode(features)
     expected = codec.decode(codes).astype(np.float32) @ text.T
-    monkeypatch.setattr(codec_module, "_MANY", 0 if many else 10**9)
+    monkeypatch.setattr(codec_module, "MANY", 0 if many else 10**9)
     found = codec.cosines(codes, text)
     np.testing.assert_allclose(found, expected, atol=2e-3)
     assert not found[:10].any()

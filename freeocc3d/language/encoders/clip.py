@@ -78,15 +78,10 @@ class ClipEncoder(Encoder):
 
     def patches(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(rows, columns, D) unit features of the patches of (H, W, 3) pixels."""
-        from ..patch_features import Splice, Tiling, normalize_patches
+        from ..patch_features import encode_windows
 
-        options, package = self.options, self.package
-        window = package.input_size if options.window is None else options.window
-        tiling = Tiling.of(rgb.shape[0], rgb.shape[1], package, options.short_side, window)
-        splice = Splice(tiling, self.dimension)
-        for images, corners in tiling.windows(tiling.image(rgb, package.mean, package.std)):
-            splice.add(normalize_patches(self._window_features(images, tiling)), corners)
-        return normalize_patches(splice.mean())
+        options = self.options
+        return encode_windows(rgb, self.package, options.short_side, options.window, self._window_features)
 
     def _window_features(self, images: NDArray[np.float32], tiling: Tiling) -> NDArray[np.float32]:
         """(B, h, w, D) of (B, 3, H, W) windows."""
@@ -99,15 +94,6 @@ class ClipEncoder(Encoder):
         (features,) = self._head.run([output], {"mixed": mixed, "stream": stream})
         h, w = tiling.window
         return np.asarray(features[:, -h * w :].reshape(len(images), h, w, -1))
-
-    def pooled(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(B, D) the network's own embeddings of (B, 3, H, W) normalised images; H and W multiples of the patch."""
-        from .. import clip_attention
-
-        q, k, v, stream = self._image.run(["queries", "keys", "values", "stream"], {"image": images})
-        grid = images.shape[2] // self.package.patch, images.shape[3] // self.package.patch
-        mixed = clip_attention.mix_values("plain", q, k, v, grid)
-        return np.asarray(self._head.run(["pooled"], {"mixed": mixed, "stream": stream})[0])
 
     def text_state(self) -> dict[str, Any]:
         return self.options.wording.state(self.package)

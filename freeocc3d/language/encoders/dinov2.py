@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from ...core.types import Frame
 from .. import model_packages
 from ..text_networks import CONTRAST, TEMPLATES, ModelWords, Wording
 from .base import Encoder, require_sizes
+
+if TYPE_CHECKING:
+    from ..patch_features import Tiling
 
 REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
 
@@ -62,15 +65,15 @@ class Dinov2Encoder(Encoder):
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16, or (rows, columns, D) of patches."""
-        from ..patch_features import Splice, Tiling, finish_patches, normalize_patches
+        from ..patch_features import encode_windows, finish_patches
 
-        options, package, rgb = self.options, self.package, frame.color
-        window = package.input_size if options.window is None else options.window
-        tiling = Tiling.of(rgb.shape[0], rgb.shape[1], package, options.short_side, window)
-        splice = Splice(tiling, self.dimension)
-        for images, corners in tiling.windows(tiling.image(rgb, package.mean, package.std)):
-            splice.add(normalize_patches(self._image.run(["features"], {"image": images})[0]), corners)
-        return finish_patches(normalize_patches(splice.mean()), rgb, options.stride)
+        options, rgb = self.options, frame.color
+        patches = encode_windows(rgb, self.package, options.short_side, options.window, self._window_features)
+        return finish_patches(patches, rgb, options.stride)
+
+    def _window_features(self, images: NDArray[np.float32], tiling: Tiling) -> NDArray[np.float32]:
+        """(B, h, w, D) of (B, 3, H, W) windows."""
+        return np.asarray(self._image.run(["features"], {"image": images})[0])
 
     def text_state(self) -> dict[str, Any]:
         return self.options.wording.state(self.package)

@@ -7,7 +7,6 @@ from pathlib import Path, PurePath
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from ...capture.base import Capture
 from ...capture.colmap_models import colmap_folder, colmap_lens, read_colmap_model
@@ -96,8 +95,3 @@ def convert_model(
 
 
 _NO_LENS = Lens(Intrinsics(1, 1, 1.0, 1.0, 0.0, 0.0))
-
-
-def list_registered(model: pycolmap.Reconstruction) -> NDArray[np.int64]:
-    """Ids of the images that have a pose, ascending."""
-    return np.array(sorted(model.reg_image_ids()), np.int64)
