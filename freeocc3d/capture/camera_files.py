@@ -14,7 +14,7 @@ from ..core.errors import CaptureError
 from ..core.transforms import is_rigid
 from ..core.types import Intrinsics
 from .base import Options
-from .image_files import Size
+from .image_decoding import Size
 
 ASPECT_TOLERANCE = 0.02
 """Relative difference of two aspect ratios up to which two images are taken to show the same view (ScanNet's colour and

@@ -18,7 +18,7 @@ from ..core.errors import CaptureError, FrameError
 from ..core.types import Frame
 from .base import Capture, Options
 from .depth_registration import PixelGrid
-from .image_files import Size, convert_to_metres, image_size, read_classes, read_color, read_depth
+from .image_decoding import Size, convert_to_metres, image_size, read_classes, read_color, read_depth
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from ..core.transforms import invert, project, transform
 from ..core.types import Frame
 from .base import NOMINAL_DEPTH, Capture, Options
 from .camera_files import read_given_calibration, rescale_camera
-from .image_files import convert_to_metres, read_color, read_depth
+from .image_decoding import convert_to_metres, read_color, read_depth
 from .lenses import Lens, Rectified
 
 UNITS_PER_METRE = 1000.0

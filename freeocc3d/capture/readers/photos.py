@@ -18,7 +18,7 @@ from ...core.errors import CaptureError, FrameError
 from ...core.types import Frame, Intrinsics
 from ..base import Capture, Options
 from ..camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
-from ..image_files import Size, read_color
+from ..image_decoding import Size, read_color
 
 REQUIRES: tuple[str, ...] = ("PIL",)
 

@@ -22,8 +22,8 @@ from ..camera_files import (
 )
 from ..class_files import capture_class_names
 from ..depth_registration import PixelGrid
-from ..image_files import has_file, list_numbered
 from ..image_pairs import ImagePairs, pair_files
+from ..numbered_files import has_file, list_numbered
 
 REQUIRES: tuple[str, ...] = ()
 

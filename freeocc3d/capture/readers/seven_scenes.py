@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from ..base import Options
 from ..camera_files import Calibration, read_given_calibration, read_intrinsics, read_pose, rescale_camera
 from ..depth_registration import PixelGrid
-from ..image_files import has_file, list_numbered
 from ..image_pairs import ImagePairs, pair_files
+from ..numbered_files import has_file, list_numbered
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -7,10 +7,12 @@ Source: H. Jégou et al., Aggregating Local Descriptors into a Compact Image Rep
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 
 OF_IMAGE = 1000
 """Features of an image that are enough to describe it."""
@@ -30,13 +32,10 @@ def compare_images(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.flo
 
 def _words(sample: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
     """(W, D) centres of clusters."""
-    words = sample[rng.permutation(len(sample))[:_WORDS]].copy()
-    for _ in range(_ROUNDS):
-        nearest = _assigned(sample, words)
-        order = np.argsort(nearest, kind="stable")
-        used, first, count = np.unique(nearest[order], return_index=True, return_counts=True)
-        words[used] = np.add.reduceat(sample[order], first, axis=0) / count[:, None]
-    return words
+    start = sample[rng.permutation(len(sample))[:_WORDS]]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "One of the clusters is empty")  # it keeps its center
+        return np.asarray(kmeans2(sample, start, _ROUNDS, minit="matrix")[0], np.float32)
 
 
 def _assigned(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:

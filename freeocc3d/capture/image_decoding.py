@@ -1,9 +1,11 @@
-"""Image files to arrays: whole or an error. A cut-off file is told from a whole one by its end marker, because some
-decoders return the part of a JPEG that is there, and grey for the rest."""
+"""Decodes color, depth and class images (PNG, JPEG): whole or an error.
+
+A cut-off file is told from a whole one by its end marker, because some decoders return the part of a JPEG that is
+there, and gray for the rest.
+"""
 
 from __future__ import annotations
 
-import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import CaptureError, FrameError
+from ..core.errors import FrameError
 
 Size = tuple[int, int]
 """Width and height in pixels."""
@@ -72,28 +74,6 @@ def image_size(path: Path) -> Size:
     if data.startswith(JPEG_START) and (size := _jpeg_size(data)):
         return size
     raise FrameError(f"{path} is not a PNG or JPEG image.")
-
-
-def list_numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """Files of ``folder`` whose whole name matches ``pattern``, by the number in its first group.
-
-    Raises CaptureError if two files have the same number.
-    """
-    expression, found = re.compile(pattern, re.IGNORECASE), dict[int, Path]()
-    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if match := expression.fullmatch(path.name):
-            other = found.setdefault(int(match[1]), path)
-            if other is not path:
-                raise CaptureError(
-                    f"{folder} holds two files of frame {int(match[1])}, {other.name} and {path.name}: remove one."
-                )
-    return found
-
-
-def has_file(folder: Path, pattern: str) -> bool:
-    """Whether a file of ``folder`` has a name that matches ``pattern``."""
-    expression = re.compile(pattern, re.IGNORECASE)
-    return folder.is_dir() and any(expression.fullmatch(path.name) for path in folder.iterdir())
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:

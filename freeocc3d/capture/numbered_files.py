@@ -1,0 +1,30 @@
+"""Files of a folder that are numbered by frame, as their names say."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from ..core.errors import CaptureError
+
+
+def list_numbered(folder: Path, pattern: str) -> dict[int, Path]:
+    """Files of ``folder`` whose whole name matches ``pattern``, by the number in its first group.
+
+    Raises CaptureError if two files have the same number.
+    """
+    expression, found = re.compile(pattern, re.IGNORECASE), dict[int, Path]()
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if match := expression.fullmatch(path.name):
+            other = found.setdefault(int(match[1]), path)
+            if other is not path:
+                raise CaptureError(
+                    f"{folder} holds two files of frame {int(match[1])}, {other.name} and {path.name}: remove one."
+                )
+    return found
+
+
+def has_file(folder: Path, pattern: str) -> bool:
+    """Whether a file of ``folder`` has a name that matches ``pattern``."""
+    expression = re.compile(pattern, re.IGNORECASE)
+    return folder.is_dir() and any(expression.fullmatch(path.name) for path in folder.iterdir())
