@@ -51,28 +51,14 @@ def summary_document(loaded: Map) -> dict[str, Any]:
 def summary_text(loaded: Map) -> str:
     """What ``info`` prints for people."""
     said = summary_document(loaded)
-    size = sum(said["bytes"].values())
-    used = said["frames"] - said["frame_status"].get("unused", 0)
-    largest, smallest = said["voxel_size_m"], said["finest_voxel_m"]
-    unit = "m" if said["metric"] else "units"
-    plural = {name: "s" if said[name] != 1 else "" for name in ("keyframes", "submaps")}
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in said["seconds"].items())
     lines = [
-        f"map        {said['map']}  ({size / 1e6:.1f} MB)",
+        f"map        {said['map']}  ({sum(said['bytes'].values()) / 1e6:.1f} MB)",
         f"capture    {said['capture']['path']}  ({said['capture']['format']})",
-        f"frames     {said['frames']} in the capture, {used} used, {said['frames_with_pose']} with a pose, "
-        f"{said['keyframes']} keyframe{plural['keyframes']}, {said['submaps']} submap{plural['submaps']}",
-        *(
-            [
-                f"refined    {'a box of ' if 'box' in said['refined'] else 'from '}{said['refined']['map']}, whose "
-                "frames and times these are"
-            ]
-            if said["refined"]
-            else []
-        ),
+        _frames_text(said),
+        *([_refined_text(said["refined"])] if said["refined"] else []),
         f"gaussians  {said['gaussians']:,}",
-        f"voxels     {said['voxels']['occupied']:,} occupied, {said['voxels']['free']:,} free, "
-        + (f"edge {largest:.3g} {unit}" if largest == smallest else f"edges {largest:.3g} to {smallest:.3g} {unit}"),
+        _voxels_text(said),
         *([] if said["scale"]["by"] == "sensor" else [_scale_text(said["scale"])]),
         f"encoder    {said['encoder']}, which knows {said['encoder_knows']}",
         *([_vocabulary_text(said["vocabulary"])] if said["vocabulary"] else []),
@@ -87,6 +73,25 @@ def summary_text(loaded: Map) -> str:
         ]
     lines += [f"warning    {text}" for text in said["warnings"]]
     return "\n".join(lines)
+
+
+def _frames_text(said: dict[str, Any]) -> str:
+    used = said["frames"] - said["frame_status"].get("unused", 0)
+    counts = ", ".join(f"{said[name]} {name[:-1]}{'s' if said[name] != 1 else ''}" for name in ("keyframes", "submaps"))
+    return f"frames     {said['frames']} in the capture, {used} used, {said['frames_with_pose']} with a pose, {counts}"
+
+
+def _refined_text(refined: dict[str, Any]) -> str:
+    return (
+        f"refined    {'a box of ' if 'box' in refined else 'from '}{refined['map']}, whose frames and times these are"
+    )
+
+
+def _voxels_text(said: dict[str, Any]) -> str:
+    largest, smallest = said["voxel_size_m"], said["finest_voxel_m"]
+    unit = "m" if said["metric"] else "units"
+    edges = f"edge {largest:.3g} {unit}" if largest == smallest else f"edges {largest:.3g} to {smallest:.3g} {unit}"
+    return f"voxels     {said['voxels']['occupied']:,} occupied, {said['voxels']['free']:,} free, {edges}"
 
 
 def _scale_text(scale: dict[str, Any]) -> str:

@@ -224,9 +224,9 @@ def _answer(map_path: Path, loaded: Map, results: Sequence[QueryResult], answer:
     from .query_answers import answers_document, answers_text
 
     if answer.as_json:
-        from .region_details import details
+        from .region_details import describe_regions
 
-        more = details(loaded, results, answer.views)
+        more = describe_regions(loaded, results, answer.views)
         return json.dumps(answers_document(map_path, results, more, loaded.metric))
     unit = "" if loaded.metric else "\nThe map's scale is unknown, so lengths are not metres (see freeocc3d scale)."
     return answers_text(results, loaded.metric) + unit

@@ -21,7 +21,7 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,9 @@ _OF_OCCUPIED = {"color": np.uint8, "feature": np.float32}
 _BLOCKS_AT_ONCE = 64
 _LARGEST_ATTRIBUTE = (1 << 31) - 1
 """Bytes: Open3D reads no 64-bit ZIP archives."""
+
+_Read = Callable[[slice], NDArray[Any]]
+"""Gives (n, 512, channels) of a slice of n blocks."""
 
 
 @dataclass(frozen=True)
@@ -126,29 +129,34 @@ def write_grid(
         for number, (name, (channels, read)) in enumerate(attributes.items()):
             kind = np.dtype((_PER_VOXEL | _OF_OCCUPIED)[name])
             shape = (len(occupancy.keys), BLOCK, BLOCK, BLOCK, channels)
-            if np.prod([float(n) for n in shape]) * kind.itemsize > _LARGEST_ATTRIBUTE:
-                raise ExportError(
-                    f"The attribute '{name}' takes more than 2 GiB, which Open3D does not read: export a part of the "
-                    "map with --set box=…, or leave features out with --set features=false."
-                )
+            _refuse_too_large(name, shape, kind)
             arrays[f"attr_name_{name}"] = np.array([number], np.int32)
             with archive.open(f"value_{number:03d}.npy", "w") as stream:
                 header = {"descr": np.lib.format.dtype_to_descr(kind), "fortran_order": False, "shape": shape}
                 np.lib.format.write_array_header_1_0(stream, header)
-                for start in range(0, len(occupancy.keys), _BLOCKS_AT_ONCE):
-                    values = read(slice(start, min(start + _BLOCKS_AT_ONCE, len(occupancy.keys))))
-                    blocks = values.reshape(-1, BLOCK, BLOCK, BLOCK, channels).transpose(0, 3, 2, 1, 4)
-                    stream.write(np.ascontiguousarray(blocks, kind).tobytes())
+                _write_values(stream, read, shape, kind)
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w") as stream:
                 np.lib.format.write_array(stream, np.asarray(array, order="C"), allow_pickle=False)
 
 
-_Read = Callable[[slice], NDArray[Any]]
+def _refuse_too_large(name: str, shape: tuple[int, ...], kind: np.dtype[Any]) -> None:
+    if np.prod([float(n) for n in shape]) * kind.itemsize > _LARGEST_ATTRIBUTE:
+        raise ExportError(
+            f"The attribute '{name}' takes more than 2 GiB, which Open3D does not read: export a part of the "
+            "map with --set box=…, or leave features out with --set features=false."
+        )
+
+
+def _write_values(stream: IO[bytes], read: _Read, shape: tuple[int, int, int, int, int], kind: np.dtype[Any]) -> None:
+    for start in range(0, shape[0], _BLOCKS_AT_ONCE):
+        values = read(slice(start, min(start + _BLOCKS_AT_ONCE, shape[0])))
+        blocks = values.reshape(-1, *shape[1:]).transpose(0, 3, 2, 1, 4)  # from x, y, z to z, y, x
+        stream.write(np.ascontiguousarray(blocks, kind).tobytes())
 
 
 def _attributes(occupancy: Occupancy, features: Features | None) -> dict[str, tuple[int, _Read]]:
-    """By name: the number of channels, and what gives (n, 512, channels) of n blocks."""
+    """By name: the number of channels, and what gives the values of some blocks."""
     occupied = occupancy.state == OCCUPIED
     first = np.concatenate(([0], np.cumsum(np.count_nonzero(occupied, axis=1))))
 
@@ -183,19 +191,7 @@ def read_occupancy(
     Blocks of 16, 24, … voxels an edge are cut into ours. voxel_size, origin: not kept by Open3D; origin is the lower
     corner of voxel (0, 0, 0), by default the world's origin. Raises FreeOccError for a grid of other attributes.
     """
-    import open3d as o3d
-    import open3d.core as o3c
-
-    rows = grid.hashmap().active_buf_indices().to(o3c.int64)
-    keys = grid.hashmap().key_tensor()[rows].cpu().numpy().astype(np.int64)
-    arrays = {}
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        for name in (*_PER_VOXEL, *_OF_OCCUPIED):
-            try:
-                values = grid.attribute(name)[rows].cpu().numpy()
-            except RuntimeError:  # there is none: Open3D gives a tensor of nothing, which refuses everything
-                continue
-            arrays[name], places = _cut(values)
+    keys, arrays, places = _read_attributes(grid)
     if not {"probability", "state"} <= arrays.keys():
         raise FreeOccError("The VoxelBlockGrid has no attributes 'probability' and 'state': it holds no occupancy.")
     edge = round(len(places) ** (1 / 3))
@@ -217,6 +213,26 @@ def read_occupancy(
         features=features.astype(np.float16),
         **per_voxel,
     )
+
+
+def _read_attributes(
+    grid: o3d.t.geometry.VoxelBlockGrid,
+) -> tuple[NDArray[np.int64], dict[str, NDArray[np.generic]], NDArray[np.int64]]:
+    """(B, 3) indices of a grid's blocks, the attributes of ours that it has, cut into our blocks, and their places."""
+    import open3d as o3d
+    import open3d.core as o3c
+
+    rows = grid.hashmap().active_buf_indices().to(o3c.int64)
+    keys = grid.hashmap().key_tensor()[rows].cpu().numpy().astype(np.int64)
+    arrays, places = {}, np.zeros((1, 3), np.int64)
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        for name in (*_PER_VOXEL, *_OF_OCCUPIED):
+            try:
+                values = grid.attribute(name)[rows].cpu().numpy()
+            except RuntimeError:  # there is none: Open3D gives a tensor of nothing, which refuses everything
+                continue
+            arrays[name], places = _cut(values)
+    return keys, arrays, places
 
 
 def _cut(values: NDArray[np.generic]) -> tuple[NDArray[np.generic], NDArray[np.int64]]:
