@@ -113,20 +113,6 @@ def back_project(pixels: Array, depth_m: Array, intrinsics: Intrinsics) -> Array
     return np.stack((x, y, depth_m), axis=-1)
 
 
-AXIAL_NOISE = (0.0012, 0.0019, 0.4)
-"""a, b and z_0 of sigma(z) = a + b (z - z_0)^2, metres."""
-
-
-def depth_sigma(depth_m: Array) -> Array:
-    """Standard deviation in metres of a structured-light or stereo depth measurement, float32.
-
-    Source: C. V. Nguyen, S. Izadi, D. Lovell, Modeling Kinect Sensor Noise for Improved 3D Reconstruction and Tracking,
-    3DIMPVT 2012, axial noise.
-    """
-    a, b, nearest = AXIAL_NOISE
-    return np.asarray(a + b * (depth_m - nearest) ** 2, np.float32)
-
-
 _STRAIGHT = 0.005
 """Points whose second principal spread is a smaller share of the first lie on a line: what turns them about it is a
 trajectory's jitter, not its shape."""

@@ -56,7 +56,7 @@ class Frame:
     depth_m: (H, W) float32 metres, registered to ``color``'s pixels; 0 = no measurement.
     intrinsics: of ``color`` and ``depth_m``, which have the same size.
     depth_sigma_m: (H, W) float32 standard deviation of ``depth_m``, metres, more than 0 where that is; None = that of
-    a sensor (``geometry.depth_sigma``).
+    a sensor (``depth_noise.compute_sensor_sigma``).
     """
 
     index: int

@@ -20,10 +20,10 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..core.depth_noise import compute_sensor_sigma
 from ..core.errors import MapError
 from ..core.hash_table import build_table, find_row, packed_key
 from ..core.progress import Progress
-from ..core.transforms import depth_sigma
 from ..core.types import BLOCK, OCCUPIED, Gaussians, Occupancy, PosedFrame
 from ..core.voxel_keys import pack_voxels, unpack_voxels
 from ..gaussians.surface_cells import cell_keys
@@ -187,7 +187,7 @@ def _detailed(
         for j in range(3):
             moments[:, i, j] = np.bincount(cube, local[:, i] * local[:, j]) / n - mean[:, i] * mean[:, j]
     off_plane = np.sqrt(np.maximum(np.linalg.eigvalsh(moments)[:, 0], 0.0))
-    noise = np.bincount(cube, depth_sigma(np.abs(gaussians.anchor_cam[:, 2]))) / n
+    noise = np.bincount(cube, compute_sensor_sigma(np.abs(gaussians.anchor_cam[:, 2]))) / n
     uneven = (n >= _FEWEST) & (off_plane > np.hypot(_UNEVEN * voxel_size, noise))
     uneven |= np.bincount(cube, changing) > 0
     uneven &= noise <= 0.5 * voxel_size  # smaller voxels than that would show the noise

@@ -23,10 +23,10 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ..core.depth_noise import compute_sigma_image, look_up_sigma, take_stated_sigma
 from ..core.transforms import invert
 from ..core.types import PosedFrame
 from .depth_edges import is_at_edge, mask_away_from_edges
-from .depth_noise import said, sigma_at, sigma_image
 
 _REACH_M, _REACH_PER_M = 0.03, 0.01
 """A depth image shows a point if it ends within this of it, and this times the squared depth: noise and the poses'
@@ -64,8 +64,9 @@ def denoise(
         camera, depth_m = frame.intrinsics, frame.depth_m
         T_cam_world = invert(T_world_cam)
         _look(
-            points, directions, depth_m, said(frame), edge, T_cam_world[:3, :3].copy(), T_cam_world[:3, 3].copy(),
-            (camera.fx, camera.fy, camera.cx, camera.cy), row, moved, weights, shown, through, best, keyframe,
+            points, directions, depth_m, take_stated_sigma(frame), edge, T_cam_world[:3, :3].copy(),
+            T_cam_world[:3, 3].copy(), (camera.fx, camera.fy, camera.cx, camera.cy), row, moved, weights, shown,
+            through, best, keyframe,
         )  # fmt: skip
     points = points + moved / np.where(weights > 0, weights, 1.0)[:, None]
     return DenoisedPoints(points, weights, best, keyframe, through <= np.maximum(shown, 1))
@@ -116,7 +117,7 @@ def _look(
             )
             if ray[0] * directions[n, 0] + ray[1] * directions[n, 1] + ray[2] * directions[n, 2] <= 0:
                 continue  # the other side
-            sigma = sigma_at(sigma_m, line, column, depth)
+            sigma = look_up_sigma(sigma_m, line, column, depth)
             w = 1.0 / (sigma * sigma)
             step = w * beyond / z
             for i in range(3):
@@ -145,6 +146,6 @@ def look_reference(
         depth = np.where(inside, depth_m[line, column], 0)
         beyond, reach = depth - z, _REACH_M + _REACH_PER_M * z**2
         shown = (depth > 0) & (np.abs(beyond) <= reach) & ((ray * directions).sum(axis=1) > 0)
-        weight = np.where(shown, 1.0 / sigma_image(posed.frame)[line, column].astype(np.float64) ** 2, 0.0)
+        weight = np.where(shown, 1.0 / compute_sigma_image(posed.frame)[line, column].astype(np.float64) ** 2, 0.0)
         offset = np.where(shown, weight * beyond / z, 0.0)[:, None] * ray
         return offset, weight, (depth > 0) & (beyond > reach)

@@ -10,12 +10,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ..core.depth_noise import compute_sigma_image, look_up_sigma, take_stated_sigma
 from ..core.hash_table import build_table, find_slot, packed_key
 from ..core.transforms import back_project, transform
 from ..core.types import PosedFrame
 from ..core.voxel_keys import pack_voxels
 from .depth_edges import is_at_edge, mask_away_from_edges
-from .depth_noise import said, sigma_at, sigma_image
 
 """Cells on either side of the world's origin, along each axis."""
 
@@ -66,8 +66,8 @@ class CellSums:
         height, width = frame.depth_m.shape
         self._make_room(-(-height // step) * -(-width // step))
         self._used = _add_frame(
-            frame.depth_m, said(frame), frame.color, step, edge, T, (camera.fx, camera.fy, camera.cx, camera.cy),
-            keyframe, self.cell_size, self._used, *self._arrays(),
+            frame.depth_m, take_stated_sigma(frame), frame.color, step, edge, T,
+            (camera.fx, camera.fy, camera.cx, camera.cy), keyframe, self.cell_size, self._used, *self._arrays(),
         )  # fmt: skip
 
     def add(self, cells: Cells) -> None:
@@ -121,7 +121,7 @@ def cells_reference(posed: PosedFrame, step: int, edge: float, cell_size: float)
     depth = frame.depth_m[v, u]
     points = transform(T, back_project(np.stack((u, v), axis=1), depth, frame.intrinsics).astype(np.float64))
     key, cell = np.unique(cell_keys(points, cell_size), return_inverse=True)
-    weight = 1.0 / sigma_image(frame)[v, u].astype(np.float64) ** 2
+    weight = 1.0 / compute_sigma_image(frame)[v, u].astype(np.float64) ** 2
     total = np.bincount(cell, weight)
     order = np.lexsort((-np.arange(len(cell)), weight, cell))
     best = order[np.flatnonzero(np.diff(cell[order], append=-1))]  # the first of the greatest weights in each cell
@@ -168,7 +168,7 @@ def _add_frame(  # type: ignore[no-untyped-def]
             j = np.int64(math.floor(wy / cell_size))
             k = np.int64(math.floor(wz / cell_size))
             row, used = _row_of(packed_key(i, j, k), used, table, rows, keys)
-            sigma = sigma_at(sigma_m, v, u, depth)
+            sigma = look_up_sigma(sigma_m, v, u, depth)
             w = 1.0 / (sigma * sigma)
             sums[row, 0] += w
             sums[row, 1] += w * wx

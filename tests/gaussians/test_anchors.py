@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scenes import CAMERA, lifted, wall_frame, with_sigma
 
-from freeocc3d.core.transforms import depth_sigma, project, quats_to_rotations, transform
+from freeocc3d.core.depth_noise import compute_sensor_sigma
+from freeocc3d.core.transforms import project, quats_to_rotations, transform
 from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.gaussians import anchors, depth_edges
 from freeocc3d.occupancy import splat, splat_reference
@@ -48,7 +49,7 @@ def test_a_near_measurement_outweighs_a_far_one_by_its_uncertainty() -> None:
     near[2, 3], far[2, 3] = 1.1, -1.86
     g = lifted([wall_frame(1.0), wall_frame(4.0)], [near, far], cell=0.25)
     middle = np.abs(g.means[:, :2]).max(axis=1) < 0.3
-    sigma = depth_sigma(np.float32([1.0, 4.0]))
+    sigma = compute_sensor_sigma(np.float32([1.0, 4.0]))
     assert sigma[1] / sigma[0] > 10
     assert np.abs(g.means[middle, 2] - 2.10).max() < 0.004
     assert (g.anchor_keyframe[middle] == 0).all()

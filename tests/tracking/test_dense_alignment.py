@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import CAMERA, wall_frame
+from scenes import CAMERA, wall_frame, with_sigma
 from scipy.linalg import expm
 
 from freeocc3d.capture import open_capture
+from freeocc3d.core.depth_noise import compute_sensor_sigma
 from freeocc3d.core.transforms import invert, measure_pose_difference, quats_to_rotations
 from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.tracking.rgbd import dense_alignment, orb_features
-from freeocc3d.tracking.rgbd.alignment_views import AlignmentView, prepare_alignment_view
+from freeocc3d.tracking.rgbd.alignment_views import prepare_alignment_view
+from freeocc3d.tracking.rgbd.dense_residuals import Weighting, linearize, make_equations
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +35,6 @@ def small_pose(degrees: float = 1.0, metres: float = 0.02, seed: int = 0) -> np.
 
 def relative(capture, source: int, target: int) -> np.ndarray:
     return invert(capture.pose(target)) @ capture.pose(source)
-
-
-def with_pyramid(view: AlignmentView) -> tuple:
-    return view.points, view.normals, view.gray[0]
 
 
 # Views
@@ -157,8 +155,8 @@ def test_results_are_rigid_and_the_guess_is_left_alone(room) -> None:
 # The kernel against NumPy
 
 
-def reference(source, target, T, brightness, scales, photometric, stride):
-    """Normal equations (8, 8), (8,) and the counts of ``dense.linearise`` at full size, plainly."""
+def reference(source, target, T, brightness, scales, photometric, stride, stated=False):
+    """Normal equations (8, 8), (8,) and the counts of ``linearize`` at full size, plainly."""
     fx, fy, cx, cy = target.camera
     h, w = source.points.shape[:2]
     i, j = np.mgrid[stride // 2 : h : stride, stride // 2 : w : stride].reshape(2, -1)
@@ -178,7 +176,10 @@ def reference(source, target, T, brightness, scales, photometric, stride):
     met &= ((ns @ T[:3, :3].T) * n).sum(axis=1) >= 0.6
     p, x, q, n, u, v, value_s = p[met], x[met], q[met], n[met], u[met], v[met], value_s[met]
     r = (n * (x - q)).sum(axis=1)
-    sigma = np.hypot(0.0012 + 0.0019 * (q[:, 2] - 0.4) ** 2, 0.0012 + 0.0019 * (p[:, 2] - 0.4) ** 2)
+    if stated:
+        sigma = np.hypot(target.sigma_m[it, jt][met], source.sigma_m[i, j][has][inside][met])
+    else:
+        sigma = np.hypot(compute_sensor_sigma(q[:, 2]), compute_sensor_sigma(p[:, 2])).astype(float)
     k = np.abs(r) / sigma
     counts.append((k < 3 * scales[0]).sum())
     weight = 1 / (1 + (k / (2.4 * scales[0])) ** 2) ** 2 / (sigma * scales[0]) ** 2
@@ -201,21 +202,31 @@ def reference(source, target, T, brightness, scales, photometric, stride):
     return H + (J * weight[:, None]).T @ J, g + (J * weight[:, None]).T @ rp, [*counts, len(x)]
 
 
+@pytest.mark.parametrize("stated", [False, True])
 @pytest.mark.parametrize("stride", [1, 2])
-def test_normal_equations_are_those_of_a_plain_computation(room, stride) -> None:
-    a, b = prepare_alignment_view(room[13]), prepare_alignment_view(room[12])
+def test_normal_equations_are_those_of_a_plain_computation(room, stride, stated) -> None:
+    frames = [with_sigma(room[n]) if stated else room[n] for n in (13, 12)]
+    a, b = (prepare_alignment_view(frame) for frame in frames)
     T = small_pose(0.5, 0.01) @ relative(room, 13, 12)
     brightness, scales = np.array((0.9, 0.05)), np.array((2.0, 4.0))
-    H, g, counts = reference(a, b, T, brightness, scales, 0.2, stride)
-    H8, g8, stats = np.zeros((8, 8)), np.zeros(8), np.zeros(dense_alignment.STATS)
-    given = scales.copy()
-    dense_alignment.linearize(
-        *with_pyramid(a), *with_pyramid(b), b.camera, T, stride, brightness, given, 0.2, H8, g8, stats
-    )
-    np.testing.assert_allclose(stats[:5], counts, atol=2)
-    np.testing.assert_allclose(H8, H, rtol=2e-3, atol=1e-4 * np.abs(H).max())
-    np.testing.assert_allclose(g8, g, rtol=2e-3, atol=2e-3 * np.abs(g).max())
+    H, g, counts = reference(a, b, T, brightness, scales, 0.2, stride, stated)
+    found, given = make_equations(), scales.copy()
+    linearize(a.levels[0], b.levels[0], b.camera, T, stride, Weighting(given, brightness, 0.2), found)
+    np.testing.assert_allclose(found.statistics[:5], counts, atol=2)
+    np.testing.assert_allclose(found.H, H, rtol=2e-3, atol=1e-4 * np.abs(H).max())
+    np.testing.assert_allclose(found.g, g, rtol=2e-3, atol=2e-3 * np.abs(g).max())
     assert not np.array_equal(given, scales)  # updated for the next step
+
+
+def test_a_stated_standard_deviation_is_averaged_where_there_is_depth() -> None:
+    frame = with_sigma(wall_frame(2.0))
+    depth = frame.depth_m.copy()
+    depth[::3] = 0
+    wide = replace(frame, depth_m=depth, depth_sigma_m=np.where(depth > 0, 0.01, np.nan).astype(np.float32))
+    view = prepare_alignment_view(wide)
+    known = view.points[..., 2] > 0
+    np.testing.assert_allclose(view.sigma_m[known & (view.sigma_m > 0)], 0.01, rtol=1e-5)
+    assert prepare_alignment_view(wall_frame(2.0)).sigma_m.size == 0
 
 
 def test_gain_and_offset_are_eliminated_as_a_full_solution_would() -> None:

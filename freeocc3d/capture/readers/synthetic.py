@@ -13,8 +13,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ...core.depth_noise import compute_sensor_sigma
 from ...core.errors import CaptureError
-from ...core.transforms import back_project, depth_sigma, invert
+from ...core.transforms import back_project, invert
 from ...core.types import FREE, UNKNOWN, Frame, Intrinsics
 from ...settings.registry import require_positive
 from .. import base, builtin_room
@@ -260,7 +261,7 @@ def disturbed_depth(
     columns = np.clip(np.arange(width)[None] + shift[1], 0, width - 1)
     edges = _edges(depth_m)
     noisy = np.where(edges, depth_m[rows, columns], depth_m)
-    noisy = noisy + depth_sigma(noisy) * rng.standard_normal(noisy.shape, np.float32)
+    noisy = noisy + compute_sensor_sigma(noisy) * rng.standard_normal(noisy.shape, np.float32)
     chance = np.where(edges, 0.5, np.clip((_GRAZING[1] - cosine) / (_GRAZING[1] - _GRAZING[0]), 0, 1))
     holes = (rng.random(depth_m.shape, np.float32) < chance) | (depth_m < _NEAREST_M)
     return np.where(holes, 0, np.rint(noisy * 1000) / 1000).astype(np.float32)

@@ -15,7 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ...core.depth_noise import NOT_STATED
 from ...core.types import Frame, Intrinsics
+from .dense_residuals import Surface
 
 WIDTH = 160
 """Views are about this wide."""
@@ -29,12 +31,14 @@ class AlignmentView:
     """A frame as the alignment needs it.
 
     intrinsics: of the (h, w) images.  points: (h, w, 3) float32, camera frame, metres; 0 where there is no surface.
-    normals: (h, w, 3) float32 unit.  gray: intensities 0…1, float32, at full, half and quarter size.
+    normals: (h, w, 3) float32 unit.  sigma_m: (h, w) float32 standard deviations of the depth, metres, or
+    ``NOT_STATED``.  gray: intensities 0…1, float32, at full, half and quarter size.
     """
 
     intrinsics: Intrinsics
     points: NDArray[np.float32]
     normals: NDArray[np.float32]
+    sigma_m: NDArray[np.float32]
     gray: tuple[NDArray[np.float32], ...]
 
     @property
@@ -42,6 +46,11 @@ class AlignmentView:
         """fx, fy, cx, cy."""
         K = self.intrinsics
         return np.array((K.fx, K.fy, K.cx, K.cy))
+
+    @property
+    def levels(self) -> tuple[Surface, ...]:
+        """The surface with the intensities of each size, the largest first."""
+        return tuple(Surface(self.points, self.normals, self.sigma_m, gray) for gray in self.gray)
 
     @property
     def covered(self) -> float:
@@ -64,7 +73,19 @@ def prepare_alignment_view(frame: Frame) -> AlignmentView:
     pyramid = [cv2.GaussianBlur(gray, (3, 3), 0.6)]
     for _ in range(_LEVELS - 1):
         pyramid.append(cv2.pyrDown(pyramid[-1]))
-    return AlignmentView(small, points, normals, tuple(pyramid))
+    return AlignmentView(small, points, normals, _average_sigma(frame, step), tuple(pyramid))
+
+
+def _average_sigma(frame: Frame, step: int) -> NDArray[np.float32]:
+    """(h, w) means of what the frame states of the pixels with a depth in each square of ``step`` pixels; 0 without
+    any."""
+    if frame.depth_sigma_m is None:
+        return NOT_STATED
+    h, w = frame.depth_m.shape[0] // step, frame.depth_m.shape[1] // step
+    known = (frame.depth_m > 0)[: h * step, : w * step].reshape(h, step, w, step)
+    sigma = frame.depth_sigma_m[: h * step, : w * step].reshape(h, step, w, step)
+    total = np.where(known, sigma, np.float32(0)).sum(axis=(1, 3))
+    return np.asarray(total / np.maximum(known.sum(axis=(1, 3)), 1), np.float32)
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")

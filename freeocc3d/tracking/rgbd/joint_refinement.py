@@ -1,8 +1,9 @@
 """All keyframes at once: poses that agree best with dense and feature residuals of every overlapping pair.
 
 For a pair (s, t) of keyframes with T_ts = T_t^-1 T_s, both kinds of residuals give normal equations H, g of
-T_ts <- exp(xi) T_ts (``dense``, ``features``). Moving the keyframes by exp(xi_s), exp(xi_t) from the left moves T_ts by
-A (xi_s - xi_t), A = Ad(T_t^-1), so that the pair adds A^T H A to the blocks (s, s), (t, t), and its negative to (s, t).
+T_ts <- exp(xi) T_ts (``dense_residuals``, ``orb_features``). Moving the keyframes by exp(xi_s), exp(xi_t) from the left
+moves T_ts by A (xi_s - xi_t), A = Ad(T_t^-1), so that the pair adds A^T H A to the blocks (s, s), (t, t), and its
+negative to (s, t).
 One Gauss-Newton step solves for all keyframes; correspondences are found anew at each.
 
 Source: Q.-Y. Zhou, J. Park, V. Koltun, Fast Global Registration, ECCV 2016, Sec. 3.3 (multi-way), with its pairs'
@@ -24,12 +25,18 @@ from ...core.threads import count_threads
 from ...core.transforms import invert, nearest_rigid
 from ..overlap import measure_mutual_overlap
 from . import dense_alignment, orb_features
+from .dense_residuals import Weighting, linearize, make_equations
 from .keyframe_registration import FeatureMatches, KeyframeView, match_keyframes
 
 _STRIDE = 2  # source pixels that are skipped: neighbouring ones say nearly the same
 _LEAST_SHARE, _LEAST_CORRELATION = 0.5, 0.5
 _STILL, _FAR_M = 5e-5, 0.02  # a step that moves nothing any more, and one after which other pairs may overlap
 _PRIOR = 1.0  # information that holds a keyframe which no pair holds
+_DAMPING = 1e-4  # share of its own information that holds every keyframe: it halves nothing, and bounds a step
+_FIXED = 1e15  # information of the first keyframe, which stays
+_FIRST_SPREADS = (3.0, 5.0)  # of residuals before any is known; tracking has aligned the keyframes once already
+_LEAST_IN_VIEW = 0.05  # share of the source's pixels that must be in the target's view
+_AGREEMENT_POWER = 4  # of a correlation's agreement, in the intensities' weight
 
 
 @dataclass
@@ -37,9 +44,9 @@ class _Pair:
     source: int
     target: int
     matched: FeatureMatches
-    brightness: NDArray[np.float64] = field(default_factory=lambda: np.array((1.0, 0.0)))
-    scales: NDArray[np.float64] = field(default_factory=lambda: np.array((3.0, 5.0)))
-    photometric: float = dense_alignment.PHOTOMETRIC
+    weighting: Weighting = field(
+        default_factory=lambda: Weighting(np.array(_FIRST_SPREADS), np.array((1.0, 0.0)), dense_alignment.PHOTOMETRIC)
+    )
 
 
 def refine_poses(
@@ -113,20 +120,19 @@ def _terms(
     a, b = source.view, target.view
     T_target_world = invert(T[pair.target])
     T_ts = T_target_world @ T[pair.source]
-    H8, g8, stats = np.zeros((8, 8)), np.zeros(8), np.zeros(dense_alignment.STATS)
-    dense_alignment.linearize(
-        a.points, a.normals, a.gray[0], b.points, b.normals, b.gray[0], b.camera, T_ts, _STRIDE, pair.brightness,
-        pair.scales, pair.photometric, H8, g8, stats,
-    )  # fmt: skip
-    few = stats[1] * _STRIDE**2 < 0.05 * a.points[..., 0].size
+    equations = make_equations()
+    linearize(a.levels[0], b.levels[0], b.camera, T_ts, _STRIDE, pair.weighting, equations)
+    H8, g8, stats = equations
+    few = stats[1] * _STRIDE**2 < _LEAST_IN_VIEW * a.points[..., 0].size
     correlation = dense_alignment.compute_correlation(stats)
     if few or dense_alignment.compute_inlier_share(stats) < _LEAST_SHARE or correlation < _LEAST_CORRELATION:
         return None
     # Intensities that agree less well (colour that lies beside its depth, reflections) say less of the pose.
     if not np.isnan(correlation):  # flat ones say nothing, at any weight
         agreement = (correlation - _LEAST_CORRELATION) / (1 - _LEAST_CORRELATION)
-        pair.photometric = dense_alignment.PHOTOMETRIC * agreement**4
-    pair.brightness += np.linalg.solve(H8[6:, 6:] + 1e-9 * np.eye(2), -g8[6:])
+        pair.weighting = pair.weighting._replace(photometric=dense_alignment.PHOTOMETRIC * agreement**_AGREEMENT_POWER)
+    damping = dense_alignment.BRIGHTNESS_DAMPING * np.eye(2)
+    pair.weighting.brightness[:] += np.linalg.solve(H8[6:, 6:] + damping, -g8[6:])
     H, g, _ = dense_alignment.remove_undetermined(*dense_alignment.eliminate_brightness(H8, g8))
     orb_features.add_reprojection(pair.matched.points_s, pair.matched.rays_t, T_ts, target.camera.fx, H, g)
     A = _adjoint(T_target_world)
@@ -151,8 +157,8 @@ def _solve(
     g = np.zeros((count, 6))
     np.add.at(g, source, np.stack([term for _, term in terms]))
     np.add.at(g, target, -np.stack([term for _, term in terms]))
-    hold = _PRIOR + 1e-4 * M.diagonal()
-    hold[:6] = 1e15
+    hold = _PRIOR + _DAMPING * M.diagonal()
+    hold[:6] = _FIXED
     return np.asarray(spsolve(M + diags(hold), -g.ravel())).reshape(count, 6)
 
 

@@ -1,0 +1,272 @@
+"""Residuals of two RGB-D views and their normal equations.
+
+With p a source point and p' = T p, n and q the target's normal and point where p' projects, I the intensities,
+
+    r_g = n^T (p' - q),            weighed by 1 / sigma(z)^2                                                        (1)
+    r_p = I_t(pi(p')) - (gain I_s(p) + offset)                                                                      (2)
+
+Each is weighed by the Geman-McClure function's rho'(r) = 1 / (1 + (r / c)^2)^2, c = ``GEMAN_MCCLURE`` s, with s the
+residuals' spread in units of the standard deviation that is expected of them.
+
+Sources: Y. Chen, G. Medioni, Object Modelling by Registration of Multiple Range Images, IVC 1992 (1); C. Kerl, J.
+Sturm, D. Cremers, Dense Visual SLAM for RGB-D Cameras, IROS 2013 (2).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ...core.depth_noise import look_up_sigma
+
+NEAREST_M = 0.1
+"""Metres in front of the target's camera that a point must at least be: below it projection is unstable."""
+
+GEMAN_MCCLURE = 2.4
+"""Spreads at which a residual's weight has fallen to a quarter. Near the 2.385 at which Cauchy's weight, whose square
+this is, uses Gaussian residuals with 95 % efficiency (Z. Zhang, Parameter Estimation Techniques, IVC 1997)."""
+
+NORMALS_AGREE = 0.6
+"""Cosine between two views' normals, 53 degrees, from which they can be of one surface: fitted normals of noisy depth
+are off by up to half of that each."""
+
+ON_SURFACE = 3.0
+"""Spreads within which a point lies on the target's surface: 99.7 % of Gaussian residuals."""
+
+SAME_SURFACE = 6.0
+"""Spreads beyond which a point is of another surface, so that its intensity says nothing."""
+
+GRAY_SIGMA = 0.01
+"""Standard deviation expected of intensities 0…1: noise and rounding of 8-bit images, two to three of their steps."""
+
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a Gaussian over the median of its absolute values, 1 / Phi^-1(3/4)."""
+
+LEAST_SPREAD = (0.5, 0.3)
+"""Least s of depth's and of intensities' residuals: with smaller ones single pixels would decide."""
+
+STATISTICS = 10
+"""Numbers in ``NormalEquations.statistics``."""
+
+_BINS = 512
+_PER_SIGMA = 16.0  # histogram bins per unit of a normalized residual: spreads to 3 %, residuals up to 32 of them
+_EXPOSURE = 8  # unknowns: rotation, translation, gain, offset
+_POSE = 6
+
+
+class Surface(NamedTuple):
+    """What the residuals see of a view.
+
+    points: (h, w, 3) camera frame, metres; z = 0 where there is none.  normals: (h, w, 3) unit.  sigma_m: (h, w)
+    standard deviations of the points' depth, metres, or ``depth_noise.NOT_STATED``.  gray: intensities 0…1 of the same
+    view, its size times a power of two smaller.
+    """
+
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    sigma_m: NDArray[np.float32]
+    gray: NDArray[np.float32]
+
+
+class Weighting(NamedTuple):
+    """How residuals weigh; both arrays change from step to step.
+
+    spreads: s of depth's residuals and of the intensities'; ``linearize`` leaves what these residuals have for the next
+    call.  brightness: gain, offset.  photometric: weight of the intensities, 0 = they are not compared.
+    """
+
+    spreads: NDArray[np.float64]
+    brightness: NDArray[np.float64]
+    photometric: float
+
+
+class NormalEquations(NamedTuple):
+    """H (8, 8), g (8,) of xi (rotation before translation, T <- exp(xi) T), gain and offset.
+
+    statistics: source pixels with a surface, of these in view, of these where the target has a surface too, of these on
+    it; then of the pixels that were compared by intensity their number and the sums of s, t, s s, t t, s t.
+    """
+
+    H: NDArray[np.float64]
+    g: NDArray[np.float64]
+    statistics: NDArray[np.float64]
+
+
+def make_equations() -> NormalEquations:
+    """Room for ``linearize``."""
+    return NormalEquations(np.zeros((_EXPOSURE, _EXPOSURE)), np.zeros(_EXPOSURE), np.zeros(STATISTICS))
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def linearize(
+    source: Surface,
+    target: Surface,
+    camera: NDArray[np.float64],
+    T: NDArray[np.float64],
+    stride: int,
+    weighting: Weighting,
+    equations: NormalEquations,
+) -> None:
+    """Fill the normal equations and statistics at T, the pose of the source in the target.
+
+    camera: fx, fy, cx, cy of the full-size images; the gray images may be smaller by a power of two.  stride: of the
+    source's pixels that are compared.
+    """
+    points_s, normals_s, gray_s = source.points, source.normals, source.gray
+    points_t, normals_t, gray_t = target.points, target.normals, target.gray
+    H, g, stats = equations.H, equations.g, equations.statistics
+    scales, photometric = weighting.spreads, weighting.photometric
+    h, w = points_s.shape[:2]
+    ht, wt = points_t.shape[:2]
+    fx, fy, cx, cy = camera
+    shrink = gray_t.shape[1] / wt
+    hg, wg = gray_t.shape
+    H[:] = 0.0
+    g[:] = 0.0
+    stats[:] = 0.0
+    histogram_g = np.zeros(_BINS, np.int64)
+    histogram_p = np.zeros(_BINS, np.int64)
+    count_g = 0
+    count_p = 0
+    soft_g = 1.0 / (GEMAN_MCCLURE * scales[0]) ** 2
+    soft_p = 1.0 / (GEMAN_MCCLURE * scales[1]) ** 2
+    gain, offset = weighting.brightness
+    J = np.zeros(_EXPOSURE)
+    first = stride // 2
+    for i in range(first, h, stride):
+        for j in range(first, w, stride):
+            ps0, ps1, ps2 = points_s[i, j, 0], points_s[i, j, 1], points_s[i, j, 2]
+            if ps2 == 0.0:
+                continue
+            stats[0] += 1
+            x = T[0, 0] * ps0 + T[0, 1] * ps1 + T[0, 2] * ps2 + T[0, 3]
+            y = T[1, 0] * ps0 + T[1, 1] * ps1 + T[1, 2] * ps2 + T[1, 3]
+            z = T[2, 0] * ps0 + T[2, 1] * ps1 + T[2, 2] * ps2 + T[2, 3]
+            if z < NEAREST_M:
+                continue
+            u = fx * x / z + cx
+            v = fy * y / z + cy
+            if u < 0.5 or v < 0.5 or u > wt - 1.5 or v > ht - 1.5:
+                continue
+            stats[1] += 1
+            jt, it = int(u + 0.5), int(v + 0.5)
+            q0, q1, q2 = points_t[it, jt, 0], points_t[it, jt, 1], points_t[it, jt, 2]
+            if q2 == 0.0:
+                continue
+            stats[2] += 1
+            n0, n1, n2 = normals_t[it, jt, 0], normals_t[it, jt, 1], normals_t[it, jt, 2]
+            m0 = T[0, 0] * normals_s[i, j, 0] + T[0, 1] * normals_s[i, j, 1] + T[0, 2] * normals_s[i, j, 2]
+            m1 = T[1, 0] * normals_s[i, j, 0] + T[1, 1] * normals_s[i, j, 1] + T[1, 2] * normals_s[i, j, 2]
+            m2 = T[2, 0] * normals_s[i, j, 0] + T[2, 1] * normals_s[i, j, 1] + T[2, 2] * normals_s[i, j, 2]
+            r = n0 * (x - q0) + n1 * (y - q1) + n2 * (z - q2)
+            sigma_t = look_up_sigma(target.sigma_m, it, jt, q2)
+            sigma_s = look_up_sigma(source.sigma_m, i, j, ps2)
+            sigma = math.sqrt(sigma_t * sigma_t + sigma_s * sigma_s)
+            k = abs(r) / sigma
+            bin_ = int(k * _PER_SIGMA)
+            if n0 * m0 + n1 * m1 + n2 * m2 < NORMALS_AGREE:
+                continue
+            if bin_ < _BINS:
+                histogram_g[bin_] += 1
+            count_g += 1
+            weight = 1.0 / (1.0 + k * k * soft_g) ** 2
+            if k < ON_SURFACE * scales[0]:
+                stats[3] += 1
+            _fill_jacobian(J, x, y, z, n0, n1, n2)
+            _add_residual(H, g, J, _POSE, weight / (sigma * sigma * scales[0] * scales[0]), r)
+            if k > SAME_SURFACE * scales[0] or photometric == 0.0:
+                continue
+            ug = (u + 0.5) * shrink - 0.5
+            vg = (v + 0.5) * shrink - 0.5
+            jg, ig = int(ug), int(vg)
+            if ug < 0 or vg < 0 or jg >= wg - 1 or ig >= hg - 1:
+                continue
+            value_s = _sample_source(gray_s, i, j, shrink)
+            fu, fv = ug - jg, vg - ig
+            g00, g01, g10, g11 = gray_t[ig, jg], gray_t[ig, jg + 1], gray_t[ig + 1, jg], gray_t[ig + 1, jg + 1]
+            value_t = (1 - fv) * ((1 - fu) * g00 + fu * g01) + fv * ((1 - fu) * g10 + fu * g11)
+            gu = ((1 - fv) * (g01 - g00) + fv * (g11 - g10)) * shrink
+            gv = ((1 - fu) * (g10 - g00) + fu * (g11 - g01)) * shrink
+            _count_intensities(stats, value_s, value_t)
+            rp = value_t - (gain * value_s + offset)
+            kp = abs(rp) * (1.0 / GRAY_SIGMA)
+            bin_ = int(kp * _PER_SIGMA)
+            if bin_ < _BINS:
+                histogram_p[bin_] += 1
+            count_p += 1
+            weight_p = photometric / (1.0 + kp * kp * soft_p) ** 2 / (GRAY_SIGMA**2 * scales[1] * scales[1])
+            d0, d1 = gu * fx / z, gv * fy / z
+            d2 = -(d0 * x + d1 * y) / z
+            _fill_jacobian(J, x, y, z, d0, d1, d2)
+            J[6] = -value_s
+            J[7] = -1.0
+            _add_residual(H, g, J, _EXPOSURE, weight_p, rp)
+    for a in range(_EXPOSURE):
+        for b in range(a):
+            H[a, b] = H[b, a]
+    scales[0] = _measure_spread(histogram_g, count_g, LEAST_SPREAD[0])
+    scales[1] = _measure_spread(histogram_p, count_p, LEAST_SPREAD[1])
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _fill_jacobian(J: NDArray[np.float64], x: float, y: float, z: float, d0: float, d1: float, d2: float) -> None:
+    """Derivative by xi of a residual whose derivative by the point (x, y, z) is (d0, d1, d2)."""
+    J[0] = y * d2 - z * d1
+    J[1] = z * d0 - x * d2
+    J[2] = x * d1 - y * d0
+    J[3] = d0
+    J[4] = d1
+    J[5] = d2
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _add_residual(
+    H: NDArray[np.float64], g: NDArray[np.float64], J: NDArray[np.float64], unknowns: int, weight: float, r: float
+) -> None:
+    """Add a residual's weight J J^T, its upper triangle alone, and weight J r."""
+    for a in range(unknowns):
+        wj = weight * J[a]
+        g[a] += wj * r
+        for b in range(a, unknowns):
+            H[a, b] += wj * J[b]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _sample_source(gray_s: NDArray[np.float32], i: int, j: int, shrink: float) -> float:
+    """The intensity at a full-size pixel, linearly between the pixels of a smaller image."""
+    js = (j + 0.5) * shrink - 0.5
+    is_ = (i + 0.5) * shrink - 0.5
+    if shrink == 1.0:
+        value_s = gray_s[i, j]
+    else:
+        a0, b0 = max(0, min(int(is_), gray_s.shape[0] - 2)), max(0, min(int(js), gray_s.shape[1] - 2))
+        fa, fb = is_ - a0, js - b0
+        value_s = (1 - fa) * ((1 - fb) * gray_s[a0, b0] + fb * gray_s[a0, b0 + 1]) + fa * (
+            (1 - fb) * gray_s[a0 + 1, b0] + fb * gray_s[a0 + 1, b0 + 1]
+        )
+    return value_s
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _count_intensities(stats: NDArray[np.float64], value_s: float, value_t: float) -> None:
+    stats[4] += 1
+    stats[5] += value_s
+    stats[6] += value_t
+    stats[7] += value_s * value_s
+    stats[8] += value_t * value_t
+    stats[9] += value_s * value_t
+
+
+@njit(nogil=True, cache=True)
+def _measure_spread(histogram: NDArray[np.int64], count: int, least: float) -> float:
+    """Standard deviation from the median of absolute residuals, in units of their a-priori one."""
+    total = 0
+    for k in range(len(histogram)):
+        total += histogram[k]
+        if 2 * total >= count:
+            return max(MAD_TO_SIGMA * (k + 0.5) / _PER_SIGMA, least)
+    return MAD_TO_SIGMA * len(histogram) / _PER_SIGMA
