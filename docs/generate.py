@@ -87,7 +87,10 @@ def _command(words: tuple[str, ...], command: Any) -> list[str]:
         names = ", ".join(f"`{name}{value}`" for name in parameter.opts)
         default = parameter.default
         stated = default is not None and not parameter.is_flag and not callable(default) and default != ()
-        lines.append(f"| {names} | {_cell(parameter.help)}{f' Default: `{default}`.' if stated else ''} |")
+        said = f" Default: `{default}`." if stated else ""
+        if isinstance(parameter.show_default, str):  # in words
+            said = f" Default: {parameter.show_default}."
+        lines.append(f"| {names} | {_cell(parameter.help)}{said} |")
     return [*lines, ""]
 
 

@@ -21,7 +21,7 @@ EXAMPLES = {"tripod", "brightness", "csv"}
 """Backends that CONTRIBUTING.md adds."""
 
 
-COMING = ("language.color", "demo --frames")
+COMING = ("language.color",)
 """What others are about to add."""
 
 
