@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Frame
+from ..core.warnings import Notice
 
 NOMINAL_DEPTH = 2.0
 """The median depth that scans of unknown scale are given, as rooms have it in metres: voxels and tolerances, which are
@@ -76,7 +77,7 @@ class Capture(ABC):
     """Whether at least the focal length is stated, if roughly, as EXIF does; true where the intrinsics are known."""
     metric_poses: bool = True
     """Whether ``pose`` is in metres."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     """What the user should know of what was found, such as files that are left out."""
     classes: tuple[str, ...] = ()
     """Names of the class images' values, index 0 = nothing; empty where the capture has no class images."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import CaptureError, ConfigError, FrameError
+from ..core.warnings import Notice
 from ..settings import registry
 from .base import Capture, Options
 
@@ -72,8 +73,8 @@ def select_frames(capture: Capture) -> range:
     return frames
 
 
-def check_depth_scale(capture: Capture, samples: int = 5) -> str | None:
-    """A warning in one sentence if depth seems to be stored in other units than assumed, or None.
+def check_depth_scale(capture: Capture, samples: int = 5) -> Notice | None:
+    """A warning if depth seems to be stored in other units than assumed, or None.
 
     Looks at some frames spread over the capture, before depth is clipped at ``max_depth``, because depth that is read
     1000 times too large would be clipped away entirely.
@@ -89,9 +90,10 @@ def check_depth_scale(capture: Capture, samples: int = 5) -> str | None:
     advice = f"capture.depth_scale is probably {likely:g} and not {units_per_metre:g}"
     if likely == units_per_metre:
         advice = "check capture.depth_scale and capture.max_depth"
-    return (
+    return Notice(
+        "depth-scale-doubtful",
         f"The median depth of {capture.path} is {median_m:.3g} m and {within:.0%} of it lies within "
-        f"capture.max_depth = {capture.options.max_depth:g} m, which does not look like a room: {advice}."
+        f"capture.max_depth = {capture.options.max_depth:g} m, which does not look like a room: {advice}.",
     )
 
 

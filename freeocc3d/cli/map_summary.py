@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from ..core.warnings import read_notices
+
 if TYPE_CHECKING:
     from ..storage.store import Map
 
@@ -71,7 +73,7 @@ def summary_text(loaded: Map) -> str:
             f"{submap['keyframes']} as keyframes; {'mapped' if submap['mapped'] else 'apart, not in the map'}"
             for submap in said["submap_frames"]
         ]
-    lines += [f"warning    {text}" for text in said["warnings"]]
+    lines += [f"warning    {notice.text}" for notice in read_notices(said["warnings"])]
     return "\n".join(lines)
 
 

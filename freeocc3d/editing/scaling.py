@@ -23,6 +23,7 @@ from ..core.errors import FreeOccError, MapError
 from ..core.transforms import back_project, transform
 from ..core.tum_files import write_tum
 from ..core.types import Gaussians, Submap, Trajectory
+from ..core.warnings import read_notices
 from ..evaluation.scoring import reopen_capture
 from ..gaussians import rendered_views
 from ..gaussians.point_cloud import write_gaussian_ply
@@ -34,11 +35,6 @@ from ..storage.store import Map, load_map
 from ..storage.work_folder import WorkFolder
 from ..tracking.trajectory_alignment import Poses, align_trajectories, read_poses, select_estimated_poses
 from ..viewer import render_pictures, trajectory_picture
-
-UNKNOWN = (
-    "The scale of this map is unknown: its lengths, also the edge of its voxels, are in a unit in which the scene is "
-    "about 2 deep. Give metres per unit with --scale, or scale the map by a known length: freeocc3d scale."
-)
 
 _NEAR_PX = 6
 _MOST_DEPTH_M = 65.535  # what 16 bits of millimetres hold
@@ -199,7 +195,10 @@ def _settings(scan_map: Map, factor: float) -> Config:
 
 def _report(scan_map: Map, factor: float) -> dict[str, Any]:
     report = dict(scan_map.report)
-    report["warnings"] = [text for text in report["warnings"] if text != UNKNOWN]
+    warnings = read_notices(report["warnings"])
+    if not scan_map.metric and warnings and warnings[-1].code == "uncoded":
+        warnings.pop()  # of a map of unknown scale, the last one always said so when warnings had no codes
+    report["warnings"] = [notice.to_dict() for notice in warnings if notice.code != "scale-unknown"]
     if (rendering := report.get("rendering")) and rendering.get("depth_l1_m") is not None:
         report["rendering"] = {**rendering, "depth_l1_m": rendering["depth_l1_m"] * factor}
     return report

@@ -28,7 +28,6 @@ from ..core.types import Gaussians
 from ..settings.registry import require_positive
 from .rasterizers.base import ALPHA_MIN, Rasterizer, Rendered
 from .rendered_views import CapturedView
-from .surface_cells import cell_keys
 
 _RATES = {"outline": 1e-2, "turn": 1e-2, "shape": 1e-2, "quats": 5e-3, "means": 2e-4, "logits": 5e-2, "colors": 1e-2}
 """Adam's step of each parameter: natural logarithms, radians, metres, logits, 0…1."""
@@ -232,20 +231,3 @@ class _Free(_Parameters):
             torch.maximum(torch.minimum(shape, self.log_scales + _LARGEST_CHANGE), self.log_scales - _LARGEST_CHANGE)
         )
         self.optimised["quats"].copy_(torch.nn.functional.normalize(self.optimised["quats"], dim=1))
-
-
-def carried_over(fresh: Gaussians, before: Gaussians, cell_size: float) -> Gaussians:
-    """``fresh`` with shapes, opacities and colours of those of ``before`` that lie in the same cells: what was fitted
-    to earlier keyframes stays, and new surface starts as it was initialised. Both at the same poses."""
-    keys, row = np.unique(cell_keys(before.means.astype(np.float64), cell_size), return_index=True)
-    if not len(keys):
-        return fresh
-    wanted = cell_keys(fresh.means.astype(np.float64), cell_size)
-    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    known = keys[place] == wanted
-    source = row[place[known]]
-    changed = {}
-    for name in ("scales", "quats_wxyz", "opacities", "colors"):
-        changed[name] = getattr(fresh, name).copy()
-        changed[name][known] = getattr(before, name)[source]
-    return replace(fresh, **changed)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from ..core.atomic_files import replace_text
 from ..core.errors import ConfigError
 from ..core.types import Frame
+from ..core.warnings import Notice
 from ..settings.registry import require_positive
 from .synonyms import normalize_phrase
 from .vision_server import ServerError, VisionServer, resolve_address, shorten_to_line
@@ -85,9 +86,9 @@ class Namer:
 
     def names(
         self, keyframes: Sequence[Frame], path: Path, advance: Callable[[int], None]
-    ) -> tuple[dict[str, Any], list[str]]:
+    ) -> tuple[dict[str, Any], list[Notice]]:
         """What a map keeps: the model, the frames that were answered, and the names with their counts and frames, the
-        most frequent first; and sentences about what did not work.
+        most frequent first; and warnings of what did not work.
 
         path: where answers are kept meanwhile.
         """
@@ -111,15 +112,17 @@ class Namer:
             self._keep(path, answers)
             advance(len(asked))
         answered = {frame: answers[frame] for frame in asked if frame in answers}
-        warnings = []
+        warnings: list[Notice] = []
         if failed:
             lacking = len(asked) - len(answered)
-            warnings.append(f"The scene's vocabulary lacks {lacking} of {len(asked)} keyframes: {failed.rstrip('.')}.")
+            text = f"The scene's vocabulary lacks {lacking} of {len(asked)} keyframes: {failed.rstrip('.')}."
+            warnings.append(Notice("vocabulary-incomplete", text))
         if nothing:
             shown = shorten_to_line(nothing[0], 60) or "nothing"
-            warnings.append(
+            text = (
                 f"{len(nothing)} of {len(answered)} answers of {self.options.model} name nothing, the first: '{shown}'."
             )
+            warnings.append(Notice("vocabulary-empty-answers", text))
         return aggregate_names(answered, self.options.model), warnings
 
     def _marks(self) -> str:

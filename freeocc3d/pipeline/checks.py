@@ -1,11 +1,14 @@
-"""What is checked before a run, and what a user is warned of after it."""
+"""What is checked before a run, and what its user is warned of."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from ..core.progress import Progress
+from ..capture import Capture
 from ..core.types import Trajectory
+from ..core.warnings import Notice
 from ..depth import multi_view_stereo
 from ..editing import adaptive_voxels
 from ..gaussians import anchors, fitting
@@ -13,14 +16,13 @@ from ..language import lifting, scene_vocabulary
 from ..occupancy import carve, splat
 from ..settings import config, registry
 from ..settings.config import Config
-from ..storage.work_folder import WorkFolder
 from .backends import options_of
 
 _FEW_TRACKED = 0.5
 
 
 def check(settings: Config) -> None:
-    """Build the options of every layer and of the chosen backends, so that a value out of range is told before any
+    """Build the options of every layer and of the chosen backends, so that a value out of range is found before any
     work. A backend that needs more than packages has a function ``check``. Raises ConfigError, DependencyError for a
     backend whose packages are not installed, or what ``check`` raises."""
     layers = {"gaussians": anchors, "fitting": fitting, "language": lifting, "occupancy": splat, "carving": carve}
@@ -39,30 +41,58 @@ def check(settings: Config) -> None:
                 backend.check(options)
 
 
-def warn_of_result(trajectory: Trajectory, progress: Progress, work: WorkFolder) -> None:
-    """Warn about a run whose map shows only part of the scan."""
-    if work.broken:
-        count = len(work.broken)
-        text = f"{count} frame{'s' if count > 1 else ''} could not be read and were skipped; report.json says why."
-        work.warnings.append(text)
-        progress.warn(text)
-    used = trajectory.status != "unused"
-    lost = int(np.count_nonzero(trajectory.status == "lost"))
-    if lost:
-        share = lost / max(int(np.count_nonzero(used)), 1)
-        first = int(np.flatnonzero(trajectory.status == "lost")[0])
-        frames = f"{lost} frame{'s' if lost > 1 else ''} ({share:.0%})"
-        text = f"Tracking lost {frames}, the first is frame {first}: what only these show is not in the map."
+def warn_of_camera(capture: Capture) -> Notice:
+    """That nothing says what the camera is."""
+    focal = "what the images roughly state" if capture.focal_stated else "a guess"
+    return Notice(
+        "intrinsics-unknown",
+        f"Nothing says what camera took {capture.path}: its focal length is {focal}, and what is mapped is bent as "
+        "far as that is wrong. Give capture.intrinsics, if you have them.",
+    )
+
+
+def warn_of_color_focal(capture: Capture, ratio: float) -> Notice:
+    """That the color camera's focal length is ``ratio`` times what the capture says."""
+    return Notice(
+        "color-focal-corrected",
+        f"Colour and depth of {capture.path} fit each other only if the colour camera's focal length is "
+        f"{ratio:.3f} of what its files say: colour is resampled so (capture.color_focal=1 leaves it as it is).",
+    )
+
+
+def warn_of_scale() -> Notice:
+    """That lengths are not in metres."""
+    return Notice(
+        "scale-unknown",
+        "The scale of this map is unknown: its lengths, also the edge of its voxels, are in a unit in which the scene "
+        "is about 2 deep. Give metres per unit with --scale, or scale the map by a known length: freeocc3d scale.",
+    )
+
+
+def warn_of_trajectory(trajectory: Trajectory) -> Iterator[Notice]:
+    """That the map shows only part of the scan: frames that could not be read, were lost, or are submaps apart."""
+    used = max(int(np.count_nonzero(trajectory.status != "unused")), 1)
+    if broken := int(np.count_nonzero(trajectory.status == "broken")):
+        text = (
+            f"{_frames(broken)} could not be read and {'were' if broken > 1 else 'was'} skipped; report.json says why."
+        )
+        yield Notice("broken-frames", text)
+    if len(lost := np.flatnonzero(trajectory.status == "lost")):
+        share = len(lost) / used
+        text = (
+            f"Tracking lost {_frames(len(lost))} ({share:.0%}), the first is frame {lost[0]}: what only these show is "
+            "not in the map."
+        )
         if share > _FEW_TRACKED:
             text += " Most of the scan is missing: was it captured slowly, with depth in most of each image?"
-        work.warnings.append(text)
-        progress.warn(text)
-    apart = np.flatnonzero(trajectory.status == "apart")
-    if len(apart):
-        share = len(apart) / max(int(np.count_nonzero(used)), 1)
-        text = (
-            f"{len(apart)} frames ({share:.0%}), the first is frame {apart[0]}, were tracked, but nothing ties them to "
-            "the rest: they are submaps of their own and not in the map, which is of the largest."
+        yield Notice("frames-lost", text)
+    if len(apart := np.flatnonzero(trajectory.status == "apart")):
+        yield Notice(
+            "submaps-apart",
+            f"{len(apart)} frames ({len(apart) / used:.0%}), the first is frame {apart[0]}, were tracked, but nothing "
+            "ties them to the rest: they are submaps of their own and not in the map, which is of the largest.",
         )
-        work.warnings.append(text)
-        progress.warn(text)
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'s' if count > 1 else ''}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,8 @@ class Mapper:
         if not (capture.has_depth or self.tracker.brings_depth):
             self.depth = StereoSource(capture, options_of(multi_view_stereo, settings["tracking"]["stereo"]))
         self.rasterizer: Rasterizer = load_backend(settings, "fitting", "rasterizer")
-        self._fitted: tuple[Gaussians, Trajectory] | None = None
+        self.refined = False
+        """Whether all poses so far are consistent with each other."""
 
     @property
     def offline(self) -> bool:
@@ -71,6 +73,7 @@ class Mapper:
         """Track the next frame, and keep it if it is a keyframe."""
         frame = self._complete(frame)
         tracked = self.tracker.track(frame)
+        self.refined = False
         if tracked.status == "keyframe":
             self.keyframes.append(frame)
         return tracked
@@ -78,6 +81,22 @@ class Mapper:
     def refine(self) -> None:
         """Make all poses so far consistent with each other."""
         self.tracker.optimize()
+        self.refined = True
+
+    def state(self, done: int) -> dict[str, NDArray[Any]]:
+        """What ``restore`` needs, once ``done`` frames were added, beyond the keyframes, which are listed on disk."""
+        self.keyframes.save_index()
+        counts = {"done": done, "keyframes": len(self.keyframes), "refined": self.refined}
+        return {**{name: np.array(count) for name, count in counts.items()}, **self.tracker.state()}
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> int:
+        """Go on from a ``state``, which is used up; returns the number of frames that were added."""
+        keyframes = Keyframes.load(self.keyframes.folder)
+        keyframes.truncate(int(state.pop("keyframes")))
+        done, self.refined = int(state.pop("done")), bool(state.pop("refined"))
+        self.keyframes = keyframes
+        self.tracker.restore(state, keyframes)
+        return done
 
     def trajectory(self) -> Trajectory:
         """Poses so far, one row per frame of the capture."""
@@ -110,23 +129,17 @@ class Mapper:
         finally:
             stream.close()
 
-    def build_gaussians(self, progress: Progress | None = None) -> Gaussians:
-        """Layer 2 from the mapped keyframes so far at their present poses: anchored, and fitted to all of them."""
-        return self.fit_gaussians(self.anchor_gaussians(progress), progress)
-
-    def anchor_gaussians(self, progress: Progress | None = None, every: int | None = None) -> Gaussians:
-        """Layer 2 as it is initialised: Gaussians anchored at the surface that the mapped frames so far show, every
-        n-th of them (0 = keyframes alone; by default what the configuration says)."""
+    def anchor_gaussians(self, progress: Progress | None = None) -> Gaussians:
+        """Layer 2 as it is initialised: Gaussians anchored at the surface that the mapped frames so far show."""
         progress = progress or Progress()
         trajectory = self.trajectory()
         options: anchors.Options = options_of(anchors, self.settings["gaussians"])
-        every = options.every if every is None else every
-        progress.stage("gaussians", 2 * len(self.frames_used(trajectory, every)))
+        progress.stage("gaussians", 2 * len(self.frames_used(trajectory, options.every)))
         cells = anchors.AnchoredCells(options, self.cell_size, trajectory.T_world_keyframe)
         done = itertools.count(1)
 
         def frames() -> Iterator[PosedFrame]:
-            for posed in self.posed(trajectory, every):
+            for posed in self.posed(trajectory, options.every):
                 yield posed
                 progress.advance(next(done))
 
@@ -136,26 +149,13 @@ class Mapper:
 
     def fit_gaussians(self, gaussians: Gaussians, progress: Progress | None = None) -> Gaussians:
         """Layer 2 fitted to the images of all mapped keyframes so far."""
-        progress = progress or Progress()
-        trajectory, passes = self.trajectory(), self.fit_options.passes
-        progress.stage("fitting", passes * len(trajectory.keyframes))
-        return self._fit(gaussians, trajectory, passes, progress)
-
-    def update_gaussians(self) -> Gaussians:
-        """Layer 2 kept current while frames come in: what was fitted before is carried over to the keyframes' present
-        poses, new surface is added, and all is fitted to the last ``fitting.window`` keyframes."""
-        trajectory, options = self.trajectory(), self.fit_options
-        gaussians = self.anchor_gaussians(every=0)
-        if self._fitted is not None:
-            before, then = self._fitted
-            count = len(then.keyframes)
-            if np.array_equal(trajectory.keyframes[:count], then.keyframes):  # else submaps were merged: start anew
-                moved = anchors.reanchor(before, then.T_world_keyframe, trajectory.T_world_keyframe[:count])
-                gaussians = fitting.carried_over(gaussians, moved, self.cell_size)
-        window = trajectory.only_keyframes(trajectory.keyframes[-options.window :])
-        gaussians = self._fit(gaussians, window, options.window_passes, Progress())
-        self._fitted = gaussians, trajectory
-        return gaussians
+        progress, options, trajectory = progress or Progress(), self.fit_options, self.trajectory()
+        progress.stage("fitting", options.passes * len(trajectory.keyframes))
+        if options.passes == 0 or not len(gaussians):
+            return gaussians
+        views = self.views(trajectory)
+        made = fitting.fit_gaussians(gaussians, views, self.rasterizer, options, options.passes, progress.advance)
+        return anchors.anchor_in_place(made, trajectory.T_world_keyframe) if options.means == "free" else made
 
     @property
     def cell_size(self) -> float:
@@ -176,22 +176,6 @@ class Mapper:
         device, width = self.rasterizer.device, self.fit_options.width
         posed = zip(self.mapped(trajectory), trajectory.T_world_keyframe, strict=True)
         return [rendered_views.prepare_captured_view(frame, T, width, device) for frame, T in posed]
-
-    def _complete(self, frame: Frame) -> Frame:
-        """As the tracker knows the camera, and with depth."""
-        return self.depth.complete(self.tracker.prepare_frame(frame))
-
-    def _fit(self, gaussians: Gaussians, trajectory: Trajectory, passes: int, progress: Progress) -> Gaussians:
-        """Fitted to the trajectory's keyframes, ``passes`` times each."""
-        options = self.fit_options
-        if passes == 0 or not len(gaussians):
-            return gaussians
-        made = fitting.fit_gaussians(
-            gaussians, self.views(trajectory), self.rasterizer, options, passes, progress.advance
-        )
-        if options.means == "free":
-            made = anchors.anchor_in_place(made, self.trajectory().T_world_keyframe)
-        return made
 
     def build_features(
         self, gaussians: Gaussians, encoder: Encoder, progress: Progress | None = None
@@ -248,3 +232,7 @@ class Mapper:
             finest,
             progress,
         )
+
+    def _complete(self, frame: Frame) -> Frame:
+        """As the tracker knows the camera, and with depth."""
+        return self.depth.complete(self.tracker.prepare_frame(frame))

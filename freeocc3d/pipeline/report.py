@@ -20,7 +20,7 @@ def report_of(work: WorkFolder, capture: Capture, trajectory: Trajectory, submap
         "peak_memory_bytes": peak_kib * 1024,
         "frames": {str(s): int(n) for s, n in zip(status, count, strict=True)},
         "broken": {str(index): text for index, text in work.broken.items()},
-        "warnings": work.warnings,
+        "warnings": [notice.to_dict() for notice in work.warnings],
         "color_focal": getattr(capture, "color_focal", 1.0),
         "submaps": [
             {

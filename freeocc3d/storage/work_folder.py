@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import MapError
+from ..core.progress import Progress
 from ..core.types import Gaussians
+from ..core.warnings import Notice, read_notices
 from ..gaussians.point_cloud import read_gaussian_ply, write_gaussian_ply
 from ..settings import config
 from ..settings.config import Config
@@ -45,7 +47,7 @@ class WorkFolder:
         self.folder = folder
         self.resumed = resumed
         self.seconds: dict[str, float] = {}
-        self.warnings: list[str] = []
+        self.warnings: list[Notice] = []
         self.broken: dict[int, str] = {}  # frame -> what is wrong with it
         self._stage, self._since = "", 0.0
         self._fingerprints: dict[str, str] = {}
@@ -125,7 +127,7 @@ class WorkFolder:
         """Keep layer 1's state, in place of the one before."""
         temporary = self.folder / "tracking.tmp.npz"
         seconds = {**self.seconds, self._stage: self.seconds.get(self._stage, 0.0) + time.perf_counter() - self._since}
-        log = {"broken": self.broken, "warnings": self.warnings, "seconds": seconds}
+        log = {"broken": self.broken, "warnings": [notice.to_dict() for notice in self.warnings], "seconds": seconds}
         arrays: dict[str, Any] = {**state, "log": np.array(json.dumps(log))}
         np.savez(temporary, **arrays)
         temporary.replace(self.folder / _TRACKING)
@@ -139,7 +141,7 @@ class WorkFolder:
         state = store.read_arrays(path, {})
         log = json.loads(str(state.pop("log")))
         self.broken = {int(index): text for index, text in log["broken"].items()}
-        self.warnings = log["warnings"]
+        self.warnings = read_notices(log["warnings"])
         self.seconds = {name: self.seconds.get(name, 0.0) + value for name, value in log["seconds"].items()}
         return state
 
@@ -177,6 +179,12 @@ class WorkFolder:
     def answers(self) -> Path:
         """Where the answers about keyframes are kept, which say themselves to which questions."""
         return self.folder / _ANSWERS
+
+    def warn(self, progress: Progress, *notices: Notice) -> None:
+        """Tell the user now, and keep it for the map's report."""
+        for notice in notices:
+            self.warnings.append(notice)
+            progress.warn(notice.text)
 
     def begin_offline(self) -> Path:
         """The folder of what a tracker does for the whole scan before its first frame; from now on the run can be taken

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.progress import Progress
 from ..core.types import Frame, Submap, Trajectory
+from ..core.warnings import Notice
 from .pose_graph import Edge, edges_to_arrays
 from .records import Records
 
@@ -71,7 +72,7 @@ class Tracker(ABC):
     """Whether its poses are in metres; where not, their unit is unknown, and so is the scale of what is mapped."""
     offline: bool = False
     """Whether ``prepare`` works through the whole scan before the first frame is tracked."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     """What ``prepare`` found that the user should know."""
     brings_depth: bool = False
     """Whether ``prepare_frame`` adds depth, so that a capture without any needs no other depth source."""

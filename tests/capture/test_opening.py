@@ -115,13 +115,13 @@ def test_depth_in_other_units_names_the_likely_ones(tmp_path: Path, true_scale: 
         write_image(tmp_path / f"frame-{i:06d}.depth.png", depth_image(i, true_scale))
     warning = check_depth_scale(open_capture(tmp_path, Options(depth_scale=said_scale)))
     assert warning is not None
-    assert f"capture.depth_scale is probably {true_scale} and not {said_scale}" in warning
+    assert f"capture.depth_scale is probably {true_scale} and not {said_scale}" in warning.text
 
 
 def test_depth_all_beyond_the_range_is_warned_of(tmp_path: Path) -> None:
     warning = check_depth_scale(open_capture(write_seven_scenes(tmp_path, 3), Options(max_depth=1.0)))
     assert warning is not None
-    assert "check capture.depth_scale and capture.max_depth" in warning
+    assert "check capture.depth_scale and capture.max_depth" in warning.text
 
 
 def test_depth_without_any_measurement_is_not_about_units(tmp_path: Path) -> None:

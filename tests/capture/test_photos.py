@@ -157,13 +157,14 @@ def test_images_of_other_sizes_are_left_out_with_a_warning(tmp_path: Path) -> No
     capture = open_capture(tmp_path)
     assert [capture.name(index) for index in range(len(capture))] == [f"IMG_{n}.jpg" for n in (8, 9, 10, 12, 13)]
     (warning,) = capture.warnings
-    assert "1 of the 6 images" in warning
-    assert "is left out, the first IMG_11.jpg of 80 x 60 pixels: the others have 64 x 48" in warning
+    assert warning.code == "images-left-out"
+    assert "1 of the 6 images" in warning.text
+    assert "is left out, the first IMG_11.jpg of 80 x 60 pixels: the others have 64 x 48" in warning.text
     assert capture[2].color.shape == (48, 64, 3)
     with pytest.raises(FrameError, match=r"IMG_12\.jpg is not a readable image"):
         capture[3]
     write_photo(tmp_path / "IMG_13.jpg", size=(80, 60))
-    assert "2 of the 6 images" in open_capture(tmp_path).warnings[0]
+    assert "2 of the 6 images" in open_capture(tmp_path).warnings[0].text
 
 
 def test_images_of_which_no_two_have_one_size_are_refused(tmp_path: Path) -> None:

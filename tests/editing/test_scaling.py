@@ -37,7 +37,7 @@ def half(room: Map) -> Map:
     made = scaling.scale_map(room, 0.5, "given", room.path.parent / "half")
     manifest = yaml.safe_load((made.path / store.MANIFEST).read_text())
     manifest["scale"] = {"metric": False, "by": "none", "factor": 1.0}
-    report = {**made.report, "warnings": [scaling.UNKNOWN, "another"]}
+    report = {**made.report, "warnings": ["another", "The scale is unknown, said as it was without codes."]}
     (made.path / store.REPORT).write_text(json.dumps(report))
     manifest["files"][store.REPORT] = (made.path / store.REPORT).stat().st_size
     (made.path / store.MANIFEST).write_text(yaml.safe_dump(manifest))
@@ -84,7 +84,9 @@ def test_scaling_back_gives_the_map_that_it_was(room: Map, half: Map, tmp_path: 
     assert back.manifest["scale"] == {"metric": True, "by": "length", "factor": 2.0}
     assert back.manifest["voxel_size_m"] == pytest.approx(room.manifest["voxel_size_m"])
     np.testing.assert_allclose(back.gaussians.means, room.gaussians.means, rtol=1e-5)
-    assert back.report["warnings"] == ["another"], "that the scale is unknown is said no more"
+    assert back.report["warnings"] == [{"code": "uncoded", "text": "another"}], (
+        "that the scale is unknown is said no more"
+    )
     assert not list(tmp_path.glob("*.partial"))
 
 

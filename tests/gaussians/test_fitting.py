@@ -133,17 +133,6 @@ def test_fitting_twice_gives_the_same() -> None:
     assert torch.get_num_threads() >= 1
 
 
-def test_what_was_fitted_is_carried_over_by_cells() -> None:
-    frames, poses = walls()
-    g = lifted(frames, poses)
-    half = g[g.means[:, 0] < 0]
-    changed = replace(half, opacities=np.full(len(half), 0.123, np.float32))
-    carried = fitting.carried_over(g, changed, 0.04)
-    np.testing.assert_allclose(carried.opacities, np.where(g.means[:, 0] < 0, 0.123, 0.9), rtol=1e-6)
-    np.testing.assert_array_equal(carried.means, g.means)
-    assert fitting.carried_over(g, random_gaussians(0, 0), 0.04) is g
-
-
 def test_a_view_keeps_rays_and_picks_depth() -> None:
     frame = wall_frame(2.0)
     depth = frame.depth_m.copy()

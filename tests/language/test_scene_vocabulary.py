@@ -99,7 +99,7 @@ def test_answers_that_name_nothing_are_told_and_cost_nothing_else(tmp_path: Path
         found, warnings = named(namer(server.url), tmp_path)
     assert found["names"] == {"chair": {"count": 2, "keyframes": [10, 30]}}
     assert len(warnings) == 1
-    assert warnings[0].startswith("2 of 4 answers of a-model name nothing, the first: 'I'm sorry, [31m I can't.'")
+    assert warnings[0].text.startswith("2 of 4 answers of a-model name nothing, the first: 'I'm sorry, [31m I can't.'")
 
 
 def test_a_server_that_fails_now_and_then_costs_its_keyframes(tmp_path: Path) -> None:
@@ -112,8 +112,8 @@ def test_a_server_that_fails_now_and_then_costs_its_keyframes(tmp_path: Path) ->
         found, warnings = named(namer(server.url), tmp_path, 5)
     assert found["names"]["chair"]["keyframes"] == [10, 40]
     assert len(warnings) == 1
-    assert "lacks 3 of 5 keyframes" in warnings[0]
-    assert "500" in warnings[0]
+    assert "lacks 3 of 5 keyframes" in warnings[0].text
+    assert "500" in warnings[0].text
 
 
 @pytest.mark.parametrize(("status", "asked"), [(500, 3), (400, 3), (401, 1), (404, 1)])
@@ -122,7 +122,7 @@ def test_a_server_that_fails_always_is_not_asked_for_every_keyframe(tmp_path: Pa
         found, warnings = named(namer(server.url), tmp_path, 9)
     assert len(server.asked) == asked
     assert found["names"] == {}
-    assert "lacks 9 of 9" in warnings[0]
+    assert "lacks 9 of 9" in warnings[0].text
 
 
 def test_answers_are_kept_for_a_run_that_goes_on(tmp_path: Path) -> None:

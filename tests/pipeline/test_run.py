@@ -19,9 +19,8 @@ from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, Interrupted, MapError, TrackingError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import FREE, OCCUPIED
-from freeocc3d.gaussians import rendered_views
-from freeocc3d.pipeline import mapper as pipeline_mapper
-from freeocc3d.pipeline import run
+from freeocc3d.core.warnings import Notice, read_notices
+from freeocc3d.pipeline import stages
 from freeocc3d.settings import config, registry
 from freeocc3d.storage import store
 
@@ -31,6 +30,10 @@ ROOM = {"capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "
 @pytest.fixture(scope="module")
 def room(tmp_path_factory) -> store.Map:
     return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", ROOM)
+
+
+def notices(made) -> list[Notice]:
+    return read_notices(made.report["warnings"])
 
 
 def listing(folder) -> dict[str, bytes]:
@@ -80,33 +83,6 @@ def test_the_report_says_how_well_the_map_renders(room) -> None:
     assert cv2.imread(str(room.path / store.RENDER_PICTURE)).std() > 10
 
 
-def test_fitting_while_frames_come_in_keeps_what_was_fitted(tmp_path) -> None:
-    """Each keyframe is fitted when it comes, then carried along; the last map renders all of them better than what
-    the same keyframes start with."""
-    capture = open_capture("builtin:room", *_synthetic())
-    settings = config.resolve({**ROOM, "fitting": {"window": 2, "window_passes": 4}})
-    mapper = pipeline_mapper.Mapper(settings, capture, tmp_path)
-    current = None
-    for index in range(24):
-        if mapper.add(capture[index]).status == "keyframe":
-            current = mapper.update_gaussians()
-    assert len(mapper.keyframes) > 3
-    mapper.refine()
-    current = mapper.update_gaussians()
-    views = mapper.views(mapper.trajectory())
-    before, after = (
-        rendered_views.measure_fidelity(g, views, mapper.rasterizer) for g in (mapper.anchor_gaussians(), current)
-    )
-    assert after.psnr_measured > before.psnr_measured + 0.5
-    oldest_before, oldest_after = (
-        rendered_views.measure_fidelity(g, views[:1], mapper.rasterizer) for g in (mapper.anchor_gaussians(), current)
-    )
-    assert oldest_after.psnr_measured > oldest_before.psnr_measured
-    world = mapper.trajectory().T_world_keyframe[current.anchor_keyframe]
-    anchored = np.einsum("nij,nj->ni", world[:, :3, :3], current.anchor_cam.astype(float)) + world[:, :3, 3]
-    np.testing.assert_allclose(anchored, current.means, atol=1e-4)
-
-
 def test_a_pose_free_run_never_reads_poses_or_class_images(tmp_path, monkeypatch) -> None:
     from freeocc3d.capture.readers.seven_scenes import Reader
 
@@ -138,7 +114,7 @@ class Stopper(Progress):
 
 @pytest.mark.parametrize(("stage", "after"), [("tracking", 12), ("tracking", 3), ("language", 1)])
 def test_an_interrupted_run_leaves_no_map_and_resumes_to_the_same(tmp_path, room, monkeypatch, stage, after) -> None:
-    monkeypatch.setattr(run, "_CHECKPOINT_FRAMES", 5)
+    monkeypatch.setattr(stages, "_CHECKPOINT_FRAMES", 5)
     output = tmp_path / "map"
     with pytest.raises(Interrupted, match="--resume" if after != 3 else "nothing is kept"):
         freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper(stage, after))
@@ -153,7 +129,7 @@ def test_an_interrupted_run_leaves_no_map_and_resumes_to_the_same(tmp_path, room
 
 
 def test_a_run_is_not_resumed_with_other_options_and_loses_nothing_by_the_attempt(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(run, "_CHECKPOINT_FRAMES", 5)
+    monkeypatch.setattr(stages, "_CHECKPOINT_FRAMES", 5)
     output, work = tmp_path / "map", tmp_path / "map.partial"
     with pytest.raises(Interrupted):
         freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper("tracking", 12))
@@ -169,7 +145,7 @@ def test_a_run_is_not_resumed_with_other_options_and_loses_nothing_by_the_attemp
 
 
 def test_time_before_an_interruption_counts(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(run, "_CHECKPOINT_FRAMES", 20)
+    monkeypatch.setattr(stages, "_CHECKPOINT_FRAMES", 20)
     with pytest.raises(Interrupted):
         freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, progress=Stopper("tracking", 21))
     state = np.load(tmp_path / "map.partial" / "tracking.npz")
@@ -291,7 +267,9 @@ def test_frames_that_cannot_be_read_are_skipped_and_counted(tmp_path) -> None:
     assert len(made.report["broken"]) == 2
     assert "frame-000007.color.jpg" in made.report["broken"]["7"]
     assert made.trajectory.status[7] == made.trajectory.status[11] == "broken"
-    assert any("2 frames could not be read" in text for text in made.report["warnings"])
+    (warning,) = notices(made)
+    assert warning.code == "broken-frames"
+    assert "2 frames could not be read" in warning.text
     for i in (3, 4, 5):
         truncate(scan / f"frame-{i:06d}.color.jpg")
     with pytest.raises(CaptureError, match=r"capture\.max_broken"):
@@ -365,7 +343,9 @@ def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -
     assert made.report["frames"]["apart"] == 8
     assert [(s["first"], s["last"], s["mapped"]) for s in made.report["submaps"]] == [(0, 14, True), (15, 22, False)]
     assert (made.trajectory.status[15:] == "apart").all()
-    assert any("8 frames" in text and "frame 15" in text for text in made.report["warnings"])
+    (warning,) = (notice.text for notice in notices(made) if notice.code == "submaps-apart")
+    assert "8 frames" in warning
+    assert "frame 15" in warning
     assert len(made.keyframes) == len(made.trajectory.keyframes) == len(made.manifest["keyframes"])
     assert [frame.index for frame in made.keyframes] == made.trajectory.keyframes.tolist()
     assert len(list((made.path / "keyframes").glob("*.color.jpg"))) == len(made.keyframes)
@@ -417,7 +397,9 @@ def test_a_color_camera_of_another_focal_length_is_told_and_corrected(tmp_path) 
     np.testing.assert_array_equal(made.keyframes[0].depth_m, left.keyframes[0].depth_m)
     found = freeocc3d.reconstruct(kitchen, tmp_path / "found", {"capture": {"stop": 250, "stride": 10}})
     assert found.report["color_focal"] == pytest.approx(0.903, abs=0.02)
-    assert any("0.9" in text and "capture.color_focal=1" in text for text in found.report["warnings"])
+    (warning,) = (notice.text for notice in notices(found) if notice.code == "color-focal-corrected")
+    assert "0.9" in warning
+    assert "capture.color_focal=1" in warning
 
 
 def _with_vocabulary(url: str, **more) -> dict:
@@ -443,7 +425,7 @@ def test_names_by_a_model_are_kept_in_the_map_and_its_key_is_not(tmp_path, monke
 def test_a_model_that_cannot_be_asked_costs_names_and_a_warning(tmp_path) -> None:
     made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", _with_vocabulary("http://127.0.0.1:9/v1"))
     assert made.manifest["vocabulary"]["names"] == {}
-    (warning,) = (text for text in made.report["warnings"] if "vocabulary" in text)
+    (warning,) = (notice.text for notice in notices(made) if notice.code == "vocabulary-incomplete")
     assert "lacks 3 of 3 keyframes" in warning
     assert made.query("red").matched
 

@@ -156,7 +156,7 @@ def test_two_scenes_become_one_map_and_frames_apart(tmp_path: Path) -> None:
     found = reconstructed([*images[:12], *images[34:44]], camera, tmp_path)
     np.testing.assert_array_equal(found.has_pose, [True] * 12 + [False] * 10)
     np.testing.assert_array_equal(found.apart, [False] * 12 + [True] * 10)
-    assert "2 models" in found.warnings[0]
+    assert "2 models" in found.warnings[0].text
 
 
 def test_scans_that_give_no_poses_are_told_apart(tmp_path: Path) -> None:

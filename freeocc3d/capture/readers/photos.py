@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import CaptureError, FrameError
 from ...core.types import Frame, Intrinsics
+from ...core.warnings import Notice
 from ..base import Capture, Options
 from ..camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
 from ..image_decoding import Size, read_color
@@ -215,13 +216,13 @@ def _common_size(folder: Path, headers: Sequence[Header]) -> Size:
     return size
 
 
-def _left_out(folder: Path, odd: Sequence[tuple[Path, Header]], used: int, size: Size) -> str:
-    """A warning in one sentence."""
+def _left_out(folder: Path, odd: Sequence[tuple[Path, Header]], used: int, size: Size) -> Notice:
     (path, header), count = odd[0], len(odd)
-    return (
+    return Notice(
+        "images-left-out",
         f"{count} of the {count + used} images of {folder} {'is' if count == 1 else 'are'} left out, the first "
         f"{path.name} of {header.size[0]} x {header.size[1]} pixels: the others have {size[0]} x {size[1]}, and a scan "
-        "is of one camera."
+        "is of one camera.",
     )
 
 

@@ -14,10 +14,11 @@ from ...capture.base import NOMINAL_DEPTH
 from ...capture.lenses import Lens, Rectified
 from ...core.arrays import read_arrays, write_arrays
 from ...core.types import Intrinsics
+from ...core.warnings import Notice
 
 _EXPECTED = {
     "T_world_cam": ("f", 3), "camera": ("f", 1), "points": ("f", 2), "seen_frame": ("i", 1), "seen_point": ("i", 1),
-    "fisheye": ("b", 0), "metric": ("b", 0), "apart": ("b", 1), "chosen": ("b", 1), "warnings": ("U", 1),
+    "fisheye": ("b", 0), "metric": ("b", 0), "apart": ("b", 1), "chosen": ("b", 1), "warnings": ("U", 2),
 }  # fmt: skip
 
 _OF_LENS = ("camera", "fisheye")
@@ -43,7 +44,7 @@ class Reconstruction:
     metric: bool
     apart: NDArray[np.bool_]
     chosen: NDArray[np.bool_]
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[Notice, ...] = field(default=())
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:
@@ -76,7 +77,7 @@ class Reconstruction:
         camera = self.lens.camera
         numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *self.lens.distortion)
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _EXPECTED if name not in _OF_LENS}
-        arrays["warnings"] = np.array(self.warnings, "U")
+        arrays["warnings"] = np.array(self.warnings, "U").reshape(-1, 2)
         write_arrays(path, {**arrays, "camera": np.array(numbers), "fisheye": np.bool_(self.lens.fisheye)})
 
     @classmethod
@@ -85,5 +86,5 @@ class Reconstruction:
         arrays = read_arrays(path, _EXPECTED)
         width, height, fx, fy, cx, cy, *distortion = arrays.pop("camera").tolist()
         lens = Lens(Intrinsics(int(width), int(height), fx, fy, cx, cy), tuple(distortion), bool(arrays.pop("fisheye")))
-        metric, warnings = bool(arrays.pop("metric")), tuple(arrays.pop("warnings").tolist())
+        metric, warnings = bool(arrays.pop("metric")), tuple(Notice(*row) for row in arrays.pop("warnings").tolist())
         return cls(lens=lens, metric=metric, warnings=warnings, **arrays)

@@ -25,6 +25,7 @@ from ...core.errors import FrameError
 from ...core.progress import Progress
 from ...core.threads import count_threads
 from ...core.types import Intrinsics
+from ...core.warnings import Notice
 from . import diagnosis, frame_selection, mapping, pair_selection
 from .colmap_reconstruction import convert_model
 from .database import SfmDatabase, image_name
@@ -84,10 +85,11 @@ def reconstruct_poses(
     result = convert_model(model, len(capture), frame_of.get, what).normalised()
     apart, pieces = _apart(models, result.has_pose)
     if pieces:
-        warnings.append(
+        text = (
             f"{what} fell into {pieces + 1} models that nothing ties together: the largest, of {largest} images, is "
             "mapped. Film the way between them, or reconstruct them one by one (capture.start, capture.stop)."
         )
+        warnings.append(Notice("models-apart", text))
     result = replace(
         result,
         apart=apart,
@@ -127,7 +129,7 @@ def _extract(
     detect: Detector,
     recipe: Recipe,
     progress: Progress,
-) -> list[str]:
+) -> list[Notice]:
     """Features of the chosen frames into the database; a frame that cannot be decoded, or of another size than the
     first, is left out. Returns warnings."""
     progress.stage("features", len(chosen))
@@ -156,7 +158,10 @@ def _extract(
                         others += 1
                 done += 1
                 progress.advance(done)
-    return [f"{others} images of {capture.path} have another size than the first and are left out."] if others else []
+    if not others:
+        return []
+    text = f"{others} images of {capture.path} have another size than the first and are left out."
+    return [Notice("images-left-out", text)]
 
 
 def _model(capture: Capture, recipe: Recipe) -> str:

@@ -1,0 +1,186 @@
+"""The stages of a run, in the order of the paper's layers. Each leaves what it made in the work folder, and takes it
+from there when a run is resumed whose configuration is still the same."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import read_ahead, select_frames
+from ..core.errors import CaptureError, FrameError, TrackingError
+from ..core.progress import Progress
+from ..core.types import Gaussians, Occupancy, Trajectory
+from ..core.warnings import Notice
+from ..language import scene_vocabulary
+from ..language.encoders.base import Encoder
+from ..storage.work_folder import WorkFolder
+from .backends import options_of
+from .checks import warn_of_camera, warn_of_scale, warn_of_trajectory
+from .mapper import Mapper
+from .saving import evenly, save
+
+_CHECKPOINT_FRAMES = 50
+
+
+@dataclass
+class Run:
+    """One reconstruction: what its stages work with, and what each of them makes."""
+
+    mapper: Mapper
+    encoder: Encoder
+    work: WorkFolder
+    progress: Progress
+    trajectory: Trajectory = field(init=False)
+    vocabulary: dict[str, Any] | None = None
+    gaussians: Gaussians = field(init=False)
+    features: NDArray[np.float16] = field(init=False)
+    occupancy: Occupancy = field(init=False)
+
+    def warn(self, *notices: Notice) -> None:
+        """Tell the user now, and in the map's report."""
+        self.work.warn(self.progress, *notices)
+
+
+def track(run: Run) -> None:
+    """Layer 1: poses of all frames that are used, with checkpoints."""
+    mapper, work, progress = run.mapper, run.work, run.progress
+    capture = mapper.capture
+    if not (capture.intrinsics_known or mapper.tracker.estimates_camera):
+        run.warn(warn_of_camera(capture))
+    with work.timed("tracking"):
+        frames = select_frames(capture)
+        if mapper.offline:
+            mapper.prepare(work.begin_offline(), frames, progress)
+            run.warn(*mapper.tracker.warnings)
+        state = work.restore_tracking()
+        first = 0 if state is None else mapper.restore(state)
+        progress.stage("tracking", len(frames))
+        _track_frames(run, frames, first)
+    if len(mapper.keyframes) == 0:
+        raise TrackingError(
+            f"No frame of {capture.path} could be used as a start: their depth is empty. Is it in other units "
+            "(capture.depth_scale), or all beyond capture.max_depth?"
+        )
+
+
+def _track_frames(run: Run, frames: range, first: int) -> None:
+    """Those from the ``first`` one on, which are read ahead; a frame that cannot be read is left out."""
+    mapper, work, progress = run.mapper, run.work, run.progress
+    stream = read_ahead(mapper.capture, frames[first:])
+    done = first
+    try:
+        for done, (index, frame) in enumerate(stream, start=first + 1):
+            if isinstance(frame, FrameError):
+                _leave_out(run, index, frame, len(frames))
+            else:
+                mapper.add(frame)
+            progress.advance(done)
+            if done % _CHECKPOINT_FRAMES == 0:
+                work.save_tracking(mapper.state(done))
+    finally:
+        stream.close()
+    if done > first:
+        work.save_tracking(mapper.state(done))
+
+
+def _leave_out(run: Run, index: int, error: FrameError, count: int) -> None:
+    """Raises CaptureError where too many of ``count`` frames are broken."""
+    broken = run.work.broken
+    broken[index] = str(error)
+    run.progress.warn(str(error))
+    if len(broken) > run.mapper.capture.options.max_broken * count:
+        raise CaptureError(
+            f"{len(broken)} of {count} frames are unreadable, the last: {error} Repair the capture, or raise "
+            "capture.max_broken."
+        )
+
+
+def refine_poses(run: Run) -> None:
+    """Layer 1: all poses made consistent with each other."""
+    mapper, work = run.mapper, run.work
+    with work.timed("refinement"):
+        run.progress.stage("refinement")
+        if not mapper.refined:
+            mapper.refine()
+            work.save_tracking(mapper.state(len(select_frames(mapper.capture))))
+    trajectory = mapper.trajectory()
+    status = trajectory.status.copy()
+    status[list(work.broken)] = "broken"
+    run.trajectory = dataclasses.replace(trajectory, status=status)
+
+
+def name_scene(run: Run) -> None:
+    """Names of what some keyframes show, if a vision model is to be asked; the answers are kept one by one."""
+    mapper, progress = run.mapper, run.progress
+    options: scene_vocabulary.Options = options_of(scene_vocabulary, mapper.settings["vocabulary"])
+    namer = scene_vocabulary.load_namer(options)
+    if namer is None:
+        return
+    frames = mapper.trajectory().keyframes
+    chosen = mapper.keyframes.only(frames[evenly(len(frames), options.keyframes)])
+    progress.stage("vocabulary", len(chosen))
+    with run.work.timed("vocabulary"):
+        run.vocabulary, warnings = namer.names(chosen, run.work.answers, progress.advance)
+    run.warn(*warnings)
+
+
+def build_gaussians(run: Run) -> None:
+    """Layer 2: Gaussians anchored at the surface, and fitted to the images."""
+
+    def build() -> Gaussians:
+        with run.work.timed("gaussians"):
+            anchored = run.mapper.anchor_gaussians(run.progress)
+        with run.work.timed("fitting"):
+            return run.mapper.fit_gaussians(anchored, run.progress)
+
+    run.gaussians = run.work.gaussians(build)
+    if len(run.gaussians) == 0:
+        raise TrackingError(
+            f"The {len(run.mapper.keyframes)} keyframes of {run.mapper.capture.path} hold too little depth for a map: "
+            "is its depth in metres after scaling (capture.depth_scale), and nearer than capture.max_depth?"
+        )
+
+
+def lift_features(run: Run) -> None:
+    """Layer 3: features of the Gaussians."""
+    with run.work.timed("language"):
+        run.features = run.work.features(lambda: run.mapper.build_features(run.gaussians, run.encoder, run.progress))
+
+
+def build_occupancy(run: Run) -> None:
+    """Layer 4: voxels, the smaller ones where they show more. Nothing is kept but the map, which follows at once."""
+    with run.work.timed("occupancy"):
+        occupancy = run.mapper.build_occupancy(run.gaussians, run.features, run.progress)
+        occupancy = run.mapper.refine_occupancy(occupancy, run.gaussians, run.features, run.encoder, run.progress)
+    if not len(occupancy.colors):
+        raise TrackingError(
+            f"No voxel of {run.mapper.capture.path} is occupied: is its depth in the right unit (capture.depth_scale), "
+            "and is occupancy.voxel_size smaller than the scene?"
+        )
+    run.occupancy = occupancy
+
+
+def save_map(run: Run) -> None:
+    """The map, and what its user should know of it."""
+    run.warn(*warn_of_trajectory(run.trajectory))
+    if not run.mapper.tracker.metric:
+        run.warn(warn_of_scale())
+    run.progress.stage("saving")
+    save(run.work, run.mapper, run.trajectory, run.gaussians, run.features, run.occupancy, run.encoder, run.vocabulary)
+
+
+STAGES: dict[str, Callable[[Run], None]] = {
+    "tracking": track,
+    "refinement": refine_poses,
+    "vocabulary": name_scene,
+    "gaussians": build_gaussians,
+    "language": lift_features,
+    "occupancy": build_occupancy,
+    "saving": save_map,
+}
+"""What a run does, in this order."""
