@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,12 +14,15 @@ from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import FreeOccError, MapError
 from freeocc3d.core.transforms import is_rigid, transform
 from freeocc3d.core.tum_files import write_tum
+from freeocc3d.core.warnings import Notice, read_notices
 from freeocc3d.editing import scaling
 from freeocc3d.pipeline import run as pipeline
 from freeocc3d.storage import store
 from freeocc3d.storage.store import Map, load_map
 from freeocc3d.tracking.trackers import file, known
 from freeocc3d.viewer import map_pictures
+
+ANOTHER = Notice("frames-lost", "another")
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +41,18 @@ def half(room: Map) -> Map:
     made = scaling.scale_map(room, 0.5, "given", room.path.parent / "half")
     manifest = yaml.safe_load((made.path / store.MANIFEST).read_text())
     manifest["scale"] = {"metric": False, "by": "none", "factor": 1.0}
-    report = {**made.report, "warnings": ["another", "The scale is unknown, said as it was without codes."]}
+    report = {**made.report, "warnings": [Notice("scale-unknown", "").to_dict(), ANOTHER.to_dict()]}
     (made.path / store.REPORT).write_text(json.dumps(report))
     manifest["files"][store.REPORT] = (made.path / store.REPORT).stat().st_size
     (made.path / store.MANIFEST).write_text(yaml.safe_dump(manifest))
     return load_map(made.path)
+
+
+def test_maps_whose_warnings_have_no_codes_said_last_that_their_scale_is_unknown() -> None:
+    older = SimpleNamespace(metric=False, report={"warnings": ["frames were lost", "the scale is unknown"]})
+    assert read_notices(scaling._report(older, 2.0)["warnings"]) == [Notice("uncoded", "frames were lost")]
+    older.metric = True
+    assert len(scaling._report(older, 2.0)["warnings"]) == 2
 
 
 def test_everything_that_is_a_length_is_scaled(room: Map, half: Map) -> None:
@@ -84,9 +95,7 @@ def test_scaling_back_gives_the_map_that_it_was(room: Map, half: Map, tmp_path: 
     assert back.manifest["scale"] == {"metric": True, "by": "length", "factor": 2.0}
     assert back.manifest["voxel_size_m"] == pytest.approx(room.manifest["voxel_size_m"])
     np.testing.assert_allclose(back.gaussians.means, room.gaussians.means, rtol=1e-5)
-    assert back.report["warnings"] == [{"code": "uncoded", "text": "another"}], (
-        "that the scale is unknown is said no more"
-    )
+    assert read_notices(back.report["warnings"]) == [ANOTHER], "that the scale is unknown is said no more"
     assert not list(tmp_path.glob("*.partial"))
 
 
