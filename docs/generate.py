@@ -96,7 +96,7 @@ def _command(words: tuple[str, ...], command: Any) -> list[str]:
 
 def options() -> str:
     """Every option of ``--set`` and of configuration files, by section."""
-    from freeocc3d.settings import config
+    from freeocc3d.settings.default_yaml import default_yaml
 
     lines = [
         "# Options",
@@ -106,7 +106,7 @@ def options() -> str:
         "Exporters have options of their own: see [Backends](backends.md#exporters).",
         "",
         "```yaml",
-        config.documented().rstrip(),
+        default_yaml().rstrip(),
         "```",
     ]
     return "\n".join(lines) + "\n"
@@ -130,10 +130,9 @@ def backends() -> str:
             lines += [f"### `{backend.name}`", "", f"{_cell(backend.summary)}{needs}", ""]
             if backend.options:
                 lines += ["| option | type | default | |", "|---|---|---|---|"]
-            lines += [
-                f"| `{o.name}` | `{_cell(o.type)}` | `{_cell(repr(o.default))}` | {_cell(o.doc)} |"
-                for o in backend.options
-            ]
+            for o in backend.options:
+                doc = f"(advanced) {o.doc}" if o.advanced else o.doc
+                lines.append(f"| `{o.name}` | {_cell(o.type)} | `{_cell(repr(o.default))}` | {_cell(doc)} |")
             lines.append("")
     return "\n".join(lines) + "\n"
 

@@ -8,7 +8,6 @@ constructed (cheaply: nothing is decoded), and decodes frame i when asked. Every
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -17,42 +16,11 @@ from numpy.typing import NDArray
 
 from ..core.types import Frame
 from ..core.warnings import Notice
+from ..settings.stages import CaptureOptions as Options
 
 NOMINAL_DEPTH = 2.0
 """The median depth that scans of unknown scale are given, as rooms have it in metres: voxels and tolerances, which are
 in metres, are then of a sensible size beside the scene."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """How any capture is read."""
-
-    format: str = "auto"
-    """Name of the reader, or "auto" to recognise the layout of the folder."""
-    start: int = 0
-    """First frame that is used."""
-    stop: int | None = None
-    """Frame before which to stop; null = the last."""
-    stride: int = 1
-    """Use every n-th frame."""
-    depth: bool = True
-    """Read the capture's depth; false = colour alone, as of a plain video, though depth may be there."""
-    depth_scale: float | None = None
-    """Depth units per metre (1000 for millimetres); null = what the format or its files say."""
-    max_depth: float = 6.0
-    """Depth beyond this many metres counts as not measured."""
-    max_size: int | None = 960
-    """Longer side in pixels that images of videos, photographs and reconstructions are reduced to if they are larger;
-    null = as they are."""
-    scale: float | None = None
-    """Metres per unit of poses that come without a scale, those of a scan without depth; null = unknown."""
-    intrinsics: tuple[float, float, float, float] | None = None
-    """fx, fy, cx, cy of the colour image in pixels, in place of what the files say."""
-    color_focal: float | None = None
-    """Focal length of the colour camera over what the files say, where depth fits them and colour does not (7-Scenes'
-    Kinect: 0.90); null = asked of the scan itself, 1 = as the files say."""
-    max_broken: float = 0.1
-    """Share of the frames that may be unreadable before the run stops."""
 
 
 class Capture(ABC):

@@ -42,7 +42,6 @@ def open_capture(
     option out of range), DependencyError.
     """
     options = options or Options()
-    _check(options)
     if str(path).startswith(BUILTIN):
         return _construct("synthetic", Path(path), options, backend_options or {})
     folder = Path(path).expanduser()
@@ -115,34 +114,10 @@ def _sample_depth(capture: Capture, samples: int) -> tuple[float | None, float, 
     return float(np.median(measured)), within, units_per_metre
 
 
-def _check(options: Options) -> None:
-    """Raises ConfigError for a value that no reader can work with."""
-    if not options.max_depth > 0:
-        raise ConfigError(f"capture.max_depth must be positive, got {options.max_depth:g}.")
-    if options.depth_scale is not None and not (options.depth_scale > 0 and math.isfinite(options.depth_scale)):
-        raise ConfigError(f"capture.depth_scale must be a positive number, got {options.depth_scale:g}.")
-    if options.color_focal is not None and not 0.5 <= options.color_focal <= 2:
-        raise ConfigError(f"capture.color_focal must lie in 0.5…2, got {options.color_focal:g}.")
-    if not 0 <= options.max_broken <= 1:
-        raise ConfigError(f"capture.max_broken must lie in 0…1, got {options.max_broken:g}.")
-    if options.scale is not None and not options.scale > 0:
-        raise ConfigError(f"capture.scale must be positive, got {options.scale:g}.")
-    if options.max_size is not None and options.max_size < 16:
-        raise ConfigError(f"capture.max_size must be at least 16 pixels, got {options.max_size}.")
-    if options.stride < 1 or options.start < 0:
-        raise ConfigError(
-            f"capture.stride must be at least 1 and capture.start at least 0, got {options.stride} and {options.start}."
-        )
-
-
 def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mapping[str, Any]]) -> Capture:
     module = registry.load("capture.readers", name)
-    extra = (
-        [registry.build_options(module, own.get(name) or {})]
-        if registry.backends("capture.readers")[name].options
-        else []
-    )
-    opened: Capture = module.Reader(path, options, *extra)
+    extra = registry.build_options(module, own.get(name) or {}, f"capture.{name}.")
+    opened: Capture = module.Reader(path, options, *([] if extra is None else [extra]))
     if options.scale is not None and opened.has_depth:
         raise ConfigError(
             f"capture.scale is for scans without depth, but {path} has depth, which says how large everything is: "

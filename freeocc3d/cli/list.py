@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .console import Json, flag
+
+if TYPE_CHECKING:
+    from ..settings.registry import Backend
 
 
 def list_backends(
@@ -17,39 +21,42 @@ def list_backends(
     ] = None,
     as_json: Json = False,
     as_yaml: Annotated[bool, flag("--yaml", "Print a configuration file that explains every key.")] = False,
+    advanced: Annotated[
+        bool, flag("--advanced", "Show also the options that only comparisons with other methods need.")
+    ] = False,
 ) -> None:
     """List readers, trackers, encoders and exporters with their options."""
-    from ..settings import config, registry
+    from ..settings import registry
+    from ..settings.default_yaml import default_yaml
 
     if as_yaml:
-        print(config.documented(), end="")
+        print(default_yaml(), end="")
         return
-
     folders = registry.FOLDERS if kind is None else [registry.folder_of(kind)]
-    found = {registry.FOLDERS[folder]: registry.backends(folder) for folder in folders}
+    found = {registry.FOLDERS[folder]: registry.backends(folder).values() for folder in folders}
     if as_json:
-        print(
-            json.dumps(
-                {
-                    title: {
-                        b.name: {
-                            "summary": b.summary,
-                            "missing": b.missing,
-                            "options": {
-                                o.name: {"type": o.type, "default": o.default, "doc": o.doc} for o in b.options
-                            },
-                        }
-                        for b in backends.values()
-                    }
-                    for title, backends in found.items()
-                }
-            )
-        )
+        print(json.dumps({title: {b.name: _facts(b) for b in backends} for title, backends in found.items()}))
         return
     for title, backends in found.items():
         print(f"{title}s")
-        for backend in backends.values():
-            missing = f"  [needs {', '.join(backend.missing)}]" if backend.missing else ""
-            print(f"  {backend.name:<14} {backend.summary}{missing}")
-            for option in backend.options:
+        _print(backends, advanced)
+
+
+def _facts(backend: Backend) -> dict[str, object]:
+    """What JSON says of a backend; all options are in it."""
+    options = {
+        o.name: {"type": o.type, "default": o.default, "doc": o.doc, "advanced": o.advanced} for o in backend.options
+    }
+    return {"summary": backend.summary, "missing": backend.missing, "options": options}
+
+
+def _print(backends: Iterable[Backend], advanced: bool) -> None:
+    for backend in backends:
+        missing = f"  [needs {', '.join(backend.missing)}]" if backend.missing else ""
+        print(f"  {backend.name:<14} {backend.summary}{missing}")
+        for option in backend.options:
+            if advanced or not option.advanced:
                 print(f"      {option.name} = {option.default!r}  ({option.type}) {option.doc}")
+        hidden = sum(option.advanced for option in backend.options)
+        if hidden and not advanced:
+            print(f"      ({hidden} more with --advanced)")

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..core.errors import ConfigError
-from ..settings.config import Config
 from .console import ConsoleProgress, NewMap, Overwrite, Set, flag
 from .map_summary import summary_text
 
-_DEVICES = ("tracking", "backend"), ("fitting", "rasterizer")
-"""Section and key of the choices whose backends may have an option ``device``."""
+if TYPE_CHECKING:
+    from ..settings.config import Settings
+
+_MOVABLE = ("tracking", "fitting")
+"""Sections whose backends may have an option ``device``."""
 
 
 def reconstruct(
@@ -42,20 +44,20 @@ def reconstruct(
     of_scale = [] if scale is None else [f"capture.scale={scale}"]
     settings = config.load(config_file, [*(overrides or []), *of_scale])
     if device is not None:
-        _move(settings, device)
+        settings = _move(settings, device)
     with ConsoleProgress() as progress:
         made = run.reconstruct(capture, output, settings, overwrite=overwrite, resume=resume, progress=progress)
     print(summary_text(made))
 
 
-def _move(settings: Config, device: str) -> None:
-    """Let what can run on a device run on it. Raises ConfigError where nothing can."""
-    chosen = [(section, settings[section][key]) for section, key in _DEVICES]
-    movable = [settings[section][name] for section, name in chosen if "device" in settings[section].get(name, {})]
-    for options in movable:
-        options["device"] = device
+def _move(settings: Settings, device: str) -> Settings:
+    """The same with a device for what can run on one. Raises ConfigError where nothing can."""
+    movable = [section for section in _MOVABLE if settings.has_backend_option(section, "device")]
     if device != "cpu" and not movable:
         raise ConfigError(
             f"Nothing that is chosen runs on {device}: it needs fitting.rasterizer=gsplat, or "
             "tracking.backend=odometry."
         )
+    for section in movable:
+        settings = settings.with_backend(section, device=device)
+    return settings

@@ -7,7 +7,6 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -19,11 +18,11 @@ from numpy.typing import NDArray
 from ..capture import read_ahead
 from ..capture.base import Capture
 from ..core.arrays import read_arrays, write_arrays
-from ..core.errors import ConfigError, FrameError, MapError, TrackingError
+from ..core.errors import FrameError, MapError, TrackingError
 from ..core.progress import Progress
 from ..core.threads import count_threads
 from ..core.types import Frame, Intrinsics
-from ..settings.registry import require_positive
+from ..settings.stages import StereoOptions as Options
 from ..tracking.base import PosedPoints
 from . import depth_network
 from .building_planes import Layout
@@ -50,29 +49,6 @@ _EACH_WAY = 8  # pixels: depths that are looked at for how deep the scan is
 _LEAST_POINTS = 100
 _Result = TypeVar("_Result")
 _SAME_SURFACE = 0.02  # relative: beyond it, depths of adjacent pixels belong to different things
-
-
-@dataclass(frozen=True)
-class Options:
-    """Depth for captures that have none, by multi-view stereo."""
-
-    size: int = 640
-    """Longer side of the depth images in pixels; frames get them enlarged to their own size."""
-    neighbours: int = 4
-    """Views that each frame is compared with."""
-    agreeing: int = 2
-    """Views whose depth must confirm a pixel's, of twice as many as each frame is compared with, for it to become part
-    of the surface."""
-    network: str | None = None
-    """ONNX network that guesses (inverse) depth from one image, fitted to each frame's stereo depth; it fills what
-    stereo leaves empty."""
-    device: str = "cpu"
-    """Where stereo is computed: "cpu", or a CUDA device of torch's."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "neighbours", "agreeing")
-        if self.size < 64:
-            raise ConfigError(f"'size' must be at least 64 pixels, got {self.size}.")
 
 
 class StereoDepth:
@@ -104,7 +80,7 @@ class StereoDepth:
         posed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
         broken = self._decode(capture, posed, T, progress, prepared)
         T[broken] = np.nan
-        seen, count = (T, scan.points, scan.seen_frame, scan.seen_point), self.options.neighbours
+        seen, count = (T, scan.points, scan.seen_frame, scan.seen_point), self.options.neighbors
         chosen = select_partners(*seen, 2 * count)
         apart = select_partners(*seen, count + count // 2, APART).partners
         able = [frame for frame, partners in enumerate(chosen.partners) if len(partners)]
@@ -195,7 +171,7 @@ class StereoDepth:
         return broken
 
     def _measure(self, frame: int, chosen: SelectedViews, apart: list[NDArray[np.int64]]) -> DepthImage:
-        others = [self._view(other) for other in chosen.partners[frame][: self.options.neighbours]]
+        others = [self._view(other) for other in chosen.partners[frame][: self.options.neighbors]]
         wide = [self._view(other) for other in apart[frame]] or others
         return measure_depth(
             self._view(frame), others, wide, chosen.near[frame], chosen.far[frame], self.options.device

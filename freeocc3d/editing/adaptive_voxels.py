@@ -29,8 +29,7 @@ from ..core.voxel_keys import pack_voxels, unpack_voxels
 from ..gaussians.surface_cells import cell_keys
 from ..language.feature_codec import Codec
 from ..occupancy import build, carve, levels, splat
-from ..settings import registry
-from ..settings.config import Config
+from ..settings.config import Settings
 from ..storage import store
 from ..storage.store import Map, load_map
 from ..storage.work_folder import WorkFolder
@@ -67,7 +66,7 @@ def build_adaptive(
     posed: Callable[[], Iterator[PosedFrame]],
     T_world_keyframe: NDArray[np.float64],
     encode: Callable[[Gaussians], NDArray[np.float16]],
-    settings: Config,
+    settings: Settings,
     finest: float,
     progress: Progress,
 ) -> Occupancy:
@@ -102,7 +101,7 @@ def build_adaptive(
         return base
     all_features = encode(Gaussians.concatenated(found))
     ends = np.cumsum([0, *(len(made) for made in found)])
-    carving: carve.Options = registry.build_options(carve, settings["carving"])
+    carving = settings.carving
     sizes = [base.voxel_size / 2**level for level in range(1, len(found) + 1)]
     seen = [carve.DepthEvidence(base.origin, size, carving, own) for size, own in zip(sizes, leaves, strict=True)]
     progress.stage("occupancy", len(T_world_keyframe))
@@ -112,7 +111,7 @@ def build_adaptive(
         progress.advance(done)
     levelled = [levels.select_blocks(base, whole)]
     for n, (size, own, evidence) in enumerate(zip(sizes, leaves, seen, strict=True)):
-        splatting: splat.Options = registry.build_options(splat, {**settings["occupancy"], "voxel_size": size})
+        splatting = settings.occupancy.changed(voxel_size=size)
         bins = splat.bin_gaussians(found[n], base.origin, splatting).only(own)
         mine = all_features[ends[n] : ends[n + 1]]
         part = build.build_blocks(own, bins, found[n], mine, evidence, splatting, carving)
@@ -133,8 +132,7 @@ def refine_where_needed(
     if not count_halvings(base.voxel_size, finest):
         raise MapError(f"{scan_map.path} has voxels of {finest:g} m already: give a smaller size.")
     work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
-    settings, trajectory = read_settings(scan_map), scan_map.trajectory
-    settings["occupancy"]["finest"] = finest
+    settings, trajectory = read_settings(scan_map).changed("occupancy", finest=finest), scan_map.trajectory
 
     def posed() -> Iterator[PosedFrame]:
         for row, (frame, T) in enumerate(zip(scan_map.keyframes, trajectory.T_world_keyframe, strict=True)):

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture, open_capture
-from ..capture import base as capture_base
 from ..capture.focal_correction import Reregistered
 from ..core.errors import FreeOccError, MapError
 from ..core.progress import Progress
@@ -29,10 +28,10 @@ from ..gaussians import anchors
 from ..gaussians.point_cloud import write_gaussian_ply
 from ..language import lifting
 from ..language.feature_codec import Codec
-from ..occupancy import build, carve, splat
+from ..occupancy import build
 from ..query.regions import Region
 from ..settings import config, registry
-from ..settings.config import Config
+from ..settings.config import Settings
 from ..storage import store
 from ..storage.keyframes import Keyframes
 from ..storage.store import Map, load_map
@@ -97,8 +96,7 @@ def refine_box(
             f"one of up to {edge:.1f} m an edge, or larger voxels."
         )
     work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
-    settings = read_settings(scan_map)
-    settings["occupancy"]["voxel_size"] = voxel_size
+    settings = read_settings(scan_map).changed("occupancy", voxel_size=voxel_size)
     seeing, rows, trajectory = _seeing(scan_map, box, AROUND * voxel_size, progress)
     trajectory = trajectory.only_keyframes(trajectory.keyframes[rows])
     poses = trajectory.T_world_keyframe
@@ -116,8 +114,8 @@ def refine_box(
         gaussians,
         features,
         posed(),
-        registry.build_options(splat, settings["occupancy"]),
-        registry.build_options(carve, settings["carving"]),
+        settings.occupancy,
+        settings.carving,
         origin=box.low,
         blocks=(blocks[0], blocks[1], blocks[2]),
         progress=progress.advance,
@@ -138,11 +136,9 @@ def refine_box(
     return load_map(output)
 
 
-def read_settings(scan_map: Map) -> Config:
+def read_settings(scan_map: Map) -> Settings:
     """The map's own; on the processor wherever the map was made."""
-    settings = config.load(scan_map.path / store.CONFIG)
-    settings["occupancy"]["device"] = "cpu"
-    return settings
+    return config.load_saved(scan_map.path / store.CONFIG).changed("occupancy", device="cpu")
 
 
 class _Decoded(Sequence[Frame]):
@@ -199,7 +195,7 @@ def lift_gaussians(
     posed: Callable[[], Iterator[PosedFrame]],
     space: Space,
     voxel_size: float,
-    settings: Config,
+    settings: Settings,
     T_world_keyframe: NDArray[np.float64],
     progress: Progress,
 ) -> Gaussians:
@@ -207,8 +203,7 @@ def lift_gaussians(
 
     posed: gives the keyframes, each time that it is called.
     """
-    own = {**settings["gaussians"], "cell_size": None, "pixel_stride": None}  # both follow the voxels
-    options: anchors.Options = registry.build_options(anchors, own)
+    options = settings.gaussians.changed(cell_size=None, pixel_stride=None)  # both follow the voxels
     margin = AROUND * voxel_size
     progress.stage("gaussians", len(T_world_keyframe))
     cells = anchors.AnchoredCells(options, 0.5 * voxel_size, T_world_keyframe)
@@ -228,7 +223,7 @@ def lift_features_again(
     frames: Sequence[Frame],
     T_world_cam: NDArray[np.float64],
     gaussians: Gaussians,
-    settings: Config,
+    settings: Settings,
     progress: Progress,
 ) -> NDArray[np.float16]:
     """Layer 3 of these Gaussians; where the encoder cannot be had again, the features of the map's own nearest."""
@@ -236,21 +231,20 @@ def lift_features_again(
     module = registry.load("language.encoders", name)
     try:
         capture = _capture(scan_map, settings) if getattr(module, "NEEDS_CAPTURE", True) else None
-        encoder = module.load(registry.build_options(module, settings["language"].get(name, {})), capture)
+        encoder = settings.load_backend("language", capture)
     except FreeOccError as error:
         progress.warn(f"The encoder '{name}' cannot be used again, so features stay as coarse as the map's: {error}")
         from scipy.spatial import cKDTree
 
         nearest = cKDTree(scan_map.gaussians.means).query(gaussians.means)[1]
         return scan_map.gaussian_features[nearest]
-    options: lifting.Options = registry.build_options(lifting, config.options(settings, "language"))
-    return lifting.lift_features(gaussians, frames, T_world_cam, encoder, options, progress)
+    return lifting.lift_features(gaussians, frames, T_world_cam, encoder, settings.language, progress)
 
 
-def _capture(scan_map: Map, settings: Config) -> Capture:
+def _capture(scan_map: Map, settings: Settings) -> Capture:
     """The capture that the map was made of, as it was read then. Raises FreeOccError."""
-    options = registry.build_options(capture_base, config.options(settings, "capture"))
-    capture = open_capture(scan_map.manifest["capture"]["path"], options, settings["capture"])
+    path = scan_map.manifest["capture"]["path"]
+    capture = open_capture(path, settings.capture, settings.backends.get("capture"))
     color_focal = float(scan_map.report.get("color_focal", 1.0))
     return capture if color_focal == 1 else Reregistered(capture, color_focal)
 

@@ -29,7 +29,7 @@ from ..gaussians import rendered_views
 from ..gaussians.point_cloud import write_gaussian_ply
 from ..occupancy.gravity_frame import is_floor_seen
 from ..settings import config, registry
-from ..settings.config import Config
+from ..settings.config import Settings
 from ..storage import store
 from ..storage.store import Map, load_map
 from ..storage.work_folder import WorkFolder
@@ -184,12 +184,13 @@ def _gaussians(gaussians: Gaussians, factor: float) -> Gaussians:
     return dataclasses.replace(gaussians, **lengths)
 
 
-def _settings(scan_map: Map, factor: float) -> Config:
+def _settings(scan_map: Map, factor: float) -> Settings:
     """The map's own, with the sizes that were chosen beside the scene."""
-    settings = config.load(scan_map.path / store.CONFIG)
+    settings = config.load_saved(scan_map.path / store.CONFIG)
     for section, key in (("occupancy", "voxel_size"), ("occupancy", "finest"), ("gaussians", "cell_size")):
-        if settings[section][key] is not None:
-            settings[section][key] *= factor
+        value = getattr(getattr(settings, section), key)
+        if value is not None:
+            settings = settings.changed(section, **{key: value * factor})
     return settings
 
 
@@ -231,7 +232,7 @@ def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussi
         folder / store.PATH_PICTURE, [submap], trajectory, gaussians, np.array(scan_map.manifest["up"]), capture
     )
     rasterizer = registry.load("gaussians.rasterizers", "cpu").load()
-    width = int(config.load(scan_map.path / store.CONFIG)["fitting"]["width"])
+    width = config.load_saved(scan_map.path / store.CONFIG).fitting.width
     keyframes = scan_map.keyframes
     shown = []
     for row in np.unique(np.linspace(0, len(keyframes) - 1, render_pictures.SHOWN).astype(int)).tolist():

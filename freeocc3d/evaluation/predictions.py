@@ -20,10 +20,9 @@ from ..core.voxel_keys import unpack_voxels
 from ..gaussians import anchors
 from ..gaussians.splat_ply import read_standard_ply
 from ..language.encoders.base import TextEncoder, TextFeatures
-from ..occupancy import build, carve, splat
+from ..occupancy import build, splat
 from ..query import word_query
-from ..settings import registry
-from ..settings.config import Config
+from ..settings.config import Settings
 from ..storage.store import Map
 from ..tracking.trajectory_alignment import Poses, TrajectoryAlignment
 from .confusion import Prediction
@@ -35,7 +34,7 @@ _SAME_SIZE, _SAME_LATTICE = 1e-4, 1e-3
 
 
 def predict_from_map(
-    scan_map: Map, settings: Config, alignment: TrajectoryAlignment, truth: GroundTruth, classes: ClassMap
+    scan_map: Map, settings: Settings, alignment: TrajectoryAlignment, truth: GroundTruth, classes: ClassMap
 ) -> tuple[Prediction, str]:
     """A map's claim, and one sentence about its classes if there is something to say.
 
@@ -52,7 +51,7 @@ def predict_from_map(
         features,
         _scaled(scan_map, alignment),
         splatting,
-        registry.build_options(carve, settings["carving"]),
+        settings.carving,
         origin=truth.origin,
         least_scale=_least_scale(settings, alignment, truth),
     )
@@ -71,7 +70,7 @@ def predict_from_map(
 def predict_from_gaussians(
     gaussians: Gaussians,
     semantics: NDArray[np.floating] | None,
-    settings: Config,
+    settings: Settings,
     alignment: TrajectoryAlignment,
     truth: GroundTruth,
 ) -> Prediction:
@@ -99,7 +98,7 @@ def predict_from_gaussians(
 
 
 def predict_from_frames(
-    folder: Path, poses: Poses, settings: Config, truth: GroundTruth, classes: ClassMap
+    folder: Path, poses: Poses, settings: Settings, truth: GroundTruth, classes: ClassMap
 ) -> tuple[Prediction, int]:
     """The claim of per-frame Gaussians fused by true poses, and the number of frames fused: the paper's protocol for
     methods that predict each frame by itself (GaussTR, GaussianOcc).
@@ -190,18 +189,15 @@ def _scaled(scan_map: Map, alignment: TrajectoryAlignment) -> Iterator[PosedFram
         yield PosedFrame(frame.scaled(alignment.scale), T, row)
 
 
-def _splatting(settings: Config, truth: GroundTruth) -> splat.Options:
+def _splatting(settings: Settings, truth: GroundTruth) -> splat.Options:
     """Layer 4's options at the truth's voxel size, on the processor wherever the map was made."""
-    here = {**settings["occupancy"], "device": "cpu", "voxel_size": truth.voxel_size}
-    options: splat.Options = registry.build_options(splat, here)
-    return options
+    return settings.occupancy.changed(device="cpu", voxel_size=truth.voxel_size)
 
 
-def _least_scale(settings: Config, alignment: TrajectoryAlignment, truth: GroundTruth) -> float:
+def _least_scale(settings: Settings, alignment: TrajectoryAlignment, truth: GroundTruth) -> float:
     """What the map's Gaussians are widened to on the truth's lattice, metres."""
-    cell_size = settings["gaussians"]["cell_size"] or 0.5 * settings["occupancy"]["voxel_size"]
-    options: anchors.Options = registry.build_options(anchors, settings["gaussians"])
-    return anchors.compute_least_scale(options, alignment.scale * cell_size, truth.voxel_size)
+    cell_size = settings.gaussians.cell_size or 0.5 * settings.occupancy.voxel_size
+    return anchors.compute_least_scale(settings.gaussians, alignment.scale * cell_size, truth.voxel_size)
 
 
 def _words(

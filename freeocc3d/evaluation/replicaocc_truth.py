@@ -13,16 +13,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
-import yaml
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ..capture import base as capture_base
 from ..capture import open_capture, read_ahead, select_frames
 from ..capture.base import Capture
 from ..core.errors import ConfigError, FrameError, FreeOccError
@@ -30,8 +27,11 @@ from ..core.progress import Progress
 from ..core.transforms import back_project, invert, transform
 from ..core.types import UNKNOWN, Frame
 from ..core.voxel_keys import KEY_LIMIT, pack_voxels, unpack_voxels
-from ..settings import config, registry
-from ..settings.registry import require_positive
+from ..settings import config
+from ..settings.option_types import Finite, NotNegative, NotNegativeInt, Positive, PositiveInt
+from ..settings.typed_options import TypedOptions
+from ..settings.typed_options import build as build_options
+from ..settings.yaml_files import parse_yaml
 from . import scored_classes as taxonomy
 from .true_occupancy import GroundTruth
 
@@ -42,36 +42,28 @@ UNLABELLED = "occupied"
 """Class of every surface where a capture has no class images."""
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(TypedOptions, frozen=True):
     """The protocol's parameters, with the paper's values."""
 
-    voxel_size: float = 0.08
+    voxel_size: Positive = 0.08
     """Edge of a voxel, metres."""
-    pixel_stride: int = 4
+    pixel_stride: PositiveInt = 4
     """Every n-th pixel, in both directions, is back-projected."""
-    frame_stride: int = 2
+    frame_stride: PositiveInt = 2
     """Every n-th frame decides what was observed."""
-    max_range: float = 10.0
+    max_range: Positive = 10.0
     """Depth beyond this many metres counts as not measured."""
-    lattice_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lattice_offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     """Metres by which the lattice is shifted: half a voxel in z puts a floor at z = 0 inside a voxel, not on a face."""
-    min_points: int = 1
-    """Points that a voxel needs; the noise of a sensor scatters some into the voxels beside a surface."""
-    fill: str = "inside"
+    min_points: PositiveInt = 1
+    """Points that a voxel needs; the noise of a sensor scatters some into the voxels next to a surface."""
+    fill: Literal["inside", "within"] = "inside"
     """"inside": a cell is occupied if a point lies in it; "within": also if a cell next to it, no farther than one
     voxel from centre to centre, is."""
-    tolerance: float = 1.0
+    tolerance: NotNegative = 1.0
     """Voxel edges that a voxel's centre may lie behind the measured depth and still be observed."""
-    dilation: int = 0
+    dilation: NotNegativeInt = 0
     """Voxels by which what was observed is grown, across faces."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "voxel_size", "pixel_stride", "frame_stride", "max_range", "min_points")
-        if self.fill not in ("inside", "within"):
-            raise ConfigError(f"'fill' must be inside or within, got '{self.fill}'.")
-        if self.tolerance < 0 or self.dilation < 0:
-            raise ConfigError("'tolerance' and 'dilation' must not be negative.")
 
 
 def build_truth(capture: str | Path, overrides: Sequence[str] = (), progress: Progress | None = None) -> GroundTruth:
@@ -87,11 +79,11 @@ def build_truth(capture: str | Path, overrides: Sequence[str] = (), progress: Pr
         if name.startswith("capture."):
             of_capture.append(override)
         else:
-            own[name.strip()] = yaml.safe_load(text)
-    options: Options = registry.build_options(_this_module(), own)
+            own[name.strip()] = parse_yaml(text)
+    options = build_options(Options, own)
     settings = config.load(None, [f"capture.max_depth={options.max_range}", *of_capture])
-    section = registry.build_options(capture_base, config.options(settings, "capture"))
-    return build_truth_from_capture(open_capture(capture, section, settings["capture"]), options, progress)
+    opened = open_capture(capture, settings.capture, settings.backends.get("capture"))
+    return build_truth_from_capture(opened, options, progress)
 
 
 def build_truth_from_capture(capture: Capture, options: Options, progress: Progress | None = None) -> GroundTruth:
@@ -226,12 +218,6 @@ def _observe(
                     continue
                 measured = depth_m[row, column]
                 seen[i, j, k] = measured > 0 and depth <= measured + tolerance
-
-
-def _this_module() -> Any:
-    import sys
-
-    return sys.modules[__name__]
 
 
 def _classes(capture: Capture, frames: list[int]) -> tuple[tuple[str, ...], Callable[[Frame], NDArray[np.uint8]]]:

@@ -14,15 +14,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import base as capture_base
 from ..capture import open_capture
 from ..capture.base import Capture
 from ..core.errors import FreeOccError
 from ..core.types import UNKNOWN
 from ..gaussians.splat_ply import read_standard_ply
 from ..occupancy.up_direction import estimate_up
-from ..settings import config, registry
-from ..settings.config import Config
+from ..settings import config
+from ..settings.config import Settings
 from ..storage.store import CONFIG, Map, load_map
 from ..tracking.trajectory_alignment import (
     Poses,
@@ -79,7 +78,7 @@ def score_map(
     overrides: options of layer 4, ``occupancy.threshold=0.4``, in place of those that the map was made with.
     Raises FreeOccError: no true poses, an alignment that is not determined.
     """
-    settings = config.load(scan_map.path / CONFIG, list(overrides))
+    settings = config.load_saved(scan_map.path / CONFIG, list(overrides))
     estimated = select_estimated_poses(scan_map.trajectory)
     if poses is None:
         try:
@@ -300,16 +299,15 @@ def _truths(captures: Sequence[str], paths: Sequence[Path], count: int, classes:
     return [load_ground_truth(path, names) for path in paths]
 
 
-def reopen_capture(scan_map: Map, settings: Config | None = None) -> Capture:
+def reopen_capture(scan_map: Map, settings: Settings | None = None) -> Capture:
     """The capture that a map was made of, opened as it was then. Raises FreeOccError if it is not there any more."""
-    settings = settings or config.load(scan_map.path / CONFIG)
+    settings = settings or config.load_saved(scan_map.path / CONFIG)
     path = scan_map.manifest["capture"]["path"]
     if not str(path).startswith("builtin:") and not Path(path).exists():
         raise FreeOccError(
             f"The capture {path}, of which {scan_map.path} was made, is not there: name the true poses with --poses."
         )
-    options = registry.build_options(capture_base, config.options(settings, "capture"))
-    return open_capture(path, options, settings["capture"])
+    return open_capture(path, settings.capture, settings.backends.get("capture"))
 
 
 def collect_common_classes(truths: Sequence[GroundTruth]) -> ClassMap:

@@ -26,7 +26,7 @@ def export_map(
     written, or the map has nothing to write).
     """
     exporter = registry.load("export", format_name)
-    checked = registry.build_options(exporter, options or {})
+    checked = registry.build_options(exporter, options or {}, f"{format_name}.")
     notes: list[str] = []
     write_whole(Path(path), lambda target: notes.extend(exporter.write(scan_map, target, checked) or []), overwrite)
     return notes

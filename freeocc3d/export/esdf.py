@@ -11,8 +11,8 @@ A .vdb has one grid `distance`, whose active voxels are the known ones, others r
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from ..core.errors import ConfigError, ExportError
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
 from ..storage.store import Map
 from .distance_transform import LONGEST, transform_signed
-from .export_frames import PlacedVoxels, check_box, check_frame, find_world, place_voxels
+from .export_frames import Box, PlacedVoxels, VoxelOptions, find_world, place_voxels
 from .openvdb_files import write_vdb
 
 REQUIRES: tuple[str, ...] = ()
@@ -33,24 +33,14 @@ _LOCAL = np.stack(np.unravel_index(np.arange(BLOCK**3), (BLOCK,) * 3), axis=1)
 UNKNOWN_IS = "free", "obstacle", "nan"
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(VoxelOptions, frozen=True):
     """Frame, and what unknown space is; a name that ends in .npz gives arrays, in .vdb an OpenVDB grid."""
 
-    frame: str = "gravity"
-    """"gravity" (z up, floor at 0), "first-camera" (z up, from there) or "map"; voxels keep their places in the last
-    only, in the others they are sampled anew."""
-    unknown: str = "free"
+    unknown: Literal["free", "obstacle", "nan"] = "free"
     """Unknown space: "free" is no obstacle, "obstacle" is one, "nan" is none and has no distance itself."""
-    box: tuple[float, ...] = ()
+    box: Box | None = None
     """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
-    it are written, and only obstacles in it count; none = all."""
-
-    def __post_init__(self) -> None:
-        check_frame(self.frame)
-        check_box(self.box)
-        if self.unknown not in UNKNOWN_IS:
-            raise ConfigError(f"'unknown' must be free, obstacle or nan, got '{self.unknown}'.")
+    it are written, and only obstacles in it count; null = all."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:

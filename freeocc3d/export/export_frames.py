@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,33 +13,40 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.errors import ConfigError, ExportError
 from ..core.transforms import invert
 from ..core.types import BLOCK, OCCUPIED, UNKNOWN, Occupancy
+from ..settings.option_types import Finite, converted
+from ..settings.typed_options import TypedOptions
 from ..storage.store import Map
 
-FRAMES = "map", "gravity", "first-camera"
+Frame = Literal["map", "gravity", "first-camera"]
 """The map's own; z up with the floor at z = 0 and the walls along x and y; z up with the first camera at the origin,
 looking along x."""
+UprightFrame = Literal["gravity", "first-camera"]
+"""Those in which z points up."""
+Box = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 
-def check_frame(frame: str) -> None:
-    """Raises ConfigError for an unknown frame."""
-    if frame not in FRAMES:
-        raise ConfigError(f"'frame' must be {', '.join(FRAMES[:-1])} or {FRAMES[-1]}, got '{frame}'.")
+class BoxOptions(TypedOptions, frozen=True):
+    """The part of a map that is written."""
+
+    box: Box | None = None
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
+    it are written; null = all."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.box is not None and not np.less(self.box[:3], self.box[3:]).all():
+            raise ConfigError(
+                "'box' has a lower and an upper corner, x0, y0, z0, x1, y1, z1 in metres, each of the first three less "
+                f"than its counterpart; got {', '.join(f'{value:g}' for value in self.box)}."
+            )
 
 
-def check_box(box: tuple[float, ...]) -> None:
-    """Raises ConfigError unless it is empty or a lower and an upper corner."""
-    if box and not (len(box) == 6 and np.less(box[:3], box[3:]).all()):
-        raise ConfigError(
-            "'box' has a lower and an upper corner, x0, y0, z0, x1, y1, z1 in metres, each of the first three less "
-            f"than its counterpart; got {', '.join(f'{value:g}' for value in box)}."
-        )
+class VoxelOptions(BoxOptions, frozen=True):
+    """The frame of the voxels that are written, and which of them are."""
 
-
-def check_upright(frame: str) -> None:
-    """Raises ConfigError for a frame whose z does not point up."""
-    check_frame(frame)
-    if frame == "map":
-        raise ConfigError("'frame' must be gravity or first-camera here: in the map's own frame, up is no axis.")
+    frame: Frame = "gravity"
+    """"gravity" (z up, floor at 0), "first-camera" (z up, from there) or "map"; voxels keep their places in the last
+    only, in the others they are sampled anew."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +80,8 @@ class PlacedVoxels:
 
 
 def to_frame(scan_map: Map, frame: str) -> NDArray[np.float64]:
-    """(4, 4) ``T_frame_map`` of one of FRAMES."""
-    check_frame(frame)
+    """(4, 4) ``T_frame_map`` of a frame, by its name. Raises ConfigError for another name."""
+    converted(Frame, frame, "frame")
     if frame == "map":
         return np.eye(4)
     if frame == "gravity":
@@ -93,7 +100,7 @@ def place_voxels(
     frame: str,
     origin: ArrayLike | None = None,
     one_size: bool = False,
-    box: tuple[float, ...] = (),
+    box: Box | None = None,
 ) -> PlacedVoxels:
     """The map's voxels in a frame. In the map's own they are what they are; in another they are sampled anew on a
     lattice of the map's voxel size (the largest, of a map of several), and so they are where ``one_size`` asks for it
@@ -104,7 +111,7 @@ def place_voxels(
     centres, is unknown. Raises ExportError for a map of which nothing is known, there.
     """
     there = _placed(scan_map, frame, origin, one_size)
-    return _within(there, np.array(box).reshape(2, 3)) if box else there
+    return _within(there, np.array(box).reshape(2, 3)) if box is not None else there
 
 
 def _placed(scan_map: Map, frame: str, origin: ArrayLike | None, one_size: bool) -> PlacedVoxels:

@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import ExportError
+from ..settings.typed_options import TypedOptions
 from ..storage.store import Map
-from .export_frames import check_frame, to_frame, write_description
+from .export_frames import Frame, to_frame, write_description
 
 REQUIRES: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Options:
-    """Frame and orientation; NAME.json beside the file holds the transform from the map."""
+class Options(TypedOptions, frozen=True):
+    """Frame and orientation; NAME.json next to the file holds the transform from the map."""
 
     upright: bool = True
     """Turn the frame so that up is -y, as viewers of such files expect; false = the frame's own axes, in the map's the
     first camera's, which looks along +z with y down."""
-    frame: str = "map"
+    frame: Frame = "map"
     """"map", "gravity" (floor at 0) or "first-camera" (origin there)."""
-
-    def __post_init__(self) -> None:
-        check_frame(self.frame)
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:

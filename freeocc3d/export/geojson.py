@@ -9,7 +9,6 @@ whether its lengths are metres. Source: RFC 7946.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,25 +18,22 @@ from numpy.typing import NDArray
 from ..core.errors import ExportError
 from ..core.transforms import transform
 from ..query.regions import Region
+from ..settings.typed_options import TypedOptions
 from ..storage.store import Map
-from .export_frames import check_upright, to_frame
+from .export_frames import UprightFrame, to_frame
 
 REQUIRES: tuple[str, ...] = ()
 
 _CORNERS = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1)
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(TypedOptions, frozen=True):
     """Words and frame."""
 
     words: tuple[str, ...] = ()
     """Words to ask, as in [sofa, chair]; none = all words that the map's encoder or a scene vocabulary names."""
-    frame: str = "gravity"
+    frame: UprightFrame = "gravity"
     """"gravity" (walls along x and y) or "first-camera" (origin there, x where it looked)."""
-
-    def __post_init__(self) -> None:
-        check_upright(self.frame)
 
 
 def write(scan_map: Map, path: Path, options: Options) -> list[str]:

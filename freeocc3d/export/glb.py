@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..core.errors import ConfigError, ExportError
+from ..core.errors import ExportError
 from ..core.transforms import invert
 from ..occupancy.surface_faces import find_exposed_faces
 from ..storage.store import Map
-from .export_frames import PlacedVoxels, check_box, check_frame, place_voxels
-from .ply import COLORS, choose_colors
+from .export_frames import PlacedVoxels, VoxelOptions, place_voxels
+from .ply import ColorBy, choose_colors
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -30,24 +29,11 @@ _VERTICES, _INDICES = 34962, 34963
 _Z_UP_TO_Y_UP = np.array([(1.0, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1)])
 
 
-@dataclass(frozen=True)
-class Options:
-    """Frame and colour."""
+class Options(VoxelOptions, frozen=True):
+    """Frame and color."""
 
-    frame: str = "gravity"
-    """"gravity" (floor at 0), "first-camera" (origin there) or "map"; voxels keep their places in the last only, in the
-    others they are sampled anew."""
-    color: str = "rgb"
-    """"rgb" for the surface's own colour, "class", "height" or "probability", as of `ply`."""
-    box: tuple[float, ...] = ()
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
-    it are written; none = all."""
-
-    def __post_init__(self) -> None:
-        check_frame(self.frame)
-        check_box(self.box)
-        if self.color not in COLORS:
-            raise ConfigError(f"'color' must be {', '.join(COLORS[:-1])} or {COLORS[-1]}, got '{self.color}'.")
+    color: ColorBy = "rgb"
+    """"rgb" for the surface's own color, "class", "height" or "probability", as of `ply`."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:

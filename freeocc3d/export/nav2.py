@@ -9,7 +9,6 @@ for Nav2's KeepoutFilter. Source: nav2_map_server's map_io.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,9 @@ from numpy.typing import NDArray
 
 from ..core.errors import ConfigError, ExportError
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
-from ..settings.registry import require_positive
+from ..settings.option_types import Finite, NotNegative, Positive, Share
 from ..storage.store import Map
-from .export_frames import check_box, check_upright, find_floor_z, place_voxels, write_description
+from .export_frames import BoxOptions, UprightFrame, find_floor_z, place_voxels, write_description
 from .keepout_masks import parse_avoided, write_layers
 from .map_server_files import PLAN, CellGrid, write_map
 
@@ -29,38 +28,28 @@ _PIXEL = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
 _MOST_PIXELS = 1 << 28
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(BoxOptions, frozen=True):
     """The robot's heights, and what counts as free."""
 
-    frame: str = "gravity"
+    frame: UprightFrame = "gravity"
     """"gravity" (walls along x and y) or "first-camera" (origin there, x where it looked)."""
-    min_height: float = 0.1
+    min_height: Finite = 0.1
     """Metres above the floor from which something is an obstacle; what is lower is driven over."""
-    max_height: float = 1.8
+    max_height: Positive = 1.8
     """Metres above the floor up to which something is an obstacle; what is higher is driven under."""
-    min_free: float = 0.5
+    min_free: Share = 0.5
     """Share of a column's voxels between the heights that have to be free for its cell to be free, 0…1; 0 = any."""
-    inflation: float = 0.0
+    inflation: NotNegative = 0.0
     """Metres around obstacles that are occupied as well; planners mostly inflate by themselves."""
     avoid: tuple[str, ...] = ()
     """Words whose places cost a robot, as in [carpet:40%, glass:0.5]: WORD is not to be entered, WORD:METRES to be kept
-    from by so much, WORD:COST% may be entered at a cost of 1 to 99, and WORD:METRES:COST% near by at a cost that falls
-    to 0 over the metres. What hangs above max_height does not count."""
-    box: tuple[float, ...] = ()
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
-    it are written; none = all."""
+    this far from, WORD:COST% may be entered at a cost of 1 to 99, and WORD:METRES:COST% near by at a cost that falls to
+    0 over the metres. What hangs above max_height does not count."""
 
     def __post_init__(self) -> None:
-        check_upright(self.frame)
-        check_box(self.box)
-        require_positive(self, "max_height")
+        super().__post_init__()
         if self.min_height >= self.max_height:
             raise ConfigError(f"'min_height' must be below 'max_height', got {self.min_height} and {self.max_height}.")
-        if not 0 <= self.min_free <= 1:
-            raise ConfigError(f"'min_free' must be 0 to 1, got {self.min_free}.")
-        if self.inflation < 0:
-            raise ConfigError(f"'inflation' must not be negative, got {self.inflation}.")
         parse_avoided(self.avoid)
 
 

@@ -15,17 +15,16 @@ sparse one has edges (V,) int32 besides: voxel (i, j, k) covers origin + [i, i +
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import ConfigError, ExportError
+from ..core.errors import ExportError
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
 from ..storage.store import Map
-from .export_frames import check_box, check_frame, find_world, place_voxels
+from .export_frames import Frame, VoxelOptions, find_world, place_voxels
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -33,24 +32,12 @@ _LARGEST_DENSE = 2 << 30
 _MOST_CLASSES = 253  # 0 is free, 254 at the most stands for "nothing known", 255 is unknown
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(VoxelOptions, frozen=True):
     """Shape of the arrays."""
 
-    form: str = "dense"
+    frame: Frame = "map"
+    form: Literal["dense", "sparse"] = "dense"
     """"dense" for a grid over the map's box, "sparse" for lists of its known voxels."""
-    frame: str = "map"
-    """"map", "gravity" (z up, floor at 0) or "first-camera" (z up, from there); but for the first, voxels are sampled
-    anew."""
-    box: tuple[float, ...] = ()
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
-    it are written; none = all."""
-
-    def __post_init__(self) -> None:
-        check_frame(self.frame)
-        check_box(self.box)
-        if self.form not in ("dense", "sparse"):
-            raise ConfigError(f"'form' must be dense or sparse, got '{self.form}'.")
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:

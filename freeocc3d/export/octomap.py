@@ -7,7 +7,6 @@ Source: the file formats of A. Hornung et al., OctoMap, Autonomous Robots 2013, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.errors import ConfigError, ExportError
 from ..core.types import FREE, OCCUPIED, Occupancy
 from ..storage.store import Map
-from .export_frames import check_box, check_frame, place_voxels, write_description
+from .export_frames import VoxelOptions, place_voxels, write_description
 from .octree import KEY_ORIGIN, Leaves, Octree, build_octree
 
 REQUIRES: tuple[str, ...] = ()
@@ -28,22 +27,11 @@ _LEAST = 0.05  # log-odds: an occupied voxel has more, a free one less than the 
 _UNSET = 255  # of all three channels: OctoMap's colour of a node that has none
 
 
-@dataclass(frozen=True)
-class Options:
-    """Frame, and whether there are colours; a name that ends in .bt gives the binary form, in .ot the full one."""
+class Options(VoxelOptions, frozen=True):
+    """Frame, and whether there are colors; a name that ends in .bt gives the binary form, in .ot the full one."""
 
-    frame: str = "gravity"
-    """"gravity" (z up, floor at 0), "first-camera" (z up, from there) or "map"; voxels keep their places in the last
-    only, in the others they are sampled anew."""
     color: bool = False
-    """Write a ColorOcTree, for .ot: occupied leaves have the surface's colour."""
-    box: tuple[float, ...] = ()
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
-    it are written; none = all."""
-
-    def __post_init__(self) -> None:
-        check_frame(self.frame)
-        check_box(self.box)
+    """Write a ColorOcTree, for .ot: occupied leaves have the surface's color."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:

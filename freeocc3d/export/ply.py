@@ -3,52 +3,37 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.atomic_files import write_whole
-from ..core.errors import ConfigError, ExportError
+from ..core.errors import ExportError
 from ..core.ply_files import write_ply
 from ..core.types import OCCUPIED, Occupancy
 from ..occupancy.surface_faces import find_exposed_faces
 from ..query.word_query import QueryResult
 from ..storage.store import Map
 from ..viewer.palette import assign_class_colors, color_by_height, color_by_value, highlight_regions
-from .export_frames import PlacedVoxels, check_box, check_frame, place_voxels
+from .export_frames import Frame, PlacedVoxels, VoxelOptions, place_voxels
 
 REQUIRES: tuple[str, ...] = ()
 
-COLORS = "rgb", "class", "height", "probability"
+ColorBy = Literal["rgb", "class", "height", "probability"]
 """What occupied voxels may be coloured by."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Shape and colour."""
+class Options(VoxelOptions, frozen=True):
+    """Shape and color."""
 
-    form: str = "cubes"
+    frame: Frame = "map"
+    form: Literal["cubes", "points"] = "cubes"
     """"cubes" for a mesh of the faces between occupied and other voxels, "points" for voxel centres."""
-    color: str = "rgb"
-    """"rgb" for the surface's own colour, "class" for the class that fits best, "height" above the lowest voxel, or
+    color: ColorBy = "rgb"
+    """"rgb" for the surface's own color, "class" for the class that fits best, "height" above the lowest voxel, or
     "probability" of being occupied, 0 to 1; the last two from dark blue to yellow."""
-    frame: str = "map"
-    """"map", "gravity" (z up, floor at 0) or "first-camera" (z up, from there); but for the first, voxels are sampled
-    anew."""
-    box: tuple[float, ...] = ()
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
-    it are written; none = all."""
-
-    def __post_init__(self) -> None:
-        check_frame(self.frame)
-        check_box(self.box)
-        if self.form not in ("cubes", "points"):
-            raise ConfigError(f"'form' must be cubes or points, got '{self.form}'.")
-        if self.color not in COLORS:
-            raise ConfigError(f"'color' must be {', '.join(COLORS[:-1])} or {COLORS[-1]}, got '{self.color}'.")
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
@@ -73,7 +58,7 @@ def _refuse_empty(occupancy: Occupancy) -> None:
 
 
 def choose_colors(scan_map: Map, there: PlacedVoxels, by: str) -> NDArray[np.uint8]:
-    """(V, 3) colour of each occupied voxel of a placed map, by one of COLORS."""
+    """(V, 3) colour of each occupied voxel of a placed map, by one of ``ColorBy``."""
     occupancy = there.occupancy
     if by == "class":
         return assign_class_colors(scan_map.vocabulary)[scan_map.labels()[there.rows]]

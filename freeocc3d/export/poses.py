@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import ConfigError, ExportError
+from ..core.errors import ExportError
 from ..core.transforms import invert, rotations_to_quats, transform
 from ..core.types import Gaussians, Intrinsics
+from ..settings.option_types import NotNegativeInt
+from ..settings.typed_options import TypedOptions
 from ..storage.store import Map
-from .export_frames import check_frame, to_frame, write_description
+from .export_frames import Frame, to_frame, write_description
 from .ply import write_colored_ply
 
 REQUIRES: tuple[str, ...] = ()
@@ -29,23 +30,15 @@ REQUIRES: tuple[str, ...] = ()
 Views = list[tuple[Path, Intrinsics]]
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(TypedOptions, frozen=True):
     """Layout, frame, points."""
 
-    form: str = "colmap"
+    form: Literal["colmap", "nerfstudio"] = "colmap"
     """"colmap" or "nerfstudio"."""
-    frame: str = "gravity"
+    frame: Frame = "gravity"
     """"gravity" (z up, floor at 0), "first-camera" (z up, from there) or "map"."""
-    points: int = 100_000
-    """At most so many of the Gaussians' means, evenly spread, as the points that training starts from."""
-
-    def __post_init__(self) -> None:
-        check_frame(self.frame)
-        if self.form not in ("colmap", "nerfstudio"):
-            raise ConfigError(f"'form' must be colmap or nerfstudio, got '{self.form}'.")
-        if self.points < 0:
-            raise ConfigError(f"'points' must not be negative, got {self.points}.")
+    points: NotNegativeInt = 100_000
+    """The most of the Gaussians' means, evenly spread, that are the points which training starts from."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:

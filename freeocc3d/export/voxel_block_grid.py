@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -31,7 +30,7 @@ from ..core.types import BLOCK, OCCUPIED, Occupancy
 from ..core.voxel_keys import pack_voxels
 from ..language.feature_codec import CodedFeatures, Features
 from ..storage.store import Map
-from .export_frames import check_box, check_frame, find_world, place_voxels, write_description
+from .export_frames import Frame, VoxelOptions, find_world, place_voxels, write_description
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -48,22 +47,12 @@ _Read = Callable[[slice], NDArray[Any]]
 """Gives (n, 512, channels) of a slice of n blocks."""
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(VoxelOptions, frozen=True):
     """Frame, and whether features are written."""
 
+    frame: Frame = "map"
     features: bool = True
     """Write the language features and the words of the map's vocabulary."""
-    frame: str = "map"
-    """"map", "gravity" (z up, floor at 0) or "first-camera" (z up, from there); but for the first, voxels are sampled
-    anew."""
-    box: tuple[float, ...] = ()
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
-    it are written; none = all."""
-
-    def __post_init__(self) -> None:
-        check_frame(self.frame)
-        check_box(self.box)
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:

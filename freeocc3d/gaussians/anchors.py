@@ -10,67 +10,17 @@ surface, not with the frames.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..core.errors import ConfigError
 from ..core.transforms import invert, multiply_quats, rotations_to_quats
 from ..core.types import Frame, Gaussians, PosedFrame
-from ..settings.registry import require_positive
+from ..settings.stages import GaussianOptions as Options
 from . import denoising
 from .surface_cells import Cells, CellSums
-
-
-@dataclass(frozen=True)
-class Options:
-    """Layer 2: how keyframe depth becomes Gaussians."""
-
-    cell_size: float | None = None
-    """Edge of the cells that hold one Gaussian each, metres; null = half the voxel size, and no more than a hundredth
-    of the usual depth where the scale is unknown, for voxels may turn out to be large there."""
-    pixel_stride: int | None = None
-    """Every n-th pixel of a keyframe, in both directions, is lifted; null = as many as leave 320 columns, more where
-    cells are small, and all of depth by stereo."""
-    every: int = 1
-    """Every n-th tracked frame shows the surface, besides the keyframes; 0 = keyframes alone, as in the paper, which
-    loses two to nine points of IoU on the shipped captures."""
-    denoise: bool = True
-    """Move the cells' points to where all frames' depth images together have the surface, and leave out those that
-    most see through: adds 6 to 22 points of IoU on the shipped captures and halves the number of Gaussians."""
-    coverage: float = 0.7
-    """s_perp over the spacing of the Gaussians, which is the cell's edge or, where that is greater, the footprint of a
-    pixel on the surface. At 0.7 a flat wall reaches alpha = 0.5 at 0.6 voxels from its surface: a voxel's centre is
-    within 0.5 voxels of a surface through it where that is along the lattice, and up to 0.87 where it is oblique."""
-    uncertainty: float = 0.0
-    """Standard deviations of an anchor's averaged depth that are added (in quadrature) to that spacing. Uncertain
-    surfaces, those that few keyframes saw from afar, come out thicker: 1 loses two to eight points of IoU on the house
-    captures and gains 0.3 on the kitchen."""
-    gamma: float = 1.0
-    """Elongation along the viewing ray, s_par = gamma * s_perp; at 1 a Gaussian is a sphere, which measures best on the
-    shipped captures (0.6 and 1.5 lose one to five points of IoU on the kitchen)."""
-    opacity: float = 0.9
-    """Opacity of a new Gaussian, 0…1: where fitting starts, and its weight when voxels take up features and colours;
-    alpha does not depend on it."""
-    initialisation: str = "ray_aligned"
-    """"ray_aligned": as above, the paper's geometry-aware initialisation; "isotropic": spheres of the mean distance to
-    the three nearest Gaussians, as in 3D Gaussian splatting (for comparison)."""
-    edge: float = 0.05
-    """Pixels whose depth differs from a neighbour's by more than this share of it are dropped: at an edge the sensor
-    reports depths that belong to neither side."""
-    min_pixels: int = 2
-    """Measurements that a cell needs, unless it is too small to hold so many."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "cell_size", "pixel_stride", "coverage", "gamma", "opacity", "edge", "min_pixels")
-        if self.opacity > 1:
-            raise ConfigError(f"'opacity' must be at most 1, got {self.opacity}.")
-        if self.uncertainty < 0 or self.every < 0:
-            raise ConfigError("'uncertainty' and 'every' must not be negative.")
-        if self.initialisation not in ("ray_aligned", "isotropic"):
-            raise ConfigError(f"'initialisation' must be ray_aligned or isotropic, got '{self.initialisation}'.")
 
 
 def compute_least_scale(options: Options, cell_size: float, voxel_size: float) -> float:
@@ -114,7 +64,7 @@ class AnchoredCells:
         colors = np.rint(cells.colors).astype(np.uint8)
         s_perp = (self.options.coverage * spacing).astype(np.float32)
         made = align_to_rays(anchor_cam, cells.keyframe, T_world_keyframe, s_perp, colors, self.options)
-        return make_isotropic(made) if self.options.initialisation == "isotropic" else made
+        return make_isotropic(made) if self.options.initialization == "isotropic" else made
 
     def _denoised(self, cells: Cells, frames: Iterable[PosedFrame]) -> Cells:
         """The cells' points where all depth images have the surface, averaged by the cells that they are in now."""

@@ -17,15 +17,14 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.errors import ConfigError
 from ..core.types import Gaussians
-from ..settings.registry import require_positive
+from ..settings.stages import FittingOptions as Options
 from .rasterizers.base import ALPHA_MIN, Rasterizer, Rendered
 from .rendered_views import CapturedView
 
@@ -36,37 +35,6 @@ _DECAY, _DECAY_FROM = 0.1, 0.3
 _LARGEST_LOGIT = 6.0
 _LARGEST_CHANGE = math.log(4.0)
 """Of a scale, natural logarithm: what no image has, such as a frame of one colour, lets none grow without bounds."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """Layer 2: how Gaussians are fitted to the images."""
-
-    rasterizer: str = "cpu"
-    """What renders: "cpu" (compiled), "gsplat" (CUDA), or "reference" (plain PyTorch, slow)."""
-    passes: int = 6
-    """Times that every keyframe is rendered and compared; 0 = Gaussians stay as they were initialised."""
-    means: str = "anchored"
-    """"anchored": means stay on the measured surface, and shapes near the initialisation; "free": everything is moved
-    by the images, as elsewhere (for comparison; costs occupancy)."""
-    width: int = 320
-    """Columns of the rendered images."""
-    depth_weight: float = 1.0
-    """beta: a depth wrong by a metre weighs as much as a colour wrong by its whole range."""
-    shape_weight: float = 0.1
-    """Pull of anchored Gaussians' outlines to the initialisation: weight of the mean squared logarithm of their
-    change. Smaller renders better (0.02: + 0.4 dB) and loses occupancy (0.5 to 1 point of IoU)."""
-    window: int = 10
-    """Keyframes that a map is fitted to while frames come in one by one."""
-    window_passes: int = 2
-    """Times that each of these is rendered for every new keyframe."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "width", "depth_weight", "window", "window_passes")
-        if self.passes < 0 or self.shape_weight < 0:
-            raise ConfigError("'passes' and 'shape_weight' must not be negative.")
-        if self.means not in ("anchored", "free"):
-            raise ConfigError(f"'means' must be anchored or free, got '{self.means}'.")
 
 
 def fit_gaussians(

@@ -9,50 +9,18 @@ given only the keyframes that say the most (``choice``).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import ConfigError, FrameError
+from ..core.errors import FrameError
 from ..core.progress import Progress
 from ..core.types import Frame, Gaussians
-from ..settings.registry import require_positive
+from ..settings.stages import LanguageOptions as Options
 from .encoders.base import Encoder
 from .feature_fusion import FeatureFusion
 from .keyframe_choice import choose_keyframes, measure_detail
 from .visibility import find_visible
-
-
-@dataclass(frozen=True)
-class Options:
-    """Layer 3: what is known of the Gaussians in words."""
-
-    encoder: str = "colour"
-    """What turns images and words into features; "colour" needs no network and knows colour names only."""
-    keyframes: float = 1.0
-    """Keyframes that are encoded: up to 1 their share of all, above it their number. Fewer are chosen so that they are
-    sharp and together show the most surface; layer 3's time falls in proportion."""
-    visible_within: float = 0.02
-    """A Gaussian is seen if the depth image shows something within this many metres of it…"""
-    visible_share: float = 0.01
-    """…plus this share of its depth, plus its own standard deviation along the ray; otherwise it is hidden. Where
-    nothing was measured, the Gaussians' own rendered depth decides."""
-    near: float = 0.5
-    """Views count in proportion to 1 / depth^2, those nearer than this all the same, metres."""
-    border: float = 0.1
-    """Share of the image's height, from its edge inwards, over which views come to count in full: encoders see things
-    cut off there."""
-    disagreement: float | None = 0.6
-    """Regions of a view are left out that differ from what the other views say by more than this share of what two
-    random places of the scene differ by; null = none are."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "visible_within", "near", "keyframes", "disagreement")
-        if self.visible_share < 0:
-            raise ConfigError(f"'visible_share' must not be negative, got {self.visible_share}.")
-        if not 0 <= self.border <= 0.5:
-            raise ConfigError(f"'border' must be from 0 to 0.5, got {self.border}.")
 
 
 def lift_features(

@@ -14,7 +14,6 @@ import json
 import os
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from ..core.atomic_files import replace_text
 from ..core.errors import ConfigError
 from ..core.types import Frame
 from ..core.warnings import Notice
-from ..settings.registry import require_positive
+from ..settings.stages import VocabularyOptions as Options
 from .synonyms import normalize_phrase
 from .vision_server import ServerError, VisionServer, resolve_address, shorten_to_line
 
@@ -47,34 +46,6 @@ _MOST_FAILURES = 3
 """Questions in a row that are not answered before the others are not asked."""
 _WIDTH = 768  # of the pictures that are sent
 _JPEG_QUALITY = 85
-
-
-@dataclass(frozen=True)
-class Options:
-    """Names of what is in the scene, by a vision-language model; they are what a word competes with."""
-
-    endpoint: str | None = None
-    """Address of an OpenAI-compatible server, such as http://localhost:11434/v1 (Ollama); null = no model is asked. The
-    keyframes that are asked about are sent there."""
-    model: str = ""
-    """What the server calls the model."""
-    api_key_env: str | None = None
-    """Name of the environment variable that holds the server's key; null = it wants none."""
-    keyframes: int = 24
-    """At most so many keyframes are asked about, evenly spread."""
-    timeout: float = 60.0
-    """Seconds that one answer may take."""
-    retries: int = 2
-    """Times that a question is asked again after an answer that did not come."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "keyframes", "timeout")
-        if self.retries < 0:
-            raise ConfigError(f"'retries' must not be negative, got {self.retries}.")
-        if self.endpoint is not None:
-            resolve_address(self.endpoint)
-            if not self.model:
-                raise ConfigError("'vocabulary.endpoint' is given, so 'vocabulary.model' must say what to ask there.")
 
 
 class Namer:
@@ -145,9 +116,11 @@ class Namer:
 
 
 def load_namer(options: Options) -> Namer | None:
-    """What asks, None if no endpoint is given. Raises ConfigError if the key's environment variable is not set."""
+    """What asks, None if no endpoint is given. Raises ConfigError: the endpoint is no address, or the key's environment
+    variable is not set."""
     if options.endpoint is None:
         return None
+    resolve_address(options.endpoint)
     key = os.environ.get(options.api_key_env, "").strip() if options.api_key_env else None
     if options.api_key_env and not key:
         raise ConfigError(

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numba import njit, prange
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from ..core.transforms import invert, quats_to_rotations
 from ..core.types import Frame, Gaussians
+from ..settings.stages import LanguageOptions
 
 _MIN_COSINE = np.float32(0.05)
 """Of a view along the surface, and of one next to a depth edge, where pixels mix both sides."""
@@ -33,23 +33,6 @@ _NEAR = np.float32(0.05)
 """Metres, from where Gaussians are rendered."""
 _WIDEST = 16
 """Blocks, to either side, that one Gaussian covers at most."""
-
-
-class SightLimits(Protocol):
-    """The options of layer 3 by which a frame shows a Gaussian, and shows it well: ``lifting.Options`` says what each
-    means."""
-
-    @property
-    def visible_within(self) -> float: ...
-
-    @property
-    def visible_share(self) -> float: ...
-
-    @property
-    def near(self) -> float: ...
-
-    @property
-    def border(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -73,7 +56,7 @@ class VisibleGaussians:
 
 
 def find_visible(
-    gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: SightLimits
+    gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: LanguageOptions
 ) -> VisibleGaussians:
     """What a frame shows of N Gaussians."""
     camera, depth_m = frame.intrinsics, frame.depth_m
@@ -91,7 +74,7 @@ def find_visible(
 
 
 def find_visible_reference(
-    gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: SightLimits
+    gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: LanguageOptions
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(N,) pixels and (N,) weights, 0 for what is not seen: plain NumPy, all Gaussians at once."""
     camera, depth_m = frame.intrinsics, frame.depth_m

@@ -3,53 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ..core.errors import ConfigError
 from ..core.transforms import back_project, invert, transform
 from ..core.types import BLOCK, Frame
 from ..core.voxel_keys import unpack_voxels
-from ..settings.registry import require_positive
+from ..settings.stages import CarvingOptions as Options
 from .voxel_blocks import find_blocks_along_rays
 
 _NARROW = 64
 """Of the image's width: where no depth is measured within one such part of a pixel, the pixel is amid a wide patch, and
 not in a hole along the edge of a thing."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """Layer 4: free space from depth."""
-
-    margin: float = 1.0
-    """A voxel is seen through when the depth behind its centre is greater by this many voxel edges (and by the
-    depth's uncertainty)."""
-    noise: float = 0.0019
-    """Growth of a depth's standard deviation with its square, 1/m, where nothing else says how great it is; three of
-    them are added to the margin."""
-    hit: float = 0.85
-    """Log-odds that a depth image which ends in a voxel adds: OctoMap's, a probability of 0.7."""
-    miss: float = 0.4
-    """Log-odds that one which sees through a voxel takes away: OctoMap's, a probability of 0.4."""
-    min_free: int = 1
-    """Depth images that must see through a voxel that holds no surface before it counts as free."""
-    every: int = 1
-    """Every n-th tracked frame tells what is free, besides the keyframes; 0 = keyframes alone."""
-    no_return: float = 0.0
-    """Metres up to which space counts as seen through where a wide patch of a depth image holds no measurement; 0 =
-    that tells nothing. For sensors that fail beyond their range alone: what is black, shiny or too near has no depth
-    either, and would be carved away."""
-    ray_step: int = 16
-    """Every n-th pixel's ray (more where blocks are small) is followed to find the blocks that a camera looked into."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "margin", "hit", "miss", "min_free", "ray_step")
-        if self.noise < 0 or self.every < 0 or self.no_return < 0:
-            raise ConfigError("'noise', 'every' and 'no_return' must not be negative.")
 
 
 def compute_log_odds(free: NDArray[np.uint16], hits: NDArray[np.uint16], options: Options) -> NDArray[np.float32]:

@@ -40,52 +40,17 @@ from numba import njit, prange, types
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from ..core.errors import ConfigError
 from ..core.half_floats import widen_halves
 from ..core.hash_table import build_table, find_row, packed_key
 from ..core.threads import count_threads
 from ..core.types import BLOCK, Gaussians
-from ..settings.registry import require_positive
+from ..settings.stages import OccupancyOptions as Options
 from .gaussian_mass import integrate_boxes
 from .voxel_blocks import find_touched_blocks, unite_keys
 
 _PROBABILISTIC, _POISSON, _INTEGRATED, _RELEASED = range(4)
 _MODES = {"probabilistic": _PROBABILISTIC, "poisson": _POISSON, "integrated": _INTEGRATED, "released": _RELEASED}
 _SMALLEST_SCALE = 1e-5
-
-
-@dataclass(frozen=True)
-class Options:
-    """Layer 4: how Gaussians become voxels."""
-
-    voxel_size: float = 0.08
-    """Edge of a voxel, metres."""
-    finest: float | None = None
-    """Edge of the smallest voxels, metres, such as 0.01 where the others have 0.08: voxels are cut by halves down to it
-    where the surface is not flat or its meaning changes; null = all are of one size."""
-    projection: str = "probabilistic"
-    """What a Gaussian adds to a voxel: "probabilistic" (the paper's equations), "poisson" (with its opacity, in the
-    form of the paper's code), "integrated" (its mass within the voxel), "released" (a dilation, as that code runs)."""
-    cutoff: float = 3.0
-    """Neighbourhood of a Gaussian in standard deviations."""
-    threshold: float = 0.5
-    """Occupied from this alpha on."""
-    device: str = "cpu"
-    """Where Gaussians are projected: "cpu" (compiled), or a GPU for torch, such as "cuda:0"."""
-    contradiction: float = 4.0
-    """A voxel above the threshold is free all the same when the log-odds of what depth images saw there (see carving)
-    are at most minus this: 4 is ten images that saw through it, or more where others ended in it."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "voxel_size", "finest", "cutoff", "threshold", "contradiction")
-        if self.threshold >= 1:
-            raise ConfigError(f"'threshold' must be less than 1, got {self.threshold}.")
-        if self.projection not in _MODES:
-            raise ConfigError(f"'projection' must be one of {', '.join(_MODES)}, got '{self.projection}'.")
-        if self.device != "cpu":
-            from . import splat_torch
-
-            splat_torch.check_device(self.device, self.projection)
 
 
 @dataclass(frozen=True)
@@ -124,6 +89,14 @@ class Bins:
         return replace(self, packed=self.packed[rows], start=start, gaussian=self.gaussian[pairs])
 
 
+def check(options: Options) -> None:
+    """Raises ConfigError or DependencyError if Gaussians cannot be projected on the device that is asked for."""
+    if options.device != "cpu":
+        from . import splat_torch
+
+        splat_torch.check_device(options.device)
+
+
 def bin_gaussians(
     gaussians: Gaussians,
     origin: NDArray[np.float64],
@@ -136,6 +109,7 @@ def bin_gaussians(
     shape: only the voxels (0, 0, 0) … shape - 1 are evaluated, however far a Gaussian reaches; all by default.
     least_scale: s_min, metres.
     """
+    check(options)
     mode = _MODES[options.projection]
     scales, share = widen_scales(gaussians.scales, least_scale, options)
     means, form, log_weight, lo, hi = _prepared(

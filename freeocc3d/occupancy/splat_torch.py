@@ -23,10 +23,8 @@ if TYPE_CHECKING:
 _PAIRS = 1 << 24  # worked on at once: 60 bytes each
 
 
-def check_device(device: str, projection: str) -> None:
-    """Raises ConfigError or DependencyError if this cannot be done there."""
-    if projection == "integrated":
-        raise ConfigError("'integrated' projects on the processor only: set occupancy.device=cpu.")
+def check_device(device: str) -> None:
+    """Raises ConfigError or DependencyError for a device that torch does not have."""
     try:
         kind = torch.device(device).type
     except RuntimeError as error:

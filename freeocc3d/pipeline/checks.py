@@ -9,36 +9,28 @@ import numpy as np
 from ..capture import Capture
 from ..core.types import Trajectory
 from ..core.warnings import Notice
-from ..depth import multi_view_stereo
 from ..editing import adaptive_voxels
-from ..gaussians import anchors, fitting
-from ..language import lifting, scene_vocabulary
-from ..occupancy import carve, splat
-from ..settings import config, registry
-from ..settings.config import Config
-from .backends import options_of
+from ..language import scene_vocabulary
+from ..occupancy import splat
+from ..settings.config import Settings
 
 _FEW_TRACKED = 0.5
 
 
-def check(settings: Config) -> None:
-    """Build the options of every layer and of the chosen backends, so that a value out of range is found before any
-    work. A backend that needs more than packages has a function ``check``. Raises ConfigError, DependencyError for a
-    backend whose packages are not installed, or what ``check`` raises."""
-    layers = {"gaussians": anchors, "fitting": fitting, "language": lifting, "occupancy": splat, "carving": carve}
-    for section, module in layers.items():
-        options_of(module, config.options(settings, section))
-    if settings["occupancy"]["finest"] is not None:
-        adaptive_voxels.count_halvings(settings["occupancy"]["voxel_size"], settings["occupancy"]["finest"])
-    scene_vocabulary.load_namer(options_of(scene_vocabulary, settings["vocabulary"]))
-    options_of(multi_view_stereo, settings["tracking"]["stereo"])
-    for section, key in (("tracking", "backend"), ("fitting", "rasterizer"), ("language", "encoder")):
-        name = settings[section][key]
-        backend = registry.load(str(config.SECTIONS[section][1]), name)
-        if hasattr(backend, "Options"):
-            options = options_of(backend, settings[section].get(name, {}))
-            if hasattr(backend, "check"):
-                backend.check(options)
+def check(settings: Settings) -> None:
+    """Check before any work what a configuration asks of this machine: packages, files, devices, servers.
+
+    A backend that needs more than packages has a function ``check``. Raises ConfigError, DependencyError for a backend
+    whose packages are not installed, or what ``check`` raises.
+    """
+    if settings.occupancy.finest is not None:
+        adaptive_voxels.count_halvings(settings.occupancy.voxel_size, settings.occupancy.finest)
+    splat.check(settings.occupancy)
+    scene_vocabulary.load_namer(settings.vocabulary)
+    for section in ("tracking", "fitting", "language"):
+        backend, options = settings.backend(section)
+        if hasattr(backend, "check"):
+            backend.check(options)
 
 
 def warn_of_camera(capture: Capture) -> Notice:

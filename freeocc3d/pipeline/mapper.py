@@ -15,7 +15,6 @@ from ..capture import base as capture_base
 from ..core.errors import FrameError, TrackingError
 from ..core.progress import Progress
 from ..core.types import Frame, Gaussians, Occupancy, PosedFrame, Trajectory
-from ..depth import multi_view_stereo
 from ..depth.base import DepthSource, MeasuredDepth
 from ..depth.stereo_source import StereoSource
 from ..editing import adaptive_voxels
@@ -23,13 +22,11 @@ from ..gaussians import anchors, fitting, rendered_views
 from ..gaussians.rasterizers.base import Rasterizer
 from ..language import lifting
 from ..language.encoders.base import Encoder
-from ..occupancy import build, carve, splat
-from ..settings import config
-from ..settings.config import Config
+from ..occupancy import build
+from ..settings.config import Settings
 from ..storage import store
 from ..storage.keyframes import Keyframes
 from ..tracking.base import Tracked, Tracker
-from .backends import load_backend, options_of
 
 _FINE = 0.01
 """Edge of cells over the usual depth, where the scale is unknown: about what stereo can tell apart."""
@@ -38,21 +35,21 @@ _FINE = 0.01
 class Mapper:
     """Takes frames one by one. ``folder`` receives the keyframes; what is in memory grows with keyframes only."""
 
-    def __init__(self, settings: Config, capture: Capture, folder: Path):
+    def __init__(self, settings: Settings, capture: Capture, folder: Path):
         self.settings = settings
         self.capture = capture
         self.keyframes = Keyframes(folder / store.KEYFRAMES)
-        self.tracker: Tracker = load_backend(settings, "tracking", "backend", capture)
+        self.tracker: Tracker = settings.load_backend("tracking", capture)
         if self.tracker.needs_depth and not capture.has_depth:
             raise TrackingError(
-                f"tracking.backend={settings['tracking']['backend']} needs depth, which {capture.path} has none of (or "
+                f"tracking.backend={settings.tracking.backend} needs depth, which {capture.path} has none of (or "
                 "capture.depth=false): estimate poses from colour with tracking.backend=colmap, or give them (known, "
                 "file)."
             )
         self.depth: DepthSource = MeasuredDepth()
         if not (capture.has_depth or self.tracker.brings_depth):
-            self.depth = StereoSource(capture, options_of(multi_view_stereo, settings["tracking"]["stereo"]))
-        self.rasterizer: Rasterizer = load_backend(settings, "fitting", "rasterizer")
+            self.depth = StereoSource(capture, settings.stereo)
+        self.rasterizer: Rasterizer = settings.load_backend("fitting")
         self.refined = False
         """Whether all poses so far are consistent with each other."""
 
@@ -133,7 +130,7 @@ class Mapper:
         """Layer 2 as it is initialised: Gaussians anchored at the surface that the mapped frames so far show."""
         progress = progress or Progress()
         trajectory = self.trajectory()
-        options: anchors.Options = options_of(anchors, self.settings["gaussians"])
+        options = self.settings.gaussians
         progress.stage("gaussians", 2 * len(self.frames_used(trajectory, options.every)))
         cells = anchors.AnchoredCells(options, self.cell_size, trajectory.T_world_keyframe)
         done = itertools.count(1)
@@ -149,7 +146,7 @@ class Mapper:
 
     def fit_gaussians(self, gaussians: Gaussians, progress: Progress | None = None) -> Gaussians:
         """Layer 2 fitted to the images of all mapped keyframes so far."""
-        progress, options, trajectory = progress or Progress(), self.fit_options, self.trajectory()
+        progress, options, trajectory = progress or Progress(), self.settings.fitting, self.trajectory()
         progress.stage("fitting", options.passes * len(trajectory.keyframes))
         if options.passes == 0 or not len(gaussians):
             return gaussians
@@ -160,20 +157,14 @@ class Mapper:
     @property
     def cell_size(self) -> float:
         """Edge in metres of the cells that hold one Gaussian each."""
-        usual = 0.5 * self.settings["occupancy"]["voxel_size"]
+        usual = 0.5 * self.settings.occupancy.voxel_size
         if not self.tracker.metric:  # half a voxel may turn out to be much in metres
             usual = min(usual, _FINE * capture_base.NOMINAL_DEPTH)
-        return float(self.settings["gaussians"]["cell_size"] or usual)
-
-    @property
-    def fit_options(self) -> fitting.Options:
-        """The configuration's."""
-        options: fitting.Options = options_of(fitting, config.options(self.settings, "fitting"))
-        return options
+        return float(self.settings.gaussians.cell_size or usual)
 
     def views(self, trajectory: Trajectory) -> list[rendered_views.CapturedView]:
         """The keyframes as they are rendered and compared."""
-        device, width = self.rasterizer.device, self.fit_options.width
+        device, width = self.rasterizer.device, self.settings.fitting.width
         posed = zip(self.mapped(trajectory), trajectory.T_world_keyframe, strict=True)
         return [rendered_views.prepare_captured_view(frame, T, width, device) for frame, T in posed]
 
@@ -182,7 +173,7 @@ class Mapper:
     ) -> NDArray[np.float16]:
         """Layer 3: (N, D) unit features of the Gaussians, fused over the keyframes that see them."""
         trajectory = self.trajectory()
-        options: lifting.Options = options_of(lifting, config.options(self.settings, "language"))
+        options = self.settings.language
         keyframes = self.mapped(trajectory)
         return lifting.lift_features(gaussians, keyframes, trajectory.T_world_keyframe, encoder, options, progress)
 
@@ -192,19 +183,19 @@ class Mapper:
         """Layer 4: voxels with probabilities, evidence, features and colours."""
         progress = progress or Progress()
         trajectory = self.trajectory()
-        carving: carve.Options = options_of(carve, self.settings["carving"])
+        carving = self.settings.carving
         progress.stage("occupancy", len(self.frames_used(trajectory, carving.every)))
         return build.build_occupancy(
             gaussians,
             features,
             self.posed(trajectory, carving.every),
-            options_of(splat, self.settings["occupancy"]),
+            self.settings.occupancy,
             carving,
             progress=progress.advance,
             least_scale=anchors.compute_least_scale(
-                options_of(anchors, self.settings["gaussians"]),
+                self.settings.gaussians,
                 self.cell_size,
-                self.settings["occupancy"]["voxel_size"],
+                self.settings.occupancy.voxel_size,
             ),
         )
 
@@ -217,7 +208,7 @@ class Mapper:
         progress: Progress | None = None,
     ) -> Occupancy:
         """Layer 4 with smaller voxels where they show more, if the configuration asks for them."""
-        finest = self.settings["occupancy"]["finest"]
+        finest = self.settings.occupancy.finest
         if finest is None:
             return occupancy
         trajectory, progress = self.trajectory(), progress or Progress()

@@ -9,17 +9,15 @@ from typing import Any
 
 from .. import __version__
 from ..capture import Capture, check_depth_scale, open_capture, select_frames
-from ..capture import base as capture_base
 from ..capture.focal_correction import Reregistered
 from ..core.errors import Interrupted, MapError, TrackingError
 from ..core.progress import Progress
 from ..language.encoders.base import Encoder
 from ..settings import config
-from ..settings.config import Config
+from ..settings.config import Settings
 from ..storage.store import Map, load_map
 from ..storage.work_folder import WorkFolder
 from ..tracking.rgbd import focal_calibration
-from .backends import load_backend, options_of
 from .checks import check, warn_of_color_focal
 from .mapper import Mapper
 from .saving import absolute
@@ -29,7 +27,7 @@ from .stages import STAGES, Run
 def reconstruct(
     capture: str | Path,
     output: str | Path,
-    settings: Config | dict[str, Any] | None = None,
+    settings: Settings | dict[str, Any] | None = None,
     *,
     overwrite: bool = False,
     resume: bool = False,
@@ -37,7 +35,7 @@ def reconstruct(
 ) -> Map:
     """Turn the capture in a folder into a map folder, and return the map.
 
-    settings: a configuration as ``config.load`` gives it, or any part of one, {"section": {"key": value}}.
+    settings: as ``config.load`` gives them, or any part as plain values, {"section": {"key": value}}.
     overwrite: replace an existing map, and drop an interrupted run's work.  resume: go on with an interrupted run.
     Raises FreeOccError; Interrupted after Ctrl-C, with the work done so far kept for ``resume``.
     """
@@ -77,8 +75,8 @@ def _is_interrupt(error: BaseException | None) -> bool:
     return isinstance(error, KeyboardInterrupt) or (error is not None and _is_interrupt(error.__cause__))
 
 
-def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, progress: Progress) -> Map:
-    encoder: Encoder = load_backend(settings, "language", "encoder", capture)
+def _run(capture: Capture, settings: Settings, output: Path, work: WorkFolder, progress: Progress) -> Map:
+    encoder: Encoder = settings.load_backend("language", capture)
     run = Run(Mapper(settings, capture, work.folder), encoder, work, progress)
     for stage in STAGES.values():
         stage(run)
@@ -86,18 +84,17 @@ def _run(capture: Capture, settings: Config, output: Path, work: WorkFolder, pro
     return load_map(output)
 
 
-def _open(capture: str | Path, settings: Config, progress: Progress, work: WorkFolder) -> Capture:
-    section = settings["capture"]
-    opened = open_capture(capture, options_of(capture_base, config.options(settings, "capture")), section)
+def _open(capture: str | Path, settings: Settings, progress: Progress, work: WorkFolder) -> Capture:
+    opened = open_capture(capture, settings.capture, settings.backends.get("capture"))
     select_frames(opened)
     warning = check_depth_scale(opened) if opened.has_depth else None
     work.warn(progress, *opened.warnings, *([warning] if warning else []))
     return opened
 
 
-def _register_color(capture: Capture, settings: Config, progress: Progress, work: WorkFolder) -> Capture:
+def _register_color(capture: Capture, settings: Settings, progress: Progress, work: WorkFolder) -> Capture:
     """The capture with colour brought to the depth's pixels, if its cameras' focal lengths differ."""
-    ratio = settings["capture"]["color_focal"]
+    ratio = settings.capture.color_focal
     if not capture.has_depth:
         return capture
     if ratio is None:

@@ -48,7 +48,7 @@ def save(
         write_tum(folder / store.TRAJECTORY, trajectory)
         settings = mapper.settings
         if not mapper.tracker.metric:  # says how fine its Gaussians are when the map is put on other lattices
-            settings = {**settings, "gaussians": {**settings["gaussians"], "cell_size": mapper.cell_size}}
+            settings = settings.changed("gaussians", cell_size=mapper.cell_size)
         (folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
         metric = mapper.tracker.metric
         manifest = _manifest(mapper, trajectory, gaussians, occupancy, encoder, submaps)

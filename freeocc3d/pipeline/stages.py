@@ -19,7 +19,6 @@ from ..core.warnings import Notice
 from ..language import scene_vocabulary
 from ..language.encoders.base import Encoder
 from ..storage.work_folder import WorkFolder
-from .backends import options_of
 from .checks import warn_of_camera, warn_of_scale, warn_of_trajectory
 from .mapper import Mapper
 from .saving import evenly, save
@@ -117,7 +116,7 @@ def refine_poses(run: Run) -> None:
 def name_scene(run: Run) -> None:
     """Names of what some keyframes show, if a vision model is to be asked; the answers are kept one by one."""
     mapper, progress = run.mapper, run.progress
-    options: scene_vocabulary.Options = options_of(scene_vocabulary, mapper.settings["vocabulary"])
+    options = mapper.settings.vocabulary
     namer = scene_vocabulary.load_namer(options)
     if namer is None:
         return

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +38,7 @@ def query_classes(
             raise FreeOccError(f"The map has no class '{name}'{nearest(name.lower(), number)}: --classes lists them.")
     text = text_encoder.encode_words(list(vocabulary))
     of_voxel = nearest_word(occupancy.features, text)
-    options = replace(options or Options(), min_voxels=1, min_share=0.0)
+    options = (options or Options()).changed(min_voxels=1, min_share=0.0)
     results = []
     for name in names:
         k = number[name.lower()]

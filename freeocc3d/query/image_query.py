@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.errors import FreeOccError
 from ..core.types import Frame, Intrinsics, Occupancy
 from ..language.feature_codec import Features, compute_cosines, mask_known
-from ..settings import config, registry
+from ..settings import registry
 from .word_query import Options, QueryResult, found_regions
 
 if TYPE_CHECKING:
@@ -29,13 +29,15 @@ def image_encoder(name: str, config_file: Path) -> Encoder:
 
     Raises FreeOccError for one that takes more than an image, or that cannot be had again.
     """
+    from ..settings import config
+
     module = registry.load("language.encoders", name)
     if getattr(module, "NEEDS_CAPTURE", True):
         raise FreeOccError(
             f"The map's encoder '{name}' reads what the capture brings and cannot look at a picture: ask for words."
         )
-    options = config.load(config_file)["language"].get(name, {})
-    encoder: Encoder = module.load(registry.build_options(module, options), None)
+    settings = config.load_saved(config_file)
+    encoder: Encoder = settings.load_backend("language", None)
     return encoder
 
 

@@ -12,17 +12,18 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import ConfigError, FreeOccError, MapError
+from ..core.errors import FreeOccError, MapError
 from ..core.types import Occupancy
 from ..language import word_matching
 from ..language.feature_codec import Features, compute_cosines, mask_known
 from ..occupancy.connected_components import label_components
-from ..settings.registry import nearest, require_positive
+from ..settings.option_types import Cosine, PositiveInt, PositiveShare, Share
+from ..settings.typed_options import TypedOptions, nearest
 from .region_splitting import told_apart
 from .regions import Region, best_regions
 
@@ -31,45 +32,31 @@ if TYPE_CHECKING:
 
 _LONGEST_WORD = 200
 _MISSPELT = 0.75  # of difflib's ratio: "soffa" is, "canoe" for "camera" is not
-_SCORES = ("cosine", "softmax", "relevancy")
 _EVEN = 0.5  # a probability
 _ROWS = 16384  # voxels worked on at once, so that float32 copies of all features never exist
 _MANY_ROWS = 1 << 18  # by compiled code, whose threads are worth starting for many only
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(TypedOptions, frozen=True):
     """What counts as a match, and which regions are reported."""
 
-    scores: str = "cosine"
+    scores: Literal["cosine", "softmax", "relevancy"] = "cosine"
     """What a score is: "cosine" (over the cosine that the word allows), "softmax" (the word's probability against the
     contrast words) or "relevancy" (the least against each of some phrases that fit anything, as in LERF)."""
-    threshold: float | None = None
+    threshold: Cosine | None = None
     """Least score of a matching voxel, -1…1; null = the encoder's own for cosines, 0.5 for probabilities."""
-    grow: float = 0.8
+    grow: PositiveShare = 0.8
     """A region goes on over voxels that touch it down to this share of the threshold; 1 = it does not."""
-    top_k: int = 20
-    """At most so many regions a word."""
-    min_voxels: int = 2
+    top_k: PositiveInt = 20
+    """The most regions that are reported for a word."""
+    min_voxels: PositiveInt = 2
     """Smaller regions are left out, unless all are smaller."""
-    min_share: float = 0.001
+    min_share: Share = 0.001
     """Regions of less than this share of the volume of the word's largest one are left out, and those of one to three
-    voxels within half a metre of one that they are less than 50 times the share of: specks beside a thing. 0 = none."""
-    narrow: float = 0.5
+    voxels within half a metre of one that they are less than 50 times the share of: specks by a thing. 0 = none."""
+    narrow: Share = 0.5
     """Things that touch are told apart where their region, seen from above, narrows to less than this share of the
     narrower one, and to four voxels or less; 0 = regions stay whole."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "top_k", "min_voxels")
-        if self.threshold is not None and not -1 <= self.threshold <= 1:
-            raise ConfigError(f"'threshold' must lie between -1 and 1, got {self.threshold:g}.")
-        for name in ("narrow", "min_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"'{name}' must lie between 0 and 1, got {getattr(self, name):g}.")
-        if not 0 < self.grow <= 1:
-            raise ConfigError(f"'grow' must be greater than 0 and at most 1, got {self.grow:g}.")
-        if self.scores not in _SCORES:
-            raise ConfigError(f"'scores' must be one of {', '.join(_SCORES)}, got '{self.scores}'.")
 
 
 @dataclass(frozen=True)

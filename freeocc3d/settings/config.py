@@ -1,165 +1,267 @@
-"""Strict YAML in (an unknown key is an error that names the nearest), resolved YAML out.
+"""A configuration: strict in (an unknown key is an error that names the nearest), typed once, resolved YAML out.
 
-A configuration is a mapping section -> key -> value. The sections and their keys are the ``Options`` dataclasses of the
-layers, read from their syntax trees; a layer with backends has one sub-section per backend that is configured.
+A configuration file is a mapping section -> key -> value. A section is a class of ``stages``; what its backends are
+configured with stands in one sub-section for each, by the backend's name.
 """
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
-import textwrap
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import yaml
 
 from ..core.errors import ConfigError
-from . import registry
+from . import registry, renamed, stages
 from .presets import find_preset
-from .registry import Option
+from .typed_options import TypedOptions, build, field_types, nearest
+from .yaml_files import apply_override, read_yaml
 
-SECTIONS: dict[str, tuple[str, str | None]] = {
-    "capture": ("capture.base", "capture.readers"),
-    "tracking": ("tracking.base", "tracking.trackers"),
-    "gaussians": ("gaussians.anchors", None),
-    "fitting": ("gaussians.fitting", "gaussians.rasterizers"),
-    "language": ("language.lifting", "language.encoders"),
-    "vocabulary": ("language.scene_vocabulary", None),
-    "occupancy": ("occupancy.splat", None),
-    "carving": ("occupancy.carve", None),
+BackendValues = dict[str, dict[str, Any]]
+"""Name of a backend -> its options that are given, as plain values."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of a configuration file. folder: of its backends.  choice: the option that names the one to use.
+    within: the section that it stands in, where that is not the file itself."""
+
+    options: type[TypedOptions]
+    folder: str = ""
+    choice: str = ""
+    within: str = ""
+
+
+SECTIONS: dict[str, Section] = {
+    "capture": Section(stages.CaptureOptions, "capture.readers", "format"),
+    "tracking": Section(stages.TrackingOptions, "tracking.trackers", "backend"),
+    "stereo": Section(stages.StereoOptions, within="tracking"),
+    "gaussians": Section(stages.GaussianOptions),
+    "fitting": Section(stages.FittingOptions, "gaussians.rasterizers", "rasterizer"),
+    "language": Section(stages.LanguageOptions, "language.encoders", "encoder"),
+    "vocabulary": Section(stages.VocabularyOptions),
+    "occupancy": Section(stages.OccupancyOptions),
+    "carving": Section(stages.CarvingOptions),
 }
-"""Section -> (module whose ``Options`` it configures, folder of its backends)."""
-
-NESTED: dict[str, dict[str, str]] = {"tracking": {"stereo": "depth.multi_view_stereo"}}
-"""Section -> what it holds besides its backends -> module whose ``Options`` that configures."""
-
-Config = dict[str, dict[str, Any]]
+"""Field of ``Settings`` -> how it stands in a file."""
 
 
-def default() -> Config:
-    """Every key of every layer with its default."""
-    return resolve({})
+class Settings(msgspec.Struct, frozen=True):
+    """A resolved configuration: the options of every stage, and what is given for backends."""
+
+    capture: stages.CaptureOptions
+    tracking: stages.TrackingOptions
+    stereo: stages.StereoOptions
+    gaussians: stages.GaussianOptions
+    fitting: stages.FittingOptions
+    language: stages.LanguageOptions
+    vocabulary: stages.VocabularyOptions
+    occupancy: stages.OccupancyOptions
+    carving: stages.CarvingOptions
+    backends: dict[str, BackendValues] = {}
+    """Section -> what is given for its backends; options that are not given have their defaults."""
+
+    def changed(self, section: str, **values: Any) -> Settings:
+        """A copy with other values in a section (a field of this class). Raises ConfigError."""
+        return msgspec.structs.replace(self, **{section: getattr(self, section).changed(**values)})
+
+    def with_backend(self, section: str, **values: Any) -> Settings:
+        """A copy with other values for the section's chosen backend. Raises ConfigError."""
+        name, backends = self.chosen(section), copy.deepcopy(self.backends)
+        given = {**backends.get(section, {}).get(name, {}), **values}
+        backends.setdefault(section, {})[name] = _checked(section, name, given)
+        return msgspec.structs.replace(self, backends=backends)
+
+    def has_backend_option(self, section: str, name: str) -> bool:
+        """Whether the backend that a section chooses has an option."""
+        backend = registry.backend(SECTIONS[section].folder, self.chosen(section))
+        return any(option.name == name for option in backend.options)
+
+    def chosen(self, section: str) -> str:
+        """The name of the backend that a section chooses."""
+        return str(getattr(getattr(self, section), SECTIONS[section].choice))
+
+    def backend(self, section: str) -> tuple[Any, Any]:
+        """The module of the backend that a section chooses, and its options, None where it has none.
+
+        Raises ConfigError: unknown name or option; DependencyError for one whose packages are not installed.
+        """
+        name = self.chosen(section)
+        module = registry.load(SECTIONS[section].folder, name)
+        return module, registry.build_options(module, self.given(section, name), f"{section}.{name}.")
+
+    def load_backend(self, section: str, *arguments: Any) -> Any:
+        """The backend that a section chooses, made with its own options and with what else its kind takes."""
+        module, options = self.backend(section)
+        return module.load(*arguments) if options is None else module.load(options, *arguments)
+
+    def given(self, section: str, name: str) -> dict[str, Any]:
+        """What is given for a backend."""
+        return self.backends.get(section, {}).get(name, {})
+
+    def to_dict(self) -> dict[str, dict[str, Any]]:
+        """Plain values as in a file: every option of the stages and of the backends that are chosen or given."""
+        plain: dict[str, dict[str, Any]] = {}
+        for name, section in SECTIONS.items():
+            values = getattr(self, name).to_dict()
+            if section.within:
+                plain[section.within][name] = values
+                continue
+            plain[name] = values
+            if section.folder:
+                plain[name] |= self._backends_of(name)
+        return plain
+
+    def _backends_of(self, section: str) -> BackendValues:
+        """The options of a section's backends that are chosen or given; of all where the choice is left open."""
+        folder, chosen, given = SECTIONS[section].folder, self.chosen(section), self.backends.get(section, {})
+        names = dict.fromkeys([*(registry.backends(folder) if chosen == "auto" else [chosen]), *given])
+        found: BackendValues = {}
+        for name in names:
+            defaults = {option.name: option.default for option in registry.backend(folder, name).options}
+            if defaults:
+                found[name] = {**defaults, **given.get(name, {})}
+        return found
 
 
-def load(path: Path | None, overrides: Iterable[str] = ()) -> Config:
+def load(path: Path | None, overrides: Iterable[str] = ()) -> Settings:
     """The configuration of a YAML file or of a preset (``mono``), or the defaults, with overrides applied.
 
     path: None = the defaults.  overrides: ``section.key=value``.
-    Raises ConfigError: unreadable or invalid YAML, unknown key, wrong type, malformed override.
+    Raises ConfigError: unreadable or invalid YAML, unknown key, a value of another type or out of its range, malformed
+    override.
     """
-    values: dict[str, Any] = {}
+    values: dict[Any, Any] = {}
     if path is not None:
         path = find_preset(path)
+        values = read_yaml(path)
         try:
-            loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise ConfigError(f"Cannot read the configuration {path}: {error.strerror}.") from error
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
-        if loaded is not None and not isinstance(loaded, dict):
-            raise ConfigError(f"{path} must hold sections such as 'tracking:', not a {type(loaded).__name__}.")
-        values = loaded or {}
-        try:
-            resolve(values)
+            resolved = resolve(values)
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from error
+        if not (overrides := list(overrides)):
+            return resolved
     for override in overrides:
-        _apply(values, override)
+        apply_override(values, override)
     return resolve(values)
 
 
-def resolve(values: Mapping[str, Any]) -> Config:
-    """``values`` checked and with all defaults filled in. Raises ConfigError."""
-    for section in values:
-        if section not in SECTIONS:
-            raise ConfigError(f"Unknown section '{section}'{registry.nearest(section, SECTIONS)}.")
-    config: Config = {}
-    for section, (module, folder) in SECTIONS.items():
-        given = values.get(section) or {}
-        if not isinstance(given, dict):
-            raise ConfigError(f"Section '{section}' must hold 'key: value' lines, got {given!r}.")
-        options = {option.name: option for option in registry.options_of(module)}
-        backends = _subsections(section, folder)
-        own = {key: value for key, value in given.items() if key not in backends}
-        known = {**options, **{name: Option(name, "dict", {}, "") for name in backends}}
-        for key in own:
-            if key not in options:
-                raise ConfigError(f"Unknown key '{section}.{key}'{registry.nearest(key, known)}.")
-        config[section] = registry.check(options, own, f"{section}.")
-        for name, backend in backends.items():
-            sub = given.get(name) or {}
-            if not isinstance(sub, dict):
-                raise ConfigError(f"'{section}.{name}' must hold 'key: value' lines, got {sub!r}.")
-            if backend.options:
-                fields = {option.name: option for option in backend.options}
-                config[section][name] = registry.check(fields, sub, f"{section}.{name}.")
-            elif sub:
-                raise ConfigError(f"'{section}.{name}' has no options, got {', '.join(map(str, sub))}.")
-    return config
+def load_saved(path: Path, overrides: Iterable[str] = ()) -> Settings:
+    """The configuration that a map was made with, as ``load``.
+
+    It was checked then: what it says of backends that it does not choose is left out, and what it says of those that it
+    chooses is checked when they are used.
+    """
+    try:
+        saved = _resolve(read_yaml(path), saved=True)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    values: dict[Any, Any] = {}
+    for override in overrides:
+        apply_override(values, override)
+    changed = {section: {**saved.to_dict()[section], **_section(values, section)} for section in values}
+    return saved if not values else resolve({**saved.to_dict(), **changed})
 
 
-def options(config: Config, section: str) -> dict[str, Any]:
-    """The section's own keys, without its backends'."""
-    names = {option.name for option in registry.options_of(SECTIONS[section][0])}
-    return {key: value for key, value in config[section].items() if key in names}
+def resolve(values: Mapping[str, Any] | Settings) -> Settings:
+    """``values``, checked, with all defaults filled in. Raises ConfigError."""
+    return values if isinstance(values, Settings) else _resolve(values, saved=False)
 
 
-def dump(config: Config) -> str:
+def dump(settings: Settings) -> str:
     """Resolved YAML; ``load`` of it gives the same configuration back."""
-    plain = json.loads(json.dumps(config))  # tuples become lists
+    plain = json.loads(json.dumps(settings.to_dict()))  # tuples become lists
     return yaml.safe_dump(plain, sort_keys=False)
 
 
-def documented() -> str:
-    """YAML with every key, its default and what it does: what ``configs/default.yaml`` holds."""
-    lines = ["# Every option with its default. A file of your own needs only the keys that it changes."]
-    for section, (module, folder) in SECTIONS.items():
-        lines += ["", f"{section}:"]
-        for option in registry.options_of(module):
-            lines += _documented(option, indent=2)
-        for name, backend in _subsections(section, folder).items():
-            if backend.options:
-                lines.append(f"  {name}:  # {backend.summary}")
-                for option in backend.options:
-                    lines += _documented(option, indent=4)
-    return "\n".join(lines) + "\n"
-
-
-def _subsections(section: str, folder: str | None) -> dict[str, registry.Backend]:
-    """What has keys of its own in a section: its backends, and what is nested in it."""
-    nested = {name: registry.described(*module.rsplit(".", 1)) for name, module in NESTED.get(section, {}).items()}
-    return {**(registry.backends(folder) if folder else {}), **nested}
-
-
-def _documented(option: Option, indent: int) -> list[str]:
-    value = json.dumps(option.default)
-    comment = textwrap.wrap(option.doc, 118 - indent)
-    return [" " * indent + f"# {line}" for line in comment] + [" " * indent + f"{option.name}: {value}"]
-
-
-def fingerprint(config: Config, sections: Iterable[str]) -> str:
-    """A hash of some sections: a saved stage is reused only while it is unchanged."""
-    text = json.dumps({name: config[name] for name in sections}, sort_keys=True)
+def fingerprint(settings: Settings, sections: Iterable[str], *identity: Any) -> str:
+    """A hash of some sections and of what else a saved stage depends on: it is reused only while that is unchanged."""
+    plain = settings.to_dict()
+    text = json.dumps([{name: plain[name] for name in sections}, identity], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _apply(values: dict[str, Any], override: str) -> None:
-    name, separator, text = override.partition("=")
-    keys = name.strip().split(".")
-    if not separator or len(keys) < 2 or not all(keys):
-        raise ConfigError(f"An override reads section.key=value, got '{override}'.")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"The value in '{override}' is not valid YAML.") from error
-    node = values
-    for key in keys[:-1]:
-        child = node.get(key)
-        if child is None:
-            child = node[key] = {}
-        if not isinstance(child, dict):
-            raise ConfigError(f"'{override}' does not fit: '{key}' holds a value, not a section.")
-        node = child
-    node[keys[-1]] = value
+def _resolve(values: Mapping[Any, Any], saved: bool) -> Settings:
+    """saved: of a map's file, whose earlier names are no concern of the user's."""
+    outer = [name for name, section in SECTIONS.items() if not section.within]
+    for name in values:
+        if name not in outer:
+            raise ConfigError(f"Unknown section '{name}'{nearest(name, outer)}.")
+    found: dict[str, Any] = {"backends": {}}
+    for name in outer:
+        section, where = SECTIONS[name], f"{name}."
+        given = renamed.current_keys(_section(values, name), where, warn=not saved)
+        nested = [inner for inner, other in SECTIONS.items() if other.within == name]
+        for inner in nested:
+            below = renamed.current_keys(_lines(given.pop(inner, None), where + inner), f"{where}{inner}.", not saved)
+            found[inner] = build(SECTIONS[inner].options, below, f"{where}{inner}.")
+        own, backends = _divided(name, given, nested, warn=not saved)
+        if section.choice and isinstance(own.get(section.choice), str):
+            current = renamed.current_backend(section.folder, own[section.choice])
+            if not saved:
+                named = f"{where}{section.choice}="
+                renamed.warn_if_renamed(named + own[section.choice], named + current)
+            own[section.choice] = current
+        found[name] = build(section.options, own, where)
+        if saved and section.choice:
+            chosen = getattr(found[name], section.choice)
+            backends = {backend: lines for backend, lines in backends.items() if chosen in (backend, "auto")}
+        elif backends:
+            backends = {backend: _checked(name, backend, lines) for backend, lines in backends.items()}
+        if backends := {backend: lines for backend, lines in backends.items() if lines}:
+            found["backends"][name] = backends
+    return Settings(**found)
+
+
+def _divided(name: str, given: dict[Any, Any], nested: list[str], warn: bool) -> tuple[dict[Any, Any], BackendValues]:
+    """A section's own options, and what it gives for its backends. Raises ConfigError for a key that is neither."""
+    section, own, backends = SECTIONS[name], {}, {}
+    known = field_types(section.options)
+    for key, value in given.items():
+        backend = renamed.current_backend(section.folder, key)
+        if key in known:
+            own[key] = value
+        elif section.folder and registry.is_backend(section.folder, str(backend)):
+            if warn:
+                renamed.warn_if_renamed(f"{name}.{key}", f"{name}.{backend}")
+            where = f"{name}.{backend}"
+            backends[backend] = renamed.current_keys(_lines(value, where), f"{where}.", warn)
+        else:
+            others = registry.backends(section.folder) if section.folder else ()
+            raise ConfigError(f"Unknown key '{name}.{key}'{nearest(key, [*known, *nested, *others])}.")
+    return own, backends
+
+
+def _checked(section: str, name: str, values: dict[str, Any]) -> dict[str, Any]:
+    """What is given for a backend and is not the default, checked by the backend's class, or by its options' names
+    alone where its packages are not installed. Raises ConfigError."""
+    folder, where = SECTIONS[section].folder, f"{section}.{name}."
+    backend = registry.backend(folder, name)
+    defaults = {option.name: json.dumps(option.default) for option in backend.options}
+    values = {key: value for key, value in values.items() if json.dumps(value, default=str) != defaults.get(key)}
+    if not values:
+        return {}
+    if backend.missing:
+        registry.check_names(backend, values, where)
+        return values
+    options = registry.build_options(registry.load(folder, name), values, where)
+    return {key: getattr(options, key) for key in values}
+
+
+def _section(values: Mapping[Any, Any], name: str) -> dict[Any, Any]:
+    given = values.get(name) or {}
+    if not isinstance(given, dict):
+        raise ConfigError(f"Section '{name}' must hold 'key: value' lines, got {given!r}.")
+    return given
+
+
+def _lines(given: Any, where: str) -> dict[Any, Any]:
+    if not isinstance(given or {}, dict):
+        raise ConfigError(f"'{where}' must hold 'key: value' lines, got {given!r}.")
+    return given or {}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..core.errors import ConfigError
-from .registry import nearest
+from .typed_options import nearest
 
 FOLDER = Path(__file__).parent / "preset_files"
 _ABLATIONS = "ablations"

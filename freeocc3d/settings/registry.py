@@ -1,27 +1,28 @@
-"""Lists the backends of a folder without importing them, loads one by name, and reads what its options are.
+"""Lists the backends of a folder without importing them, loads one by name, and makes its options.
 
 A backend is one file. Its docstring's first line says what it does; ``REQUIRES`` names the packages that it imports
-beyond the core ones; ``Options`` is a frozen dataclass whose fields each carry a docstring. All of that is read from
-the syntax tree, so that listing is instant and works where a backend's packages are not installed.
+beyond the core ones; ``Options``, if it has any, is a class of ``typed_options`` whose fields each carry a docstring.
+All of that is read from the syntax tree, so that listing is instant and works where a backend's packages are not
+installed. Another package adds a backend by an entry point, whose name is the backend's and whose value is the module:
+group "freeocc3d.encoders", or the same with readers, trackers, rasterizers or exporters.
 """
 
 from __future__ import annotations
 
 import ast
-import contextlib
-import difflib
 import functools
 import importlib
 import importlib.util
-import itertools
-import math
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..core.errors import ConfigError, DependencyError
+from . import renamed, syntax_trees
+from .syntax_trees import Option
+from .typed_options import build, nearest
 
 PACKAGE = Path(__file__).parents[1]
 
@@ -36,21 +37,12 @@ FOLDERS = {
 
 
 @dataclass(frozen=True)
-class Option:
-    """One documented option: its name, annotation as written, default and docstring."""
-
-    name: str
-    type: str
-    default: Any
-    doc: str
-
-
-@dataclass(frozen=True)
 class Backend:
-    """What the syntax tree of a backend's file says of it."""
+    """What the syntax tree of a backend's file says of it. module: the file's dotted name."""
 
     folder: str
     name: str
+    module: str
     summary: str
     requires: tuple[str, ...]
     options: tuple[Option, ...]
@@ -62,24 +54,23 @@ class Backend:
 
 
 @functools.cache
-def options_of(module: str) -> tuple[Option, ...]:
-    """The fields of the ``Options`` dataclass of a module of this package, for example ``"tracking.rgbd"``."""
-    return _options(_tree(module))
-
-
-@functools.cache
 def backends(folder: str) -> dict[str, Backend]:
-    """The backends of ``folder`` (a key of FOLDERS) by name, sorted; nothing is imported."""
-    found = {}
-    for path in sorted(PACKAGE.joinpath(*folder.split(".")).glob("*.py")):
-        if any(_assigned(node, "REQUIRES") for node in _tree(f"{folder}.{path.stem}").body):
-            backend = described(folder, path.stem)
-            found[backend.name] = backend
-    return found
+    """The backends of ``folder`` (a key of FOLDERS) by name, sorted; those of other packages follow. A name that this
+    package has is its own. Nothing is imported."""
+    stems = sorted(path.stem for path in PACKAGE.joinpath(*folder.split(".")).glob("*.py"))
+    own = {stem.rstrip("_"): f"freeocc3d.{folder}.{stem}" for stem in stems}
+    found = {name: backend for name, module in own.items() if (backend := _described(folder, name, module))}
+    others = {name: _described(folder, name, module) for name, module in sorted(_added_elsewhere(folder).items())}
+    return {**found, **{name: backend for name, backend in others.items() if backend and name not in found}}
 
 
 def backend(folder: str, name: str) -> Backend:
-    """One of a folder's, which is not imported. Raises ConfigError for an unknown name, naming the nearest."""
+    """One of a folder's, also by an earlier name; it is not imported. Raises ConfigError for an unknown name, naming
+    the nearest."""
+    name = renamed.current_backend(folder, name)
+    found = _own(folder, name)
+    if found is not None:
+        return found
     known = backends(folder)
     if name not in known:
         raise ConfigError(f"Unknown {FOLDERS[folder]} '{name}'{nearest(name, known)}; there are: {', '.join(known)}.")
@@ -99,115 +90,66 @@ def folder_of(kind: str) -> str:
     return names[kind]
 
 
-def described(folder: str, stem: str) -> Backend:
-    """What the file ``stem`` of ``folder`` says of itself; nothing is imported."""
-    tree = _tree(f"{folder}.{stem}")
-    requires = next((ast.literal_eval(node.value) for node in tree.body if _assigned(node, "REQUIRES")), ())  # type: ignore[attr-defined]
-    summary = (ast.get_docstring(tree) or "").split("\n", 1)[0]
-    return Backend(folder, stem.rstrip("_"), summary, requires, _options(tree))
-
-
 def load(folder: str, name: str) -> types.ModuleType:
     """Import the backend ``name`` of ``folder``.
 
     Raises ConfigError for an unknown name (naming the nearest), DependencyError if a required package is missing.
     """
-    if missing := backend(folder, name).missing:
+    found = backend(folder, name)
+    if missing := found.missing:
         raise DependencyError(f"The {FOLDERS[folder]} '{name}' needs {', '.join(missing)}: pip install them first.")
-    return importlib.import_module(f"freeocc3d.{folder}.{name}")
+    return importlib.import_module(found.module)
 
 
-def build_options(module: types.ModuleType, values: Mapping[str, Any]) -> Any:
-    """The module's ``Options`` made from plain values, after ``check``."""
-    checked = check(_options_by_name(module.__name__.removeprefix("freeocc3d.")), values, where="")
-    return module.Options(**checked)
+def build_options(module: types.ModuleType, values: Mapping[str, Any], where: str = "") -> Any:
+    """The module's ``Options`` made of plain values, None where it has none. where: what stands before a key in
+    messages. Raises ConfigError: an unknown key, a value of another type or out of its range."""
+    options = getattr(module, "Options", None)
+    if options is not None and options.__module__ == module.__name__:  # else it is another file's, imported
+        return build(options, values, where)
+    if values:
+        raise ConfigError(f"'{where.rstrip('.')}' has no options, got {', '.join(map(str, values))}.")
+    return None
 
 
-def check(options: Mapping[str, Option], values: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """``values`` with defaults filled in and types checked; ``where`` is the dotted prefix used in messages.
+def is_backend(folder: str, name: str) -> bool:
+    """Whether a folder has a backend of that name, or had one."""
+    name = renamed.current_backend(folder, name)
+    return _own(folder, name) is not None or name in backends(folder)
 
-    Raises ConfigError on an unknown key (naming the nearest) or a value of the wrong type.
-    """
+
+def check_names(backend: Backend, values: Mapping[str, Any], where: str) -> None:
+    """Raises ConfigError for an option that a backend lacks, which is not imported."""
+    known = [option.name for option in backend.options]
     for key in values:
-        if key not in options:
-            raise ConfigError(f"Unknown key '{where}{key}'{nearest(key, options)}.")
-    return {
-        name: _checked(option, values[name], where) if name in values else option.default
-        for name, option in options.items()
-    }
+        if key not in known:
+            raise ConfigError(f"Unknown key '{where}{key}'{nearest(key, known)}.")
 
 
-def require_positive(options: Any, *names: str) -> None:
-    """Raise ConfigError unless the named fields of an ``Options`` (or None) are greater than zero."""
-    for name in names:
-        value = getattr(options, name)
-        if value is not None and not value > 0:
-            raise ConfigError(f"'{name}' must be greater than 0, got {value}.")
-
-
-def nearest(word: str, known: Iterable[str], least: float = 0.5) -> str:
-    """``" (did you mean 'x'?)"`` for the closest known word, or an empty string. least: of difflib's ratio, 0…1."""
-    close = difflib.get_close_matches(str(word), list(known), n=1, cutoff=least)
-    return f" (did you mean '{close[0]}'?)" if close else ""
-
-
-def _options_by_name(module: str) -> dict[str, Option]:
-    return {option.name: option for option in options_of(module)}
+def _own(folder: str, name: str) -> Backend | None:
+    """This package's own backend of that name, if there is one; the other files of its folder are not read."""
+    for stem in (name, f"{name}_"):
+        if name.isidentifier() and PACKAGE.joinpath(*folder.split("."), f"{stem}.py").is_file():
+            return _described(folder, name, f"freeocc3d.{folder}.{stem}")
+    return None
 
 
 @functools.cache
-def _tree(module: str) -> ast.Module:
-    return ast.parse(PACKAGE.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
+def _described(folder: str, name: str, module: str) -> Backend | None:
+    """What a module says of itself; None for one that is no backend, as it names no requirements."""
+    try:
+        requires = syntax_trees.assigned_value(module, "REQUIRES")
+    except FileNotFoundError:
+        return None
+    if requires is None:
+        return None
+    summary, options = syntax_trees.summary_of(module), syntax_trees.options_of(module)
+    return Backend(folder, name, module, summary, tuple(ast.literal_eval(requires)), options)
 
 
-def _assigned(node: ast.stmt, name: str) -> bool:
-    if isinstance(node, ast.AnnAssign):
-        return isinstance(node.target, ast.Name) and node.target.id == name
-    return isinstance(node, ast.Assign) and any(isinstance(t, ast.Name) and t.id == name for t in node.targets)
+def _added_elsewhere(folder: str) -> dict[str, str]:
+    """Name -> module of the backends that installed packages add to a folder."""
+    from importlib.metadata import entry_points  # takes a tenth of a second, and is for listing and unknown names
 
-
-def _options(tree: ast.Module) -> tuple[Option, ...]:
-    body = next((n.body for n in tree.body if isinstance(n, ast.ClassDef) and n.name == "Options"), [])
-    options = []
-    for node, after in itertools.zip_longest(body, body[1:]):
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value is not None:
-            is_doc = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
-            doc = " ".join(str(after.value.value).split()) if is_doc else ""  # type: ignore[union-attr]
-            options.append(Option(node.target.id, ast.unparse(node.annotation), ast.literal_eval(node.value), doc))
-    return tuple(options)
-
-
-def _checked(option: Option, value: Any, where: str) -> Any:
-    for kind in option.type.split(" | "):
-        fits, converted = _fit(kind, value)
-        if fits:
-            return converted
-    with contextlib.suppress(TypeError, ValueError, OverflowError):
-        if not math.isfinite(float(value)):
-            raise ConfigError(f"'{where}{option.name}' must be a finite number, got {value}.")
-    raise ConfigError(f"'{where}{option.name}' must be {option.type}, got {value!r} ({type(value).__name__}).")
-
-
-def _fit(kind: str, value: Any) -> tuple[bool, Any]:
-    if kind == "None":
-        return value is None, None
-    if kind == "bool":
-        return isinstance(value, bool), value
-    if kind == "int":
-        return isinstance(value, int) and not isinstance(value, bool), value
-    if kind == "float":
-        if isinstance(value, str):  # YAML 1.1 takes 1e-4, without a point, for a word
-            with contextlib.suppress(ValueError):
-                value = float(value)
-        is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        return is_number, float(value) if is_number else value
-    if kind == "str":
-        return isinstance(value, str), value
-    if kind.startswith("tuple["):
-        inner = kind.removeprefix("tuple[").removesuffix("]").split(", ")
-        if not isinstance(value, list | tuple):
-            return False, value
-        kinds = inner[:1] * len(value) if inner[1:] == ["..."] else inner
-        fitted = [_fit(k, v) for k, v in zip(kinds, value, strict=False)]
-        return len(kinds) == len(value) and all(ok for ok, _ in fitted), tuple(v for _, v in fitted)
-    raise ConfigError(f"The option type '{kind}' is not supported.")
+    group = f"freeocc3d.{FOLDERS[folder].split()[-1]}s"
+    return {point.name: point.module for point in entry_points(group=group)}

@@ -26,7 +26,7 @@ from ..core.transforms import is_rigid
 from ..core.tum_files import read_tum
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, Trajectory
 from ..language.feature_codec import Codec, CodedFeatures
-from ..settings import registry
+from ..settings import registry, typed_options
 from .manifest import MANIFEST, check_manifest
 
 if TYPE_CHECKING:
@@ -254,7 +254,7 @@ class Map:
         """What a question finds, in the places that are asked for."""
         from ..query import conditions, word_query
 
-        checked: Options = registry.build_options(word_query, options)
+        checked = typed_options.build(word_query.Options, options)
         if where is None:
             return ask(checked)
         every = replace(checked, top_k=max(len(self.occupancy.colors), 1))

@@ -20,7 +20,7 @@ from ..core.types import Gaussians
 from ..core.warnings import Notice, read_notices
 from ..gaussians.point_cloud import read_gaussian_ply, write_gaussian_ply
 from ..settings import config
-from ..settings.config import Config
+from ..settings.config import Settings
 from . import store
 
 STAGES = {
@@ -82,7 +82,7 @@ class WorkFolder:
         return cls.open(output, overwrite, resume=False)
 
     @contextlib.contextmanager
-    def writing(self, output: Path, identity: list[Any], settings: Config) -> Iterator[Path]:
+    def writing(self, output: Path, identity: list[Any], settings: Settings) -> Iterator[Path]:
         """The folder, in which the configuration stands; what is written to it inside is the map ``output`` afterwards,
         and gone where that fails. Raises MapError where nothing can be written."""
         try:
@@ -96,13 +96,12 @@ class WorkFolder:
                 raise MapError(f"Cannot write {output}: {error.strerror}.") from error
             raise
 
-    def begin(self, identity: list[Any], settings: Config) -> None:
+    def begin(self, identity: list[Any], settings: Settings) -> None:
         """Make the folder, and decide which saved stages are still valid for this configuration and for what
         ``identity`` says of the input. Raises MapError, and touches nothing, if a resumed run was another's."""
-        relevant = {**settings, "identity": {"of": identity}}
-        relevant["capture"] = {key: value for key, value in settings["capture"].items() if key != "max_broken"}
+        relevant = settings.changed("capture", max_broken=0.0)  # a run may go on with another
         self._fingerprints = {
-            stage: config.fingerprint(relevant, (*sections, "identity")) for stage, sections in STAGES.items()
+            stage: config.fingerprint(relevant, sections, identity) for stage, sections in STAGES.items()
         }
         if self.resumed:
             try:

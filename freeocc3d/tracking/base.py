@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 from ..core.progress import Progress
 from ..core.types import Frame, Submap, Trajectory
 from ..core.warnings import Notice
+from ..settings.option_types import Positive
+from ..settings.typed_options import TypedOptions
 from .pose_graph import Edge, edges_to_arrays
 from .records import Records
 
 
-@dataclass(frozen=True)
-class Options:
-    """Layer 1."""
+class KeyframeOptions(TypedOptions, frozen=True):
+    """Which frames become keyframes."""
 
-    backend: str = "rgbd"
-    """Where poses come from: "rgbd" estimates them from colour and depth, "colmap" from colour alone, "known" takes the
-    capture's own, "file" those of another system."""
+    keyframe_overlap: Positive = 0.85
+    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
 
 
 @dataclass(frozen=True)

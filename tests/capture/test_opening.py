@@ -4,6 +4,7 @@ import subprocess
 import sys
 import types
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from helpers import data_folder, depth_image, write_image, write_replica, write_
 
 from freeocc3d.capture import Options, check_depth_scale, open_capture, select_frames
 from freeocc3d.core.errors import CaptureError, ConfigError
-from freeocc3d.settings import registry
+from freeocc3d.settings import config, registry
 
 
 @pytest.mark.parametrize(
@@ -68,29 +69,30 @@ def test_a_format_that_does_not_fit_says_what_is_missing(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "options",
+    "given",
     [
-        Options(max_depth=0.0),
-        Options(depth_scale=0.0),
-        Options(max_broken=1.5),
-        Options(stride=0),
-        Options(start=-1),
+        {"max_depth": 0.0},
+        {"depth_scale": 0.0},
+        {"max_broken": 1.5},
+        {"stride": 0},
+        {"start": -1},
+        {"scale": 0.0},
+        {"max_size": 2},
+        {"color_focal": 3.0},
+        {"intrinsics": (585.0, 0.0, 320.0, 240.0)},
     ],
 )
-def test_options_out_of_range(tmp_path: Path, options: Options) -> None:
-    write_seven_scenes(tmp_path, 1)
-    with pytest.raises(ConfigError, match=r"capture\."):
-        open_capture(tmp_path, options)
+def test_options_out_of_range(given: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=rf"'capture\.{next(iter(given))}' must be"):
+        config.resolve({"capture": given})
+    with pytest.raises(ConfigError, match=f"'{next(iter(given))}' must be"):
+        Options(**given)
 
 
 def test_a_builtin_path_goes_to_the_synthetic_reader_with_its_own_options(monkeypatch: pytest.MonkeyPatch) -> None:
-    option = registry.Option("frames", "int", 100, "")
     fake = types.SimpleNamespace(Reader=lambda *arguments: arguments)
     monkeypatch.setattr(registry, "load", lambda folder, name: fake if name == "synthetic" else None)
-    monkeypatch.setattr(
-        registry, "backends", lambda folder: {"synthetic": registry.Backend(folder, "synthetic", "", (), (option,))}
-    )
-    monkeypatch.setattr(registry, "build_options", lambda module, values: values)
+    monkeypatch.setattr(registry, "build_options", lambda module, values, where: values)
     options = Options(stride=2)
     opened = open_capture("builtin:room", options, {"synthetic": {"frames": 7}, "other": {}})
     assert opened == (Path("builtin:room"), options, {"frames": 7})

@@ -201,7 +201,7 @@ def test_a_camera_that_only_turns_measures_nothing(tmp_path: Path) -> None:
         _source(Colour(), tmp_path, range(8), turned)
 
 
-@pytest.mark.parametrize("given", [{"size": 10}, {"neighbours": 0}, {"agreeing": 0}])
+@pytest.mark.parametrize("given", [{"size": 10}, {"neighbors": 0}, {"agreeing": 0}])
 def test_options_out_of_range(given) -> None:
     with pytest.raises(ConfigError):
         multi_view_stereo.Options(**given)

@@ -12,7 +12,7 @@ from freeocc3d.core.errors import MapError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import FREE
 from freeocc3d.editing import box_refinement
-from freeocc3d.language.encoders import colour
+from freeocc3d.language.encoders import color
 from freeocc3d.occupancy.connected_components import label_components
 from freeocc3d.pipeline import run as pipeline
 from freeocc3d.storage.store import Map
@@ -106,7 +106,7 @@ def test_boxes_that_cannot_be_refined(room: Map, tmp_path: Path) -> None:
 @pytest.mark.parametrize("needed", [False, True])
 def test_a_map_that_has_moved_to_another_machine(room: Map, needed: bool, tmp_path: Path, monkeypatch) -> None:
     """Colours are found in the keyframes; where an encoder needs the capture, features are the map's own."""
-    monkeypatch.setattr(colour, "NEEDS_CAPTURE", needed)
+    monkeypatch.setattr(color, "NEEDS_CAPTURE", needed)
     told = []
     progress = Progress()
     progress.warn = told.append  # type: ignore[method-assign]

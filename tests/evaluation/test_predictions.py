@@ -53,7 +53,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def of_room(room: Any, alignment: TrajectoryAlignment, truth: GroundTruth) -> NDArray[np.bool_]:
-    settings = config.load(room.path / "config.yaml")
+    settings = config.load_saved(room.path / "config.yaml")
     return predictions.predict_from_map(room, settings, alignment, truth, NO_CLASSES)[0].occupied
 
 

@@ -152,7 +152,7 @@ def test_options_out_of_range_are_refused(wrong) -> None:
 
 def test_isotropic_gaussians_are_spheres_of_their_neighbours_distance() -> None:
     frames, poses = walls(1)
-    g = lifted(frames, poses, initialisation="isotropic")
+    g = lifted(frames, poses, initialization="isotropic")
     assert (g.scales == g.scales[:, :1]).all()
     inner = np.abs(g.means[:, :2]).max(axis=1) < 0.5
     assert np.median(g.scales[inner]) == pytest.approx(0.04, rel=0.2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -110,7 +110,7 @@ def window(grid: tuple[int, int]) -> torch.Tensor:
     return added
 
 
-@pytest.mark.parametrize("attention", clip.ATTENTIONS)
+@pytest.mark.parametrize("attention", get_args(clip.Attention))
 @pytest.mark.parametrize("size", [(32, 32), (40, 56)])
 def test_dense_features_equal_plain_pytorch(folder: Path, attention: str, size: tuple[int, int]) -> None:
     made = encoder(folder, attention=attention, short_side=min(size), window=0, stride=0)

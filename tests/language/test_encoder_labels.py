@@ -100,7 +100,7 @@ def test_sixteen_bit_class_images_with_many_classes(tmp_path: Path) -> None:
 
 
 def test_a_capture_without_class_images_says_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match=r"language\.labels\.folder.*encoder=colour"):
+    with pytest.raises(CaptureError, match=r"language\.labels\.folder.*encoder=color"):
         load(Options(), scan(tmp_path))
 
 

@@ -14,14 +14,13 @@ from helpers import data_folder, truncate, write_scannet, write_seven_scenes
 from vision_servers import saying, serving
 
 import freeocc3d
-from freeocc3d.capture import base as capture_base
 from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, Interrupted, MapError, TrackingError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import FREE, OCCUPIED
 from freeocc3d.core.warnings import Notice, read_notices
 from freeocc3d.pipeline import stages
-from freeocc3d.settings import config, registry
+from freeocc3d.settings import config
 from freeocc3d.storage import store
 
 ROOM = {"capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "stop": 24}}
@@ -66,7 +65,7 @@ def test_the_rooms_poses_are_right(room) -> None:
 
 def _synthetic():
     settings = config.resolve(ROOM)
-    return registry.build_options(capture_base, config.options(settings, "capture")), settings["capture"]
+    return settings.capture, settings.backends["capture"]
 
 
 def test_means_on_file_are_their_anchors_at_the_files_poses(room) -> None:

@@ -72,7 +72,7 @@ def test_a_video_becomes_a_map_whose_scale_is_said_to_be_unknown_and_can_be_give
     assert scan_map.manifest["capture"]["format"] == "video"
     assert scan_map.manifest["scale"] == {"metric": False, "by": "none", "factor": 1.0}
     assert "scale-unknown" in codes(scan_map)
-    cell = config.load(scan_map.path / "config.yaml")["gaussians"]["cell_size"]
+    cell = config.load_saved(scan_map.path / "config.yaml").gaussians.cell_size
     assert cell == pytest.approx(0.01 * NOMINAL_DEPTH)
     assert np.median(scan_map.gaussians.scales[:, 0]) == pytest.approx(0.7 * cell, rel=1e-3)
     assert "intrinsics-unknown" not in codes(scan_map)
@@ -85,7 +85,7 @@ def test_with_a_scale_given_from_the_start_the_map_is_metric(scan: Path, tmp_pat
     scan_map = made(scan, tmp_path / "map", scale=UNIT_M)
     assert scan_map.manifest["scale"] == {"metric": True, "by": "given", "factor": UNIT_M}
     assert "scale-unknown" not in codes(scan_map)
-    assert config.load(scan_map.path / "config.yaml")["gaussians"]["cell_size"] is None
+    assert config.load_saved(scan_map.path / "config.yaml").gaussians.cell_size is None
     room = open_capture("builtin:room", None, ROOM)
     centers = scan_map.trajectory.T_world_cam[:, :3, 3]
     np.testing.assert_allclose(centers, [room.pose(index)[:3, 3] for index in range(60)], atol=1e-5)

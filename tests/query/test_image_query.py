@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from test_word_query import CUP, SOFA, box, feature, occupancy
 
 from freeocc3d.core.errors import FreeOccError
-from freeocc3d.language.encoders.colour import ColourEncoder, ColourWords
+from freeocc3d.language.encoders.color import ColorEncoder, ColorWords
 from freeocc3d.language.feature_codec import Codec, CodedFeatures
 from freeocc3d.query import image_query
 from freeocc3d.query.word_query import Options
 from freeocc3d.settings import config
 
-ENCODER = ColourEncoder()
+ENCODER = ColorEncoder()
 
 
 def picture(size: tuple[int, int] = (64, 48)) -> NDArray[np.uint8]:
@@ -30,7 +30,7 @@ def picture(size: tuple[int, int] = (64, 48)) -> NDArray[np.uint8]:
 
 
 def word(name: str) -> NDArray[np.float32]:
-    return ColourWords().encode_words([name]).features[0]
+    return ColorWords().encode_words([name]).features[0]
 
 
 def test_a_part_of_a_picture_is_what_it_shows() -> None:
@@ -70,7 +70,7 @@ def test_what_is_no_picture_and_what_says_nothing() -> None:
     with pytest.raises(FreeOccError, match=r"got float64 \(3, 3, 3\)"):
         image_query.patch_feature(ENCODER, np.zeros((3, 3, 3)))  # type: ignore[arg-type]
 
-    class Silent(ColourEncoder):
+    class Silent(ColorEncoder):
         def encode(self, frame: object) -> NDArray[np.float16]:
             return np.zeros((2, 2, 5), np.float16)
 

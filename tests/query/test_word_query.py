@@ -353,7 +353,7 @@ def test_results_do_not_depend_on_the_size_of_the_work_chunks(monkeypatch: pytes
 def test_importing_the_query_imports_nothing_heavy() -> None:
     code = (
         "import sys, freeocc3d.query.word_query; "
-        "import freeocc3d.language.encoders.colour, freeocc3d.language.encoders.labels; "
+        "import freeocc3d.language.encoders.color, freeocc3d.language.encoders.labels; "
         "print([m for m in ('scipy', 'numba', 'torch', 'open3d', 'cv2', 'typer') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

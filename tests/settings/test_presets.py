@@ -41,7 +41,7 @@ def test_a_file_comes_before_a_preset(tmp_path: Path, monkeypatch: pytest.Monkey
     (tmp_path / "mono").mkdir()
     assert find_preset("mono").name == "mono.yaml"  # a map's folder is no configuration
     (tmp_path / "rgbd").write_text("occupancy: {voxel_size: 0.05}\n")
-    assert config.load(Path("rgbd"))["occupancy"]["voxel_size"] == 0.05
+    assert config.load(Path("rgbd")).occupancy.voxel_size == 0.05
 
 
 def test_paths_are_left_as_they_are(tmp_path: Path) -> None:

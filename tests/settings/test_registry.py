@@ -4,38 +4,53 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from freeocc3d.core.errors import ConfigError, DependencyError
-from freeocc3d.settings import registry
-from freeocc3d.settings.registry import Option
+from freeocc3d.settings import registry, syntax_trees
+from freeocc3d.settings.option_types import converted, described
+from freeocc3d.settings.typed_options import TypedOptions, field_types
 
 FANCY = '''"""Does something fancy.
 
 At length."""
-from dataclasses import dataclass
+from typing import Literal
 
 import a_package_that_is_not_installed
+
+from freeocc3d.settings.option_types import Advanced, Finite, Positive
+from .shapes import Form, SizeOptions
 
 REQUIRES: tuple[str, ...] = ("a_package_that_is_not_installed", "numpy")
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(SizeOptions, frozen=True):
     """Its options."""
 
-    strength: float = 0.5
+    strength: Positive = 0.5
     """How much,
     over two lines."""
     name: str | None = None
-    sizes: tuple[int, ...] = (1, 2)
-    """Sizes."""
     required: int
-    offset: float = -1.5
+    offset: Advanced[Finite] = -1.5
     """Below zero."""
+    form: Form = "flat"
+    edge: Positive = 2.0
 '''
+
+
+SHAPES = """from typing import Literal
+
+Form = Literal["flat", "round"]
+
+
+class SizeOptions:
+    sizes: tuple[int, ...] = (1, 2)
+    \"\"\"Sizes.\"\"\"
+    edge: float = 1.0
+    \"\"\"Longest edge.\"\"\"
+"""
 
 
 @pytest.fixture
@@ -45,10 +60,12 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder.mkdir()
     (folder / "fancy.py").write_text(FANCY)
     (folder / "npz_.py").write_text('"""Arrays."""\nREQUIRES = ()\n')
+    (folder / "shapes.py").write_text(SHAPES)
     (folder / "base.py").write_text('"""The contract."""\nclass Options:\n    size: int = 1\n')
     (folder / "__init__.py").write_text("raise RuntimeError('imported')\n")
     monkeypatch.setattr(registry, "PACKAGE", tmp_path)
-    caches = registry.backends, registry.options_of, registry._tree
+    monkeypatch.setattr(syntax_trees, "_PACKAGE", tmp_path)
+    caches = registry.backends, registry._described, syntax_trees.options_of, syntax_trees.tree_of
     for cache in caches:
         cache.cache_clear()
     yield tmp_path
@@ -78,12 +95,14 @@ def test_a_backend_is_described_by_its_file(package: Path) -> None:
     assert fancy.summary == "Does something fancy."
     assert fancy.requires == ("a_package_that_is_not_installed", "numpy")
     assert fancy.missing == ("a_package_that_is_not_installed",)
-    assert fancy.options == (
-        Option("strength", "float", 0.5, "How much, over two lines."),
-        Option("name", "str | None", None, ""),
-        Option("sizes", "tuple[int, ...]", (1, 2), "Sizes."),
-        Option("offset", "float", -1.5, "Below zero."),
-    )
+    assert [(o.name, o.type, o.default, o.doc, o.advanced) for o in fancy.options] == [
+        ("sizes", "a list of whole numbers", (1, 2), "Sizes.", False),
+        ("edge", "a number greater than 0", 2.0, "Longest edge.", False),
+        ("strength", "a number greater than 0", 0.5, "How much, over two lines.", False),
+        ("name", "text or null", None, "", False),
+        ("offset", "a number", -1.5, "Below zero.", True),
+        ("form", "flat or round", "flat", "", False),
+    ]
     assert found["npz"].options == ()
     assert found["npz"].missing == ()
 
@@ -116,13 +135,39 @@ def test_a_missing_package_is_named_before_the_backend_is_imported(package: Path
         registry.load("export", "fancy")
 
 
-def test_every_option_of_every_backend_is_documented_and_of_a_known_type() -> None:
-    for folder in registry.FOLDERS:
-        for backend in registry.backends(folder).values():
-            assert backend.summary, backend
-            for option in backend.options:
-                assert option.doc, f"{folder}.{backend.name}: {option.name} has no docstring"
-                registry.check({option.name: option}, {option.name: option.default}, where="")
+BACKENDS = [(folder, name) for folder in registry.FOLDERS for name in registry.backends(folder)]
+
+
+@pytest.mark.parametrize(("folder", "name"), BACKENDS)
+def test_every_option_of_every_backend_is_documented_and_its_default_fits(folder: str, name: str) -> None:
+    backend = registry.backend(folder, name)
+    assert backend.summary
+    for option in backend.options:
+        assert option.doc, f"{option.name} has no docstring"
+        assert not isinstance(option.kind, str), f"the type of {option.name} cannot be read: {option.kind}"
+        converted(option.kind, option.default, option.name)
+
+
+@pytest.mark.parametrize(("folder", "name"), BACKENDS)
+def test_the_syntax_tree_says_what_the_class_is(folder: str, name: str) -> None:
+    backend = registry.backend(folder, name)
+    if backend.missing:
+        pytest.skip(f"needs {backend.missing}")
+    options = registry.build_options(registry.load(folder, name), {})
+    if options is None:
+        assert backend.options == ()
+        return
+    assert isinstance(options, TypedOptions)
+    assert options.to_dict() == {option.name: option.default for option in backend.options}
+    types = field_types(type(options))
+    assert {option.name: option.type for option in backend.options} == {
+        option: described(kind) for option, kind in types.items()
+    }
+    numbers = [kind for kind in types.values() if "number" in described(kind)]
+    for kind in numbers:  # every number has a range, so that none can be infinite
+        for value in (float("inf"), [float("inf")] * 2):
+            with pytest.raises(ConfigError):
+                converted(kind, value, "x")
 
 
 def test_a_loaded_backend_and_its_options() -> None:
@@ -133,55 +178,13 @@ def test_a_loaded_backend_and_its_options() -> None:
         registry.build_options(module, {"keyframe_overlop": 0.5})
 
 
-def test_defaults_are_filled_in() -> None:
-    options = {"a": Option("a", "int", 3, ""), "b": Option("b", "str", "x", "")}
-    assert registry.check(options, {"b": "y"}, where="") == {"a": 3, "b": "y"}
+def test_options_of_a_backend_that_has_none() -> None:
+    module = registry.load("gaussians.rasterizers", "cpu")
+    assert registry.build_options(module, {}) is None
+    with pytest.raises(ConfigError, match=r"'fitting\.cpu' has no options, got device"):
+        registry.build_options(module, {"device": "cpu"}, "fitting.cpu.")
 
 
-@pytest.mark.parametrize(
-    ("kind", "value", "expected"),
-    [
-        ("int", 3, 3),
-        ("float", 2, 2.0),
-        ("bool", False, False),
-        ("str", "7", "7"),
-        ("int | None", None, None),
-        ("float | None", 1, 1.0),
-        ("str | tuple[int, ...]", [1, 2], (1, 2)),
-        ("tuple[float, float]", [1, 2.5], (1.0, 2.5)),
-        ("tuple[str, ...]", [], ()),
-    ],
-)
-def test_values_that_fit(kind: str, value: object, expected: object) -> None:
-    found = registry.check({"x": Option("x", kind, None, "")}, {"x": value}, where="")["x"]
-    assert found == expected
-    assert type(found) is type(expected)
-
-
-@pytest.mark.parametrize(
-    ("kind", "value"),
-    [
-        ("int", 3.0),
-        ("int", True),
-        ("int", "3"),
-        ("int", None),
-        ("float", True),
-        ("float", float("nan")),
-        ("float", float("inf")),
-        ("bool", 1),
-        ("str", 7),
-        ("tuple[float, float]", [1.0]),
-        ("tuple[float, float]", [1.0, 2.0, 3.0]),
-        ("tuple[int, ...]", [1, "2"]),
-        ("tuple[str, ...]", "abc"),
-    ],
-)
-def test_values_that_do_not_fit_are_refused_with_their_place(kind: str, value: object) -> None:
-    with pytest.raises(ConfigError, match=r"^'layer\.x' must be "):
-        registry.check({"x": Option("x", kind, None, "")}, {"x": value}, where="layer.")
-
-
-def test_options_of_a_module_that_is_no_backend(package: Path) -> None:
-    assert registry.options_of("export.base") == (Option("size", "int", 1, ""),)
-    module = SimpleNamespace(__name__="freeocc3d.export.base", Options=lambda **given: given)
-    assert registry.build_options(module, {}) == {"size": 1}  # type: ignore[arg-type]
+def test_options_that_a_reader_takes_from_elsewhere_are_not_its_own() -> None:
+    assert registry.backend("capture.readers", "replica").options == ()
+    assert registry.build_options(registry.load("capture.readers", "replica"), {}) is None

@@ -230,8 +230,8 @@ def test_optimising_twice_moves_nothing(bedroom) -> None:
 
 
 def test_options_out_of_range_are_refused() -> None:
-    with pytest.raises(ConfigError, match="neighbours"):
-        rgbd.Options(neighbours=0)
+    with pytest.raises(ConfigError, match="neighbors"):
+        rgbd.Options(neighbors=0)
 
 
 def test_one_wrong_closure_does_not_bend_a_real_path(bedroom) -> None:

@@ -43,7 +43,7 @@ EXPORTS: dict[str, tuple[str, str, dict[str, str]]] = {
 
 def measure_exports(capture: str) -> Figures:
     """Map a capture at 4 cm with its own poses, and class images if it has them, and export it."""
-    encoder = "labels" if (Path(capture) / "semantic_class").is_dir() else "colour"
+    encoder = "labels" if (Path(capture) / "semantic_class").is_dir() else "color"
     settings = (
         "tracking.backend=known",
         "fitting.passes=0",

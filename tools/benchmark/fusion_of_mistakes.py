@@ -89,12 +89,11 @@ class _Scene:
         from freeocc3d.core.types import OCCUPIED, UNKNOWN
         from freeocc3d.evaluation import scoring
         from freeocc3d.evaluation.ground_truth import load_ground_truth
-        from freeocc3d.language import lifting
-        from freeocc3d.occupancy import build, carve, splat
-        from freeocc3d.settings import config, registry
+        from freeocc3d.occupancy import build, splat
+        from freeocc3d.settings import config
 
-        settings = config.load(scan_map.path / "config.yaml")
-        self.options = registry.build_options(lifting, config.options(settings, "language"))
+        settings = config.load_saved(scan_map.path / "config.yaml")
+        self.options = settings.language
         self.truth = load_ground_truth(truth_path)
         self.classes = scoring.collect_common_classes([self.truth])
         self.words = scan_map.text_encoder.encode_words(list(self.truth.classes[1:]))
@@ -105,8 +104,8 @@ class _Scene:
             self.gaussians,
             np.zeros((len(self.gaussians), 0), np.float16),
             self.keyframes(),
-            registry.build_options(splat, {**settings["occupancy"], "voxel_size": self.truth.voxel_size}),
-            registry.build_options(carve, settings["carving"]),
+            settings.occupancy.changed(voxel_size=self.truth.voxel_size),
+            settings.carving,
             origin=self.truth.origin,
         )
         voxels = made.voxels(OCCUPIED)

@@ -46,20 +46,20 @@ def classes_found(scan_map: Any, truth_path: Path) -> Figures:
     """
     from freeocc3d.core.types import UNKNOWN, PosedFrame
     from freeocc3d.evaluation.ground_truth import load_ground_truth
-    from freeocc3d.occupancy import build, carve, splat
+    from freeocc3d.occupancy import build
     from freeocc3d.query import word_query
-    from freeocc3d.settings import config, registry
+    from freeocc3d.settings import config
 
     truth = load_ground_truth(truth_path)
-    settings = config.load(scan_map.path / "config.yaml")
+    settings = config.load_saved(scan_map.path / "config.yaml")
     poses = scan_map.trajectory.T_world_keyframe
     keyframes = (PosedFrame(f, T, row) for row, (f, T) in enumerate(zip(scan_map.keyframes, poses, strict=True)))
     occupancy = build.build_occupancy(
         scan_map.gaussians,
         scan_map.gaussian_features,
         keyframes,
-        registry.build_options(splat, {**settings["occupancy"], "voxel_size": truth.voxel_size}),
-        registry.build_options(carve, settings["carving"]),
+        settings.occupancy.changed(voxel_size=truth.voxel_size),
+        settings.carving,
         origin=truth.origin,
     )
     voxels = occupancy.occupied_voxels()

@@ -17,7 +17,8 @@ from ...core.depth_noise import compute_sensor_sigma
 from ...core.errors import CaptureError
 from ...core.transforms import back_project, invert
 from ...core.types import FREE, UNKNOWN, Frame, Intrinsics
-from ...settings.registry import require_positive
+from ...settings.option_types import NotNegativeInt, PositiveInt
+from ...settings.typed_options import TypedOptions
 from .. import base, builtin_room
 from ..camera_files import read_given_calibration
 
@@ -32,23 +33,19 @@ _EDGE = 0.05  # relative step of depth at which the sensor's two views disagree
 _GRAZING = 0.10, 0.22  # cosine of incidence at which every, and the first, pixel is lost
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(TypedOptions, frozen=True):
     """The walk and the camera."""
 
-    frames: int = 240
+    frames: PositiveInt = 240
     """Frames of one round through the room; fewer are a faster walk."""
-    width: int = 320
+    width: PositiveInt = 320
     """Image width, pixels."""
-    height: int = 240
+    height: PositiveInt = 240
     """Image height, pixels."""
     noise: bool = True
-    """Whether depth and colour are disturbed as by a sensor; false = exact."""
-    seed: int = 0
+    """Whether depth and color are disturbed as by a sensor; false = exact."""
+    seed: NotNegativeInt = 0
     """Seed of the noise."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "frames", "width", "height")
 
 
 @dataclass(frozen=True)

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from ...core.errors import DependencyError
 from ...core.types import Intrinsics
+from ...settings.typed_options import TypedOptions
 from .base import BLUR, NEAR, Rendered
 
 REQUIRES = ("gsplat",)
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(TypedOptions, frozen=True):
     """Where it runs."""
 
     device: str = "cuda:0"

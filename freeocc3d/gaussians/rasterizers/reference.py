@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from ...core.types import Intrinsics
+from ...settings.typed_options import TypedOptions
 from .base import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR, TRANSMITTANCE_MIN, Rendered, compute_slope_limits
 
 REQUIRES: tuple[str, ...] = ()
@@ -15,8 +14,7 @@ REQUIRES: tuple[str, ...] = ()
 _TILE = 16
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(TypedOptions, frozen=True):
     """Where it runs."""
 
     device: str = "cpu"

@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import ConfigError
 from ...core.types import Frame
 
 
@@ -79,13 +78,3 @@ class Encoder(ABC):
     def text_state(self) -> dict[str, Any]:
         """What ``load_text`` needs to restore the word side: numbers, strings, lists and dicts only (it is saved as
         YAML in the map's manifest)."""
-
-
-def require_sizes(short_side: int, window: int | None, stride: int) -> None:
-    """Raise ConfigError unless these options of an encoder that resizes frames are sizes that images have."""
-    if not 16 <= short_side <= 4096:
-        raise ConfigError(f"'short_side' must lie between 16 and 4096, got {short_side}.")
-    if window is not None and not 0 <= window <= 4096:
-        raise ConfigError(f"'window' must be 0 (the whole frame), or up to 4096, got {window}.")
-    if stride < 0:
-        raise ConfigError(f"'stride' must be at least 0, got {stride}.")

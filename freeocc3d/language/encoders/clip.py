@@ -2,61 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import ConfigError
 from ...core.types import Frame
+from ...settings.option_types import Advanced, Cosine
 from .. import model_packages
-from ..text_networks import CONTRAST, TEMPLATES, ModelWords, Wording
-from .base import Encoder, require_sizes
+from ..text_networks import ModelWords
+from .base import Encoder
+from .model_options import PatchOptions
 
 if TYPE_CHECKING:
     from ..patch_features import Tiling
 
 REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
 
-ATTENTIONS = ("plain", "maskclip", "sclip", "clearclip", "naclip")
+Attention = Literal["plain", "maskclip", "sclip", "clearclip", "naclip"]
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(PatchOptions, frozen=True):
     """Which model, and how its patches become features of pixels."""
 
     model: str = ""
     """Folder of a model package of kind "clip", or its name in the models folder (freeocc3d models list)."""
-    attention: str = "naclip"
-    """Last block's attention: "plain", "maskclip", "sclip", "clearclip" or "naclip", the best by the papers' tables."""
-    short_side: int = 336
-    """Frames are resized so that their shorter side has so many pixels."""
-    window: int | None = None
-    """Edge in pixels of windows that are encoded one by one, half overlapping; 0 = the whole frame at once; null = the
-    size of the model's training images."""
-    stride: int = 4
-    """Pixels of the frame from one feature to the next, upsampled from patches along the image's edges; 0 = patches."""
-    templates: tuple[str, ...] = ()
-    """Prompts whose mean stands for a word, which goes where they have {}; none = the built-in ones."""
-    contrast: tuple[str, ...] = ()
-    """Words that a voxel could be instead: a word matches only where none of them fits better; none = what most rooms
-    hold."""
-    threshold: float = 0.15
+    attention: Advanced[Attention] = "naclip"
+    """Attention of the last block; naclip is the best by the papers' tables."""
+    threshold: Cosine = 0.15
     """Least cosine of a match; those of CLIP's images and words lie between 0.1 and 0.35, SigLIP's from 0 to 0.2."""
-    device: str = "cpu"
-    """Where the image network runs: "cpu", or "cuda:0" with onnxruntime-gpu."""
-
-    def __post_init__(self) -> None:
-        if self.attention not in ATTENTIONS:
-            raise ConfigError(f"'attention' must be one of {', '.join(ATTENTIONS)}, got {self.attention}.")
-        require_sizes(self.short_side, self.window, self.stride)
-        self.wording.check()
-
-    @property
-    def wording(self) -> Wording:
-        """How words are asked."""
-        return Wording(self.templates or TEMPLATES, self.contrast or CONTRAST, self.threshold)
 
 
 class ClipEncoder(Encoder):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -10,8 +9,9 @@ from numpy.typing import NDArray
 
 from ...core.types import Frame
 from .. import model_packages
-from ..text_networks import CONTRAST, TEMPLATES, ModelWords, Wording
-from .base import Encoder, require_sizes
+from ..text_networks import ModelWords
+from .base import Encoder
+from .model_options import ImageSide, PatchOptions, WindowSide
 
 if TYPE_CHECKING:
     from ..patch_features import Tiling
@@ -19,37 +19,13 @@ if TYPE_CHECKING:
 REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(PatchOptions, frozen=True):
     """Which model, and how its patches become features of pixels."""
 
     model: str = ""
     """Folder of a model package of kind "dense", or its name in the models folder (freeocc3d models list)."""
-    short_side: int = 448
-    """Frames are resized so that their shorter side has so many pixels."""
-    window: int | None = 0
-    """Edge in pixels of windows that are encoded one by one, half overlapping; 0 = the whole frame at once; null = the
-    size of the model's training images."""
-    stride: int = 4
-    """Pixels of the frame from one feature to the next, upsampled from patches along the image's edges; 0 = patches."""
-    templates: tuple[str, ...] = ()
-    """Prompts whose mean stands for a word, which goes where they have {}; none = the built-in ones."""
-    contrast: tuple[str, ...] = ()
-    """Words that a voxel could be instead: a word matches only where none of them fits better; none = what most rooms
-    hold."""
-    threshold: float = 0.15
-    """Least cosine of a match."""
-    device: str = "cpu"
-    """Where the image network runs: "cpu", or "cuda:0" with onnxruntime-gpu."""
-
-    def __post_init__(self) -> None:
-        require_sizes(self.short_side, self.window, self.stride)
-        self.wording.check()
-
-    @property
-    def wording(self) -> Wording:
-        """How words are asked."""
-        return Wording(self.templates or TEMPLATES, self.contrast or CONTRAST, self.threshold)
+    short_side: ImageSide = 448
+    window: WindowSide | None = 0
 
 
 class Dinov2Encoder(Encoder):

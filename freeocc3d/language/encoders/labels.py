@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,8 +12,10 @@ from numpy.typing import NDArray
 
 from ...capture.base import Capture
 from ...capture.class_files import read_class_names
-from ...core.errors import CaptureError, ConfigError
+from ...core.errors import CaptureError
 from ...core.types import Frame
+from ...settings.option_types import PositiveInt
+from ...settings.typed_options import TypedOptions
 from .. import synonyms
 from .base import Encoder, TextEncoder, TextFeatures
 
@@ -25,8 +26,7 @@ _VOID = 255
 _ASPECT_TOLERANCE = 0.02
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(TypedOptions, frozen=True):
     """Where the class images are, if the capture brings none."""
 
     folder: str | None = None
@@ -35,12 +35,8 @@ class Options:
     classes: str | None = None
     """File with the class names: JSON {"classes": [...]} or one name a line; the first (value 0) means nothing. null =
     classes.json or classes.txt in the folder, or the capture's own."""
-    stride: int = 2
+    stride: PositiveInt = 2
     """Every n-th pixel of a class image is used."""
-
-    def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise ConfigError(f"'stride' must be at least 1, got {self.stride}.")
 
 
 class LabelsEncoder(Encoder):
@@ -129,7 +125,7 @@ def load(options: Options, capture: Capture) -> LabelsEncoder:
         if len(classes) < 2 or all(capture.labels(index) is None for index in range(min(len(capture), 10))):
             raise CaptureError(
                 f"{capture.path} brings no class images with names: give them with language.labels.folder and "
-                "language.labels.classes, or use another encoder, for example language.encoder=colour."
+                "language.labels.classes, or use another encoder, for example language.encoder=color."
             )
         return LabelsEncoder(tuple(classes), capture.labels, options.stride)
     folder = Path(options.folder)

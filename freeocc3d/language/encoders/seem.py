@@ -7,51 +7,30 @@ are not known yet, a pixel is given the embedding of the mask that covers it bes
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from ...core.errors import ConfigError
 from ...core.types import Frame
 from .. import model_packages
-from ..text_networks import CONTRAST, TEMPLATES, ModelWords, Wording
-from .base import Encoder, require_sizes
+from ..text_networks import ModelWords
+from .base import Encoder
+from .model_options import ImageSide, WordOptions
 
 REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(WordOptions, frozen=True):
     """Which model, and which of its masks count."""
 
     model: str = ""
     """Folder of a model package of kind "masks", or its name in the models folder (freeocc3d models list)."""
-    short_side: int = 512
-    """Frames are resized so that their shorter side has so many pixels, and both sides whole patches."""
-    mask_probability: float = 0.5
+    short_side: ImageSide = 512
+    """Frames are resized so that their shorter side has this many pixels, and both sides whole patches."""
+    mask_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.5
     """Pixels that no mask covers with at least this probability say nothing."""
-    templates: tuple[str, ...] = ()
-    """Prompts whose mean stands for a word, which goes where they have {}; none = the built-in ones."""
-    contrast: tuple[str, ...] = ()
-    """Words that a voxel could be instead: a word matches only where none of them fits better; none = what most rooms
-    hold."""
-    threshold: float = 0.15
-    """Least cosine of a match."""
-    device: str = "cpu"
-    """Where the network runs: "cpu", or "cuda:0" with onnxruntime-gpu."""
-
-    def __post_init__(self) -> None:
-        require_sizes(self.short_side, None, 0)
-        if not 0 < self.mask_probability < 1:
-            raise ConfigError(f"'mask_probability' must lie between 0 and 1, got {self.mask_probability}.")
-        self.wording.check()
-
-    @property
-    def wording(self) -> Wording:
-        """How words are asked."""
-        return Wording(self.templates or TEMPLATES, self.contrast or CONTRAST, self.threshold)
 
 
 class SeemEncoder(Encoder):

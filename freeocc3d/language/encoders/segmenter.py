@@ -8,9 +8,8 @@ with a network of 40 classes (bedroom, living; mIoU over the classes present): p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,9 @@ from ...capture.class_files import read_class_file, read_class_names
 from ...core.errors import ConfigError, FrameError
 from ...core.onnx_session import load_session
 from ...core.types import Frame
+from ...settings.option_types import Finite, Positive, PositiveInt
 from ...settings.registry import nearest
+from ...settings.typed_options import TypedOptions
 from .. import synonyms
 from ..name_embeddings import NameEmbeddings
 from .base import Encoder
@@ -38,8 +39,7 @@ _FREE_SIZE_STEP = 32
 """A network of any input size is given a multiple of this, which is what its strides multiply to."""
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(TypedOptions, frozen=True):
     """A network, what its classes are called, and how it wants its images."""
 
     model: str = ""
@@ -53,30 +53,20 @@ class Options:
     embeddings: str | None = None
     """File (.npz) with text embeddings of many names, "names" and "embeddings", those of the classes among them: a name
     whose embedding is nearer to a class's than names there commonly are to each other means the class."""
-    mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
-    """Mean of red, green and blue, in 0…1, that images are normalised by; an input of bytes is not normalised."""
-    std: tuple[float, float, float] = (0.229, 0.224, 0.225)
-    """Standard deviation of red, green and blue, in 0…1, that images are normalised by."""
-    channels: str = "rgb"
+    mean: tuple[Finite, Finite, Finite] = (0.485, 0.456, 0.406)
+    """Mean of red, green and blue, in 0…1, that images are normalized by; an input of bytes is not normalized."""
+    std: tuple[Positive, Positive, Positive] = (0.229, 0.224, 0.225)
+    """Standard deviation of red, green and blue, in 0…1, that images are normalized by."""
+    channels: Literal["rgb", "bgr"] = "rgb"
     """Order of the input's channels: "rgb" or "bgr"."""
-    size: tuple[int, int] | None = None
+    size: tuple[PositiveInt, PositiveInt] | None = None
     """Width and height of the input; null = as the network says, or about the frame's where it takes any."""
     output: str | None = None
     """Name of the output with a channel for each class; null = the first that has one."""
-    stride: int = 4
+    stride: PositiveInt = 4
     """Pixels of the frame between features; logits are interpolated."""
     device: str = "cpu"
     """Where the network runs: "cpu", or "cuda:0" and so on with onnxruntime-gpu."""
-
-    def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise ConfigError(f"'stride' must be at least 1, got {self.stride}.")
-        if self.size is not None and min(self.size) < 1:
-            raise ConfigError(f"'size' must be a width and a height of at least 1, got {self.size}.")
-        if self.channels not in ("rgb", "bgr"):
-            raise ConfigError(f"'channels' must be rgb or bgr, got {self.channels}.")
-        if min(self.std) <= 0:
-            raise ConfigError(f"'std' must be greater than 0, got {self.std}.")
 
 
 class SegmenterEncoder(Encoder):

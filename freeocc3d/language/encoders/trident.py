@@ -16,17 +16,18 @@ Segmentation, 2024. Its steps, as they are here:
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from ...core.errors import ConfigError
 from ...core.types import Frame
+from ...settings.option_types import Advanced, Finite, NotNegativeInt
 from .. import model_packages
-from ..text_networks import CONTRAST, TEMPLATES, ModelWords, Wording
-from .base import Encoder, require_sizes
+from ..text_networks import ModelWords
+from .base import Encoder
+from .model_options import PatchOptions, WindowSide
 
 if TYPE_CHECKING:
     from ..patch_features import Tiling
@@ -37,8 +38,7 @@ _FINER = 2
 """Features a patch of SAM's, along an axis, after refinement."""
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(PatchOptions, frozen=True):
     """Which models, and the paper's constants."""
 
     model: str = ""
@@ -47,43 +47,21 @@ class Options:
     """The same of kind "backbone": DINO ViT-B/16 in the paper."""
     sam: str = ""
     """The same of kind "sam"."""
-    short_side: int = 336
-    """Frames are resized for CLIP so that their shorter side has so many pixels."""
-    window: int | None = 336
-    """Edge in pixels of windows that are encoded one by one, half overlapping; 0 = the whole frame at once; null = the
-    size of the model's training images."""
-    beta: float = 1.2
+    window: WindowSide | None = 336
+    beta: Advanced[Finite] = 1.2
     """Share of the mean correlation that a pair of DINO's patches must exceed."""
-    gamma: float = 3.0
+    gamma: Advanced[Finite] = 3.0
     """Factor of correlations in the softmax."""
-    cosine: float = 1.2
+    cosine: Advanced[Finite] = 1.2
     """Share of the mean cosine that a pair of SAM's patches must exceed."""
-    points: int = 16
+    points: Advanced[Annotated[int, Meta(ge=0, le=64)]] = 16
     """Points along the longer side of the grid that SAM is prompted with; 0 = no masks."""
-    mask_score: float = 0.8
+    mask_score: Advanced[Finite] = 0.8
     """Least quality of a mask, as SAM estimates it."""
-    stride: int = 4
+    stride: NotNegativeInt = 4
     """Pixels of the frame from one feature to the next, upsampled along the image's edges; 0 = as SAM's grid is."""
-    templates: tuple[str, ...] = ()
-    """Prompts whose mean stands for a word, which goes where they have {}; none = the built-in ones."""
-    contrast: tuple[str, ...] = ()
-    """Words that a voxel could be instead: a word matches only where none of them fits better; none = what most rooms
-    hold."""
-    threshold: float = 0.15
-    """Least cosine of a match."""
     device: str = "cpu"
     """Where the image networks run: "cpu", or "cuda:0" with onnxruntime-gpu."""
-
-    def __post_init__(self) -> None:
-        require_sizes(self.short_side, self.window, self.stride)
-        if not 0 <= self.points <= 64:
-            raise ConfigError(f"'points' must lie between 0 and 64, got {self.points}.")
-        self.wording.check()
-
-    @property
-    def wording(self) -> Wording:
-        """How words are asked."""
-        return Wording(self.templates or TEMPLATES, self.contrast or CONTRAST, self.threshold)
 
 
 class TridentEncoder(Encoder):

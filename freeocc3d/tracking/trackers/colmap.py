@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,8 @@ from ...capture.base import Capture
 from ...core.errors import ConfigError
 from ...core.progress import Progress
 from ...core.types import Frame, Trajectory
-from ...settings.registry import require_positive
-from ..base import PosedPoints, Tracked
+from ...settings.option_types import PositiveInt
+from ..base import KeyframeOptions, PosedPoints, Tracked
 from ..given_poses import GivenTracker
 from ..sfm.colmap_reconstruction import read_model
 from ..sfm.reconstruction import Reconstruction
@@ -22,37 +22,22 @@ from ..sfm.structure_from_motion import Recipe, reconstruct_poses
 
 REQUIRES: tuple[str, ...] = ("pycolmap",)
 
-_CHOICES = {
-    "order": ("auto", "video", "photos"),
-    "mapping": ("incremental", "global"),
-    "intrinsics": ("refine", "fixed"),
-}
 
-
-@dataclass(frozen=True)
-class Options:
+class Options(KeyframeOptions, frozen=True):
     """Which frames, how they are matched and mapped, the camera, and an existing model."""
 
-    frames: int = 300
-    """Frames that are reconstructed at most: of more, the sharpest ones with the same way of image motion between."""
-    order: str = "auto"
+    frames: PositiveInt = 300
+    """The most frames that are reconstructed: of more, the sharpest ones with the same way of image motion between."""
+    order: Literal["auto", "video", "photos"] = "auto"
     """"video": each frame shows much of the one before; "photos": images in no order; "auto": as the images say."""
     features: str = "sift"
     """"sift", or the path of an ONNX network that finds keypoints and descriptors (SuperPoint, DISK, ALIKED)."""
-    mapping: str = "incremental"
+    mapping: Literal["incremental", "global"] = "incremental"
     """"incremental" adds image by image; "global" places all at once: faster, but needs each seen in many others."""
-    intrinsics: str = "refine"
+    intrinsics: Literal["refine", "fixed"] = "refine"
     """"refine": those of the capture are a start; "fixed": they are kept as they are."""
     model: str | None = None
     """Folder of a COLMAP model (cameras, images, points3D) of the capture's images that is taken instead."""
-    keyframe_overlap: float = 0.85
-    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "frames", "keyframe_overlap")
-        for name, known in _CHOICES.items():
-            if getattr(self, name) not in known:
-                raise ConfigError(f"'{name}' must be {' or '.join(known)}, got '{getattr(self, name)}'.")
 
 
 def load(options: Options, capture: Capture) -> ColmapTracker:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -15,7 +15,8 @@ from ...capture.point_files import read_points
 from ...core.errors import ConfigError, TrackingError
 from ...core.transforms import invert, project, transform
 from ...core.types import Frame
-from ...settings.registry import require_positive
+from ...settings.option_types import Positive
+from ..base import KeyframeOptions
 from ..given_poses import GivenTracker
 from ..rgbd import orb_features
 from ..rgbd.keyframe_registration import decode_keyframe_view
@@ -29,24 +30,18 @@ _CELL = 8  # pixels; in one of them a cloud's points hide what lies behind
 _BEHIND = 0.05  # of the depth
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(KeyframeOptions, frozen=True):
     """Which file, how its poses are told apart, its scale, and a point cloud that came with it."""
 
     path: str = ""
     """The trajectory: a file, or a folder of 7-Scenes' poses or with a COLMAP model; also looked for in the capture."""
-    max_time_difference: float = 0.02
+    max_time_difference: Positive = 0.02
     """Seconds by which a pose and its frame may differ, for files that state times."""
-    scale: float | None = 1.0
+    scale: Positive | None = 1.0
     """Metres per unit of the file; null = as the capture's depth says, for monocular systems, and without depth as
     capture.scale says, else unknown."""
     points: str | None = None
     """Point cloud (PLY, PCD, XYZ) in the file's world: where a frame has no depth, its points are the anchors."""
-    keyframe_overlap: float = 0.85
-    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "max_time_difference", "scale", "keyframe_overlap")
 
 
 def load(options: Options, capture: Capture) -> FileTracker:

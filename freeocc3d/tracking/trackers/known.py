@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from ...capture.base import Capture
 from ...core.errors import TrackingError
-from ...settings.registry import require_positive
+from ..base import KeyframeOptions
 from ..given_poses import GivenTracker
 
 REQUIRES: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(KeyframeOptions, frozen=True):
     """Keyframes."""
-
-    keyframe_overlap: float = 0.85
-    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "keyframe_overlap")
 
 
 def load(options: Options, capture: Capture) -> KnownTracker:

@@ -14,9 +14,9 @@ from ...capture.base import Capture
 from ...core.errors import ConfigError
 from ...core.transforms import invert, nearest_rigid
 from ...core.types import Frame, Intrinsics
-from ...settings.registry import require_positive
+from ...settings.option_types import Advanced, Finite, NotNegativeInt, Positive, PositiveInt
 from .. import pose_graph
-from ..base import Tracked, Tracker
+from ..base import KeyframeOptions, Tracked, Tracker
 from ..overlap import DepthView, measure_mutual_overlap, sample_points
 from ..pose_graph import Edge
 from ..records import Records
@@ -24,35 +24,32 @@ from ..records import Records
 REQUIRES: tuple[str, ...] = ("open3d",)
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(KeyframeOptions, frozen=True):
     """Odometry and keyframes."""
 
     device: str = "cpu"
     """Where the odometry runs: "cpu", or "cuda:0" and so on with an Open3D that has CUDA."""
-    width: int = 320
+    width: PositiveInt = 320
     """Images are tracked at this width (a smaller one is kept)."""
-    iterations: tuple[int, int, int] = (10, 6, 4)
+    iterations: Advanced[tuple[NotNegativeInt, NotNegativeInt, NotNegativeInt]] = (10, 6, 4)
     """Gauss–Newton iterations per pyramid level, coarse to fine."""
-    depth_difference: float = 0.07
+    depth_difference: Advanced[Positive] = 0.07
     """Pixels whose depths differ by more than this many metres are no correspondence."""
-    keyframe_overlap: float = 0.85
-    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
-    min_fitness: float = 0.3
+    min_fitness: Advanced[Positive] = 0.3
     """Share of pixels that must find a correspondence."""
-    max_residual: float = 0.03
-    """Largest root mean square of the odometry's residual (metres and grey levels, 0…1, mixed)."""
-    min_information: float = 1e-3
+    max_residual: Advanced[Positive] = 0.03
+    """Largest root mean square of the odometry's residual (metres and gray levels, 0…1, mixed)."""
+    min_information: Advanced[Finite] = 1e-3
     """Smallest eigenvalue of the information matrix, per correspondence, that still counts as constrained."""
-    overlap_edges: int = 6
+    overlap_edges: Advanced[NotNegativeInt] = 6
     """Earlier keyframes that a new one is registered to, beyond the last: those that share most of its view."""
-    min_edge_overlap: float = 0.4
+    min_edge_overlap: Advanced[Finite] = 0.4
     """Share of the view that such a keyframe must have in common."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "width", "depth_difference", "keyframe_overlap", "min_fitness", "max_residual")
-        if min(self.iterations) < 0 or max(self.iterations) == 0:
-            raise ConfigError(f"'iterations' must not be negative, nor all zero, got {self.iterations}.")
+        super().__post_init__()
+        if max(self.iterations) == 0:
+            raise ConfigError(f"'iterations' must not all be 0, got {list(self.iterations)}.")
 
 
 @dataclass(frozen=True)

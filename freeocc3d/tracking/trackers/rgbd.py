@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from ...capture.base import Capture
 from ...core.transforms import invert, measure_pose_difference
 from ...core.types import Frame
-from ...settings.registry import require_positive
+from ...settings.option_types import Advanced, Positive, PositiveInt
 from .. import pose_graph
-from ..base import Tracked, Tracker
+from ..base import KeyframeOptions, Tracked, Tracker
 from ..overlap import DepthView, measure_mutual_overlap
 from ..pose_graph import Edge
 from ..records import Records
@@ -42,21 +42,16 @@ _DRAWS = 1000  # of RANSAC for a lost frame, which is worth more of them
 _RECENT = 4  # keyframes that a lost frame is compared with, besides those that look alike
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(KeyframeOptions, frozen=True):
     """Tracking, loop closure and refinement."""
 
-    keyframe_overlap: float = 0.8
-    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
-    close_loops: bool = True
-    """Recognise places that were seen before, and make the path agree with them."""
-    refine: bool = True
+    keyframe_overlap: Positive = 0.8
+    close_loops: Advanced[bool] = True
+    """Recognize places that were seen before, and make the path agree with them."""
+    refine: Advanced[bool] = True
     """Align all overlapping keyframes jointly at the end."""
-    neighbours: int = 16
+    neighbors: Advanced[PositiveInt] = 16
     """Earlier keyframes that each is aligned with in the refinement."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "keyframe_overlap", "neighbours")
 
 
 def load(options: Options, capture: Capture) -> RgbdTracker:
@@ -126,7 +121,7 @@ class RgbdTracker(Tracker):
             placed = pose_graph.optimize_component(T, self.edges, rows)
             if self.options.refine:
                 placed = joint_refinement.refine_poses(
-                    [self.keyframes[k] for k in rows], placed, self.options.neighbours
+                    [self.keyframes[k] for k in rows], placed, self.options.neighbors
                 )
             for k, pose in zip(rows, placed, strict=True):
                 T[k] = pose

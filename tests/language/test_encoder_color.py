@@ -9,11 +9,11 @@ import pytest
 
 from freeocc3d.core.errors import ConfigError, MapError
 from freeocc3d.core.types import Frame, Intrinsics
-from freeocc3d.language.encoders import colour
-from freeocc3d.language.encoders.colour import CENTROIDS, MODIFIERS, NAMES, TERMS, ColourEncoder, Options, load_text
+from freeocc3d.language.encoders import color
+from freeocc3d.language.encoders.color import CENTROIDS, MODIFIERS, NAMES, TERMS, ColorEncoder, Options, load_text
 from freeocc3d.query.word_query import similarity
 
-ENCODER = ColourEncoder()
+ENCODER = ColorEncoder()
 WORDS = load_text(ENCODER.text_state())
 
 SURFACES = {
@@ -73,7 +73,7 @@ def test_a_very_warm_wall_is_beige_rather_than_yellow_or_pink() -> None:
 
 def test_white_option_adapts_to_the_light() -> None:
     light = np.array((1.0, 0.85, 0.6))
-    adapted = ColourEncoder(Options(white=tuple(250 * light)))
+    adapted = ColorEncoder(Options(white=tuple(250 * light)))
     feature = adapted.encode(frame(np.array((220, 220, 220)) * light))[0]
     named = similarity(feature, WORDS.encode_words(list(TERMS)))[0]
     assert list(TERMS)[int(named.argmax())] == "white"
@@ -146,7 +146,7 @@ def test_every_word_is_reached_by_some_colour_and_competes_with_others_only() ->
     words = [*TERMS, *NAMES, *modified]
     text = WORDS.encode_words(words)
     assert all(text.understood)
-    pure = np.sqrt(colour.features_squared(np.eye(len(CENTROIDS))))
+    pure = np.sqrt(color.features_squared(np.eye(len(CENTROIDS))))
     np.testing.assert_allclose(similarity(pure, text).max(axis=0), 1, atol=1e-5)
     terms = WORDS.encode_words(WORDS.contrast_words()).features
     for word, row in zip(words, text.features @ terms.T, strict=True):
@@ -175,7 +175,7 @@ def test_blocks_lie_where_their_pixels_are(stride: int) -> None:
     color[:, :12] = SURFACES["red"]
     color[:, 12:] = SURFACES["blue"]
     pixels = Frame(0, 0.0, color, np.ones((12, 24), np.float32), Intrinsics(24, 12, 9, 9, 9, 9))
-    features = ColourEncoder(Options(stride=stride)).encode(pixels)
+    features = ColorEncoder(Options(stride=stride)).encode(pixels)
     named = similarity(features.reshape(-1, features.shape[2]), WORDS.encode_words(["red", "blue"]))
     best = named.argmax(axis=1).reshape(features.shape[:2])
     half = features.shape[1] // 2
@@ -186,7 +186,7 @@ def test_blocks_lie_where_their_pixels_are(stride: int) -> None:
 def test_look_up_table_agrees_with_the_formula() -> None:
     rng = np.random.default_rng(1)
     rgb = rng.integers(0, 32, (200, 3)) * 8 + 4
-    exact = np.sqrt(colour.features_squared(colour.memberships(rgb.astype(float))))
+    exact = np.sqrt(color.features_squared(color.memberships(rgb.astype(float))))
     looked_up = np.array([ENCODER.encode(frame(pixel))[0, 0] for pixel in rgb])
     assert (exact * looked_up).sum(axis=1).min() > 0.99
 
@@ -195,7 +195,7 @@ def test_lab_of_reference_colours() -> None:
     """Values of the sRGB primaries in CIELAB (D65), as colour tables give them."""
     rgb = np.array([(255, 255, 255), (0, 0, 0), (255, 0, 0), (0, 255, 0), (0, 0, 255)], float)
     expected = [(100, 0, 0), (0, 0, 0), (53.24, 80.09, 67.20), (87.73, -86.18, 83.18), (32.30, 79.19, -107.86)]
-    np.testing.assert_allclose(colour.rgb_to_lab(rgb), expected, atol=0.05)
+    np.testing.assert_allclose(color.rgb_to_lab(rgb), expected, atol=0.05)
 
 
 def test_state_is_plain_and_restores_the_words() -> None:

@@ -1,12 +1,12 @@
-"""Colour names, no network: "red", "dark blue" and "white sofa" (as white) have a meaning.
+"""Color names, no network: "red", "dark blue" and "white sofa" (as white) have a meaning.
 
-A pixel belongs softly to named colours: its membership in colour c is m_c = exp(-d_c^2 / 2 sigma^2), normalised to sum
+A pixel belongs softly to named colors: its membership in color c is m_c = exp(-d_c^2 / 2 sigma^2), normalised to sum
 1, where d_c is the CIE94 difference to the nearest of c's centroids, with lightness at half weight because shading
-changes it within an object. Colours gather in basic terms ("dark blue" is blue), mu = M m, and the feature is
+changes it within an object. Colors gather in basic terms ("dark blue" is blue), mu = M m, and the feature is
 
     f = (sqrt(mu / 2), sqrt(m / 2)),   of unit length because mu and m each sum to 1.
 
-A term's text feature is its axis in the first half; that of another name, with its distribution q over the colours, is
+A term's text feature is its axis in the first half; that of another name, with its distribution q over the colors, is
 (sqrt(M q / 5), sqrt(4 q / 5)), so that "dark blue" is a little like any blue. Each half of a cosine is a Bhattacharyya
 coefficient.
 
@@ -18,15 +18,17 @@ CIE94: CIE publication 116-1995.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
-from ...core.errors import ConfigError, MapError
+from ...core.errors import MapError
 from ...core.types import Frame
+from ...settings.option_types import PositiveInt
+from ...settings.typed_options import TypedOptions
 from .base import Encoder, TextEncoder, TextFeatures
 
 REQUIRES: tuple[str, ...] = ()
@@ -58,10 +60,10 @@ CENTROIDS: dict[str, tuple[tuple[float, float, float], ...]] = {
     "light brown": ((62, 42, 70), (62, 30, 74), (56, 44, 62), (70, 36, 76), (54, 22, 75), (66, 26, 88), (62, 22, 95)),
     "beige": ((84, 17, 82), (78, 22, 80), (92, 16, 95), (74, 15, 82), (78, 24, 92)),
 }
-"""Centroids of each colour as (lightness 0…100, chroma, hue in degrees) in CIELAB of sRGB under D65."""
+"""Centroids of each color as (lightness 0…100, chroma, hue in degrees) in CIELAB of sRGB under D65."""
 
 Meaning = dict[str, float]
-"""Shares of the colours of CENTROIDS, up to a common factor."""
+"""Shares of the colors of CENTROIDS, up to a common factor."""
 
 TERMS: dict[str, Meaning] = {
     "white": {"white": 1.0, "light grey": 0.2},
@@ -78,7 +80,7 @@ TERMS: dict[str, Meaning] = {
     "brown": {"brown": 1.0, "light brown": 0.9, "dark brown": 1.0, "olive": 0.2},
     "beige": {"beige": 1.0, "light brown": 0.1},
 }
-"""Basic terms, and the share of each colour that they have: the matrix M."""
+"""Basic terms, and the share of each color that they have: the matrix M."""
 
 _GOLD = {"yellow": 0.6, "light brown": 0.4}
 
@@ -114,7 +116,7 @@ NAMES: dict[str, Meaning] = {
     "teal": {"turquoise": 0.8, "dark green": 0.2},
     "violet": {"purple": 0.8, "light purple": 0.2},
 }
-"""What other colour names mean."""
+"""What other color names mean."""
 
 _DARK: dict[str, Meaning] = {
     "red": {"dark red": 0.9, "red": 0.1},
@@ -152,7 +154,7 @@ _BRIGHT: dict[str, Meaning] = {
     "white": {"white": 1.0},
 }
 MODIFIERS = {"dark": _DARK, "deep": _DARK, "light": _LIGHT, "pale": _LIGHT, "bright": _BRIGHT, "vivid": _BRIGHT}
-"""What a colour name means after a modifier; one that is not listed under it keeps its own meaning."""
+"""What a color name means after a modifier; one that is not listed under it keeps its own meaning."""
 
 _SPELLINGS = {"gray": "grey"}
 
@@ -162,27 +164,23 @@ _TERM_SHARE = 0.2  # of the squared text feature of a shade, for the term that i
 _TABLE_BITS = 5  # of each channel that the look-up table tells apart
 
 
-@dataclass(frozen=True)
-class Options:
-    """How pixels get colour names."""
+Channel = Annotated[float, Meta(ge=16, le=255)]
 
-    stride: int = 4
+
+class Options(TypedOptions, frozen=True):
+    """How pixels get color names."""
+
+    stride: PositiveInt = 4
     """Edge in pixels of the blocks whose memberships are averaged into one feature."""
-    white: tuple[float, float, float] | None = None
-    """RGB (16 to 255) that something white has in this capture, for scans under coloured or dim light; null = colours
+    white: tuple[Channel, Channel, Channel] | None = None
+    """RGB (16 to 255) that something white has in this capture, for scans under colored or dim light; null = colors
     are taken as they are."""
 
-    def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise ConfigError(f"'stride' must be at least 1, got {self.stride}.")
-        if self.white is not None and not all(16 <= value <= 255 for value in self.white):
-            raise ConfigError(f"'white' must be three numbers from 16 to 255, got {self.white}.")
 
+class ColorEncoder(Encoder):
+    """sqrt of the mean color memberships of blocks of pixels."""
 
-class ColourEncoder(Encoder):
-    """sqrt of the mean colour memberships of blocks of pixels."""
-
-    name: ClassVar[str] = "colour"
+    name: ClassVar[str] = "color"
     dimension = len(TERMS) + len(CENTROIDS)
 
     def __init__(self, options: Options | None = None):
@@ -209,16 +207,16 @@ class ColourEncoder(Encoder):
         return np.sqrt(total / samples**2).astype(np.float16)
 
     def text_state(self) -> dict[str, Any]:
-        return {"terms": list(TERMS), "colours": list(CENTROIDS)}
+        return {"terms": list(TERMS), "colors": list(CENTROIDS)}
 
 
-class ColourWords(TextEncoder):
-    """Colour names, with modifiers, in any phrase; its other words are passed over."""
+class ColorWords(TextEncoder):
+    """Color names, with modifiers, in any phrase; its other words are passed over."""
 
     threshold = 0.6
     temperature = 0.1
     same_word = 0.3
-    knows = "colour names (it needs no image network, and has none)"
+    knows = "color names (it needs no image network, and has none)"
 
     def __init__(self) -> None:
         self._pure = np.sqrt(features_squared(np.eye(len(CENTROIDS))))
@@ -232,7 +230,7 @@ class ColourWords(TextEncoder):
             understood.append(", ".join(meanings))
             if meanings:
                 features[row] = np.sqrt(np.mean([_text_squared(m) for m in meanings.values()], axis=0))
-                attainable[row] = (self._pure @ features[row]).max()  # by a thing that is wholly of one colour
+                attainable[row] = (self._pure @ features[row]).max()  # by a thing that is wholly of one color
         return TextFeatures(features, tuple(understood), attainable)
 
     def contrast_words(self) -> list[str]:
@@ -243,70 +241,71 @@ NEEDS_CAPTURE = False
 """Whether ``load`` asks the capture for anything: a map's keyframes alone are enough to encode them again."""
 
 
-def load(options: Options, capture: Capture | None) -> ColourEncoder:
+def load(options: Options, capture: Capture | None) -> ColorEncoder:
     """The encoder; it needs nothing of the capture."""
-    return ColourEncoder(options)
+    return ColorEncoder(options)
 
 
-def load_text(state: dict[str, Any]) -> ColourWords:
-    """The word side. Raises MapError for a map whose colours are not those that words are defined by."""
-    if state.get("terms") != list(TERMS) or state.get("colours") != list(CENTROIDS):
-        raise MapError("The map's colour features are of another version of freeocc3d: make the map again.")
-    return ColourWords()
+def load_text(state: dict[str, Any]) -> ColorWords:
+    """The word side. Raises MapError for a map whose colors are not those that words are defined by."""
+    colors = state.get("colors", state.get("colours"))  # the older spelling stands in earlier maps
+    if state.get("terms") != list(TERMS) or colors != list(CENTROIDS):
+        raise MapError("The map's color features are of another version of freeocc3d: make the map again.")
+    return ColorWords()
 
 
 def parse_colors(phrase: str) -> dict[str, Meaning | str]:
-    """The colours that a phrase names: "a dark-blue sofa" gives "dark blue". Each with its meaning, or with the basic
+    """The colors that a phrase names: "a dark-blue sofa" gives "dark blue". Each with its meaning, or with the basic
     term that it is."""
     meanings: dict[str, Meaning | str] = {}
     modifier = ""
     for token in re.findall(r"[a-z]+", phrase.lower()):
-        prefix = next((m for m in MODIFIERS if token.startswith(m) and base_colour(token.removeprefix(m))), "")
-        colour = base_colour(token.removeprefix(prefix))
-        if colour:
+        prefix = next((m for m in MODIFIERS if token.startswith(m) and base_color(token.removeprefix(m))), "")
+        color = base_color(token.removeprefix(prefix))
+        if color:
             modifier = prefix or modifier
-            plain = _SPELLINGS.get(colour, colour)
-            meanings[f"{modifier} {colour}".strip()] = MODIFIERS.get(modifier, {}).get(plain, NAMES.get(plain, plain))
+            plain = _SPELLINGS.get(color, color)
+            meanings[f"{modifier} {color}".strip()] = MODIFIERS.get(modifier, {}).get(plain, NAMES.get(plain, plain))
         modifier = token if token in MODIFIERS else ""
     return meanings
 
 
-def base_colour(token: str) -> str:
-    """The colour name of which a lower-case token is a form ("reddish", "greys", "redcolored"), or an empty string."""
+def base_color(token: str) -> str:
+    """The color name of which a lower-case token is a form ("reddish", "greys", "redcolored"), or an empty string."""
     for ending in ("", "s", "coloured", "colored"):
-        if _is_colour(token.removesuffix(ending)):
+        if _is_color(token.removesuffix(ending)):
             return token.removesuffix(ending)
     if not token.endswith("ish"):
         return ""
     stem = token.removesuffix("ish")  # "green(ish)", "blu(ish)" without its e, "red-d(ish)"
-    return next((word for word in (stem, stem + "e", stem[:-1]) if _is_colour(word)), "")
+    return next((word for word in (stem, stem + "e", stem[:-1]) if _is_color(word)), "")
 
 
-def _is_colour(word: str) -> bool:
+def _is_color(word: str) -> bool:
     return word in TERMS or word in NAMES or word in _SPELLINGS
 
 
 def features_squared(m: NDArray[np.floating]) -> NDArray[np.floating]:
-    """(..., C) memberships in the colours to (..., D) squared features (mu, m) / 2."""
+    """(..., C) memberships in the colors to (..., D) squared features (mu, m) / 2."""
     return np.concatenate((m @ _shares().T, m), axis=-1) / 2
 
 
 def _shares() -> NDArray[np.float64]:
-    """M: (terms, colours), columns sum to 1."""
-    return np.array([[term.get(colour, 0.0) for colour in CENTROIDS] for term in TERMS.values()])
+    """M: (terms, colors), columns sum to 1."""
+    return np.array([[term.get(color, 0.0) for color in CENTROIDS] for term in TERMS.values()])
 
 
 def _text_squared(meaning: Meaning | str) -> NDArray[np.floating]:
     """(D,) squared text feature of a meaning, or of a basic term."""
     if isinstance(meaning, str):
         return np.array([*(float(term == meaning) for term in TERMS), *(0.0 for _ in CENTROIDS)])
-    q = np.array([meaning.get(colour, 0.0) for colour in CENTROIDS])
+    q = np.array([meaning.get(color, 0.0) for color in CENTROIDS])
     q /= q.sum()
     return np.concatenate((_TERM_SHARE * _shares() @ q, (1 - _TERM_SHARE) * q))
 
 
 def memberships(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(..., 3) sRGB in 0…255 to (..., C) memberships in the colours of CENTROIDS; they sum to 1."""
+    """(..., 3) sRGB in 0…255 to (..., C) memberships in the colors of CENTROIDS; they sum to 1."""
     lab = rgb_to_lab(rgb)
     squared = np.stack(
         [np.min([_squared_cie94(lab, c) for c in centroids], axis=0) for centroids in CENTROIDS.values()], axis=-1
@@ -327,7 +326,7 @@ def rgb_to_lab(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _squared_cie94(lab: NDArray[np.float64], centroid: tuple[float, float, float]) -> NDArray[np.float64]:
-    """(...,) squared CIE94 difference of (..., 3) colours to a centroid (lightness, chroma, hue in degrees)."""
+    """(...,) squared CIE94 difference of (..., 3) colors to a centroid (lightness, chroma, hue in degrees)."""
     L, a, b = np.moveaxis(lab, -1, 0)
     L_c, C_c, hue = centroid[0], centroid[1], np.radians(centroid[2])
     squared_dC = (np.hypot(a, b) - C_c) ** 2
