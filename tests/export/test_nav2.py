@@ -85,10 +85,10 @@ def test_free_share_and_inflation(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"frame": "map"}, "up is no axis"),
-        ({"min_height": 2.0}, "below 'max_height'"),
-        ({"min_free": 1.5}, "0 to 1"),
-        ({"inflation": -1.0}, "negative"),
+        ({"frame": "map"}, "must be gravity or first-camera, got 'map'"),
+        ({"min_height": 2.0}, r"below 'nav2\.max_height'"),
+        ({"min_free": 1.5}, "from 0 to 1"),
+        ({"inflation": -1.0}, "at least 0"),
         ({"inflation": float("nan")}, "inflation"),
     ],
 )
