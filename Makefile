@@ -1,27 +1,40 @@
-# make demo and make test do all the set-up that they need; nothing else has to be run first.
+# Every target does all the set-up that it needs; nothing else has to be run first.
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test lint setup system benchmark docs clean
+# Tests of the parts that most changes touch; they compile little and map nothing.
+QUICK  := tests/test_imports.py tests/core tests/settings
+
+.PHONY: help demo quick test lint docs wheel-test benchmark setup system clean
 
 demo: setup  ## build the built-in room, map it, ask it three words, write pictures to demo/
 	$(BIN)/freeocc3d demo -o demo --overwrite
 
-test: setup lint
+help:  ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+
+quick: setup lint  ## style, types and the fast tests, in less than two minutes
+	$(BIN)/python -m pytest -n 2 --dist loadfile -q $(QUICK)
+
+test: setup lint  ## style, types, all tests (which build the documentation), and the wheel
 	@sh tools/test_clients.sh
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python tools/check_wheel.py
 
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-docs: setup  ## build the documentation into site/
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+docs: setup  ## the documentation as a site in site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-benchmark: setup
+wheel-test: setup  ## build the wheel, install it into an empty environment, and run its demo
+	$(BIN)/python tools/check_wheel.py
+
+benchmark: setup  ## measure maps, ablations and peers
 	$(BIN)/python tools/benchmark.py
 
 setup: system $(STAMP)

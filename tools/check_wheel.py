@@ -1,0 +1,78 @@
+#!/usr/bin/env python3
+"""Builds the wheel, installs it into an empty environment, and runs its demo there: python tools/check_wheel.py
+
+The dependencies come from this interpreter's environment, by a path in the new environment's site-packages, so that
+nothing is downloaded. freeocc3d itself can only come from the wheel: the new processes start outside the repository.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import venv
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SOURCES = ("freeocc3d", "configs", "setup.cfg", "pyproject.toml", "README.md", "LICENSE")
+FRAMES = 40
+PICTURES = ("map.png", "query_red_cup.png", "query_blue_chair.png", "query_green_plant.png")
+
+
+def build_wheel(folder: Path) -> Path:
+    """The wheel, built of a copy of the sources, which holds nothing of earlier builds."""
+    sources = folder / "sources"
+    sources.mkdir()
+    for name in SOURCES:
+        path = REPOSITORY / name
+        if path.is_dir():
+            shutil.copytree(path, sources / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(path, sources / name)
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", str(folder), str(sources)], folder)
+    return next(folder.glob("*.whl"))
+
+
+def install(wheel: Path, folder: Path) -> Path:
+    """The folder of programs of a new environment that holds the wheel, and finds the dependencies of this one."""
+    venv.create(folder, with_pip=False)
+    python = folder / "bin" / "python"
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "--python", str(python)]
+    run([*pip, "install", "--no-deps", "--no-index", str(wheel)], folder)
+    packages = run([str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"], folder)
+    paths = dict.fromkeys((sysconfig.get_path("purelib"), sysconfig.get_path("platlib")))
+    (Path(packages.strip()) / "dependencies.pth").write_text("\n".join(paths) + "\n", encoding="utf-8")
+    return python.parent
+
+
+def run(command: list[str], folder: Path) -> str:
+    """What a command prints to stdout, started in a folder that has nothing to do with the repository."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory(prefix="freeocc3d-wheel-") as temporary:
+        folder = Path(temporary)
+        wheel = build_wheel(folder)
+        programs = install(wheel, folder / "environment")
+        found = run([str(programs / "python"), "-c", "import freeocc3d; print(freeocc3d.__file__)"], folder).strip()
+        if not Path(found).is_relative_to(folder / "environment"):
+            raise SystemExit(f"freeocc3d comes from {found}, not from the wheel")
+        command = str(programs / "freeocc3d")
+        run([command, "list"], folder)
+        print(run([command, "demo", "--frames", str(FRAMES), "-o", "demo"], folder))
+        if missing := [name for name in PICTURES if not (folder / "demo" / name).is_file()]:
+            raise SystemExit(f"the demo left out {', '.join(missing)}")
+        print(f"{wheel.name}: {wheel.stat().st_size:,} bytes, installed, and its demo ran")
+
+
+if __name__ == "__main__":
+    main()
