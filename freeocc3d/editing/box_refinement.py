@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, overload
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,28 +141,9 @@ def read_settings(scan_map: Map) -> Settings:
     return config.load_saved(scan_map.path / store.CONFIG).changed("occupancy", device="cpu")
 
 
-class _Decoded(Sequence[Frame]):
-    """Some keyframes of a map, decoded anew each time that they are asked for."""
-
-    def __init__(self, keyframes: Keyframes, rows: NDArray[np.int64]):
-        self.keyframes, self.rows = keyframes, rows
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    @overload
-    def __getitem__(self, row: int) -> Frame: ...
-    @overload
-    def __getitem__(self, row: slice) -> list[Frame]: ...
-    def __getitem__(self, row: int | slice) -> Frame | list[Frame]:
-        if isinstance(row, slice):
-            return [self.keyframes[int(own)] for own in self.rows[row]]
-        return self.keyframes[int(self.rows[row])]
-
-
 def _seeing(
     scan_map: Map, box: Box, margin: float, progress: Progress
-) -> tuple[_Decoded, NDArray[np.int64], Trajectory]:
+) -> tuple[Keyframes, NDArray[np.int64], Trajectory]:
     """The keyframes that show something in the box, their rows among all, and the trajectory."""
     trajectory, keyframes = scan_map.trajectory, scan_map.keyframes
     progress.stage("keyframes", len(keyframes))
@@ -171,7 +152,7 @@ def _seeing(
         seen[row] = box.contains(_points(frame, T, _LOOK_STRIDE)[1], margin).any()
         progress.advance(row + 1)
     rows = np.flatnonzero(seen)
-    return _Decoded(keyframes, rows), rows, trajectory
+    return keyframes.only(trajectory.keyframes[rows]), rows, trajectory
 
 
 def _points(

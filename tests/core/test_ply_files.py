@@ -1,0 +1,49 @@
+"""PLY files: what is written reads back, and no file is believed before its size bears its header out."""
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from freeocc3d.core.errors import FreeOccError
+from freeocc3d.core.ply_files import read_ply_header, read_ply_vertices, write_ply
+
+
+def vertices(count: int) -> np.ndarray:
+    rows = np.zeros(count, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("id", "<i4")])
+    rows["x"], rows["red"], rows["id"] = np.arange(count), 7, -np.arange(count)
+    return rows
+
+
+def test_what_is_written_reads_back_and_in_open3d(tmp_path: Path) -> None:
+    quads = np.array([[0, 1, 2, 3]], np.int32)
+    write_ply(tmp_path / "a.ply", vertices(4), quads, ["of a test"])
+    np.testing.assert_array_equal(read_ply_vertices(tmp_path / "a.ply"), vertices(4))
+    header = read_ply_header(tmp_path / "a.ply")
+    assert [(name, count) for name, count, _ in header.elements] == [("vertex", 4), ("face", 1)]
+    points = np.asarray(o3d.io.read_point_cloud(str(tmp_path / "a.ply")).points)
+    np.testing.assert_array_equal(points[:, 0], np.arange(4))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (b"", "not a PLY"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n", "not a PLY"),
+        (b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n", "header cannot be read"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty text x\nend_header\n", "header cannot be read"),
+        (b"ply\nformat ascii 1.0\nproperty float x\nend_header\n", "header cannot be read"),
+        (b"ply\nformat ascii 1.0\nelement vertex 9000000000\nproperty float x\nend_header\n0\n", "damaged"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty double x\nend_header\n12345678", "damaged"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nelement face 9\n"
+            b"property list uchar int vertex_indices\nend_header\n12345678",
+            "damaged",
+        ),
+    ],
+)
+def test_headers_that_the_file_does_not_bear_out_are_refused(tmp_path: Path, text: bytes, said: str) -> None:
+    (tmp_path / "a.ply").write_bytes(text)
+    with pytest.raises(FreeOccError, match=said):
+        read_ply_header(tmp_path / "a.ply")
