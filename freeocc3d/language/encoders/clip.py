@@ -69,6 +69,16 @@ class ClipEncoder(Encoder):
         h, w = tiling.window
         return np.asarray(features[:, -h * w :].reshape(len(images), h, w, -1))
 
+    def pooled(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(B, D) the network's own embeddings of (B, 3, H, W) normalised images, by which a test compares a package
+        with its checkpoint; H and W multiples of the patch."""
+        from .. import clip_attention
+
+        q, k, v, stream = self._image.run(["queries", "keys", "values", "stream"], {"image": images})
+        grid = images.shape[2] // self.package.patch, images.shape[3] // self.package.patch
+        mixed = clip_attention.mix_values("plain", q, k, v, grid)
+        return np.asarray(self._head.run(["pooled"], {"mixed": mixed, "stream": stream})[0])
+
     def text_state(self) -> dict[str, Any]:
         return self.options.wording.state(self.package)
 
