@@ -1,6 +1,6 @@
 """Exact Euclidean distances between two kinds of voxels in a dense grid, in the memory of their result.
 
-Squared distances are found axis by axis as lower envelopes of parabolas. A voxel's own kind tells which of the two
+Squared distances are found axis by axis as lower envelopes of parabolas. A voxel's kind says which of the two
 distances it holds, so that one array of 4 bytes a voxel serves both and becomes the result in place.
 Source: P. Felzenszwalb and D. Huttenlocher, Distance Transforms of Sampled Functions, Theory of Computing 8, 2012.
 """
@@ -18,7 +18,7 @@ LONGEST = 26_000
 
 
 def transform_signed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """(X, Y, Z) distance, in voxels, from each voxel's centre to that of the nearest one of the other kind, negative
+    """(X, Y, Z) distance, in voxels, from each voxel's center to that of the nearest one of the other kind, negative
     inside; infinite where there is none. No edge may be longer than LONGEST."""
     inside = np.ascontiguousarray(inside)
     squared = np.full(inside.shape, _NONE, np.int32)

@@ -18,7 +18,7 @@ from ..settings.typed_options import TypedOptions
 from ..storage.store import Map
 
 Frame = Literal["map", "gravity", "first-camera"]
-"""The map's own; z up with the floor at z = 0 and the walls along x and y; z up with the first camera at the origin,
+"""The map's frame; z up with the floor at z = 0 and the walls along x and y; z up with the first camera at the origin,
 looking along x."""
 UprightFrame = Literal["gravity", "first-camera"]
 """Those in which z points up."""
@@ -29,7 +29,7 @@ class BoxOptions(TypedOptions, frozen=True):
     """The part of a map that is written."""
 
     box: Box | None = None
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centres lie in
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centers lie in
     it are written; null = all."""
 
     def __post_init__(self) -> None:
@@ -45,8 +45,8 @@ class VoxelOptions(BoxOptions, frozen=True):
     """The frame of the voxels that are written, and which of them are."""
 
     frame: Frame = "gravity"
-    """"gravity" (z up, floor at 0), "first-camera" (z up, from there) or "map"; voxels keep their places in the last
-    only, in the others they are sampled anew."""
+    """"gravity" (z up, floor at 0), "first-camera" (z up, origin there) or "map". Voxels keep their places only in the
+    map's frame; for the others they are resampled."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def to_frame(scan_map: Map, frame: str) -> NDArray[np.float64]:
     trajectory = scan_map.trajectory
     posed = np.flatnonzero(trajectory.has_pose)
     if not len(posed):
-        raise ExportError("The map has no camera pose, so that there is no first camera: use --frame gravity.")
+        raise ExportError("The map has no camera pose, so there is no first camera: use --frame gravity.")
     return compute_first_camera_frame(scan_map.T_gravity_map, trajectory.T_world_cam[posed[0]])
 
 
@@ -102,13 +102,13 @@ def place_voxels(
     one_size: bool = False,
     box: Box | None = None,
 ) -> PlacedVoxels:
-    """The map's voxels in a frame. In the map's own they are what they are; in another they are sampled anew on a
+    """The map's voxels in a frame. In the map's frame they stay what they are; in another they are resampled on a
     lattice of the map's voxel size (the largest, of a map of several), and so they are where ``one_size`` asks for it
     or where ``origin``, a place of the new lattice, does not lie on the old one.
 
     origin: (3,) lower corner of some voxel, in the frame; by default such that z = 0 lies amid a layer of voxels, the
-    map's own lattice in its own frame.  box: x0, y0, z0, x1, y1, z1 in the frame: what is not in it, by voxels'
-    centres, is unknown. Raises ExportError for a map of which nothing is known, there.
+    map's lattice in the map's frame.  box: x0, y0, z0, x1, y1, z1 in the frame: what lies outside of it, by voxels'
+    centers, is unknown. Raises ExportError for a map of which nothing is known, there.
     """
     there = _placed(scan_map, frame, origin, one_size)
     return _within(there, np.array(box).reshape(2, 3)) if box is not None else there
@@ -163,7 +163,7 @@ def find_floor_z(scan_map: Map, T_frame_map: NDArray[np.float64]) -> float:
 
 
 def write_description(path: Path, described: dict[str, Any]) -> None:
-    """Write ``PATH.json`` beside an export whose format has no room for its frame. Raises OSError."""
+    """Write ``PATH.json`` next to an export whose format cannot say its frame. Raises OSError."""
     unit = "metre" if described.get("metric", True) else "unknown"
     text = json.dumps({"file": path.name, "unit": unit, **described}, indent=1)
     path.with_name(f"{path.name}.json").write_text(text + "\n", encoding="utf-8")

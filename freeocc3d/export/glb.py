@@ -1,4 +1,4 @@
-"""glTF binary: the occupied voxels as a coloured mesh for Blender, Unity, Unreal and web viewers.
+"""glTF binary: the occupied voxels as a colored mesh for Blender, Unity, Unreal and web viewers.
 
 One mesh of the faces between occupied and other voxels, in the frame's coordinates; its node turns it so that up is +y,
 as glTF has it. The node's `extras` say which frame that is. Source: glTF 2.0 specification, Khronos Group.
@@ -90,7 +90,7 @@ def _described(
 
 
 def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Colours of the screen, sRGB, as the light that a renderer computes with and glTF's vertex colours are."""
+    """Colors of the screen, sRGB, as the light that a renderer computes with and glTF's vertex colors are."""
     c = np.arange(256) / 255.0
     table = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     return np.rint(255 * table).astype(np.uint8)[colors]

@@ -1,6 +1,6 @@
 """Costs of words for planners: masks for Nav2's KeepoutFilter, over the cells of a plan.
 
-A mask holds 0 where a word asks for nothing, 100 where a robot must not be, and 1 to 99 where it may be at that cost.
+A mask holds 0 where no word has a cost, 100 where a robot must not be, and 1 to 99 where it may be at that cost.
 Nav2 takes them as they are for `type: 0, base: 0.0, multiplier: 1.0` of its costmap filter info server.
 Source: nav2_costmap_2d's KeepoutFilter, nav2_map_server's map_io.
 """
@@ -49,8 +49,8 @@ def parse_avoided(entries: Sequence[str]) -> list[Avoided]:
     parts = [TOGETHER, *(avoided.file_part for avoided in found)]
     if len(set(parts)) < len(parts):
         raise ConfigError(
-            f"'avoid' names two words whose layers would have the same file name, or one that would be '{TOGETHER}' as "
-            "that of all together is: leave one out."
+            "'avoid' names two words whose masks would have the same file name, or a word whose mask would be called "
+            f"'{TOGETHER}' like the mask of all words: leave one out."
         )
     return found
 
@@ -73,8 +73,8 @@ def write_layers(
     """Write a mask for each word and one of all, NAME.WORD.yaml and NAME.avoid.yaml for a plan NAME.yaml. Returns
     what was written, and a sentence for each word that is nowhere, so that its mask is empty, or half understood.
 
-    highest: z in the frame up to which a thing counts; what hangs higher is driven under. Raises ExportError for a word
-    that the map does not understand: an empty mask would look as if there were nothing to avoid.
+    highest: z in the frame up to which a thing counts; a robot drives under what is higher. Raises ExportError for a
+    word that the map does not understand: an empty mask would look as if there were nothing to avoid.
     """
     if not avoided:
         return [], []
@@ -111,7 +111,7 @@ def compute_cost_map(
     cells: NDArray[np.int64], shape: tuple[int, int], size: float, avoided: Avoided
 ) -> NDArray[np.uint8]:
     """(X, Y) costs 0…100 around (N, 2) cells, which may lie outside of the plan: the cost on them, and 100 within the
-    distance, or a lower one that falls off evenly over it. Distances are Euclidean, between the cells' centres."""
+    distance, or a lower one that falls off evenly over it. Distances are Euclidean, between the cells' centers."""
     from scipy import ndimage
 
     costs = np.zeros(shape, np.uint8)

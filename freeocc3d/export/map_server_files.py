@@ -49,7 +49,7 @@ def encode_costs(costs: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def write_map(path: Path, pixels: NDArray[np.uint8], grid: CellGrid, reading: Reading, about: str) -> None:
-    """Write ``path``, a .yaml, and the image beside it of (X, Y) pixels: x to the right, y upwards. Raises OSError."""
+    """Write ``path``, a .yaml, and the image of (X, Y) pixels next to it: x to the right, y upwards. Raises OSError."""
     image = path.with_suffix(".pgm")
     rows = np.ascontiguousarray(pixels.T[::-1])
     image.write_bytes(f"P5\n{rows.shape[1]} {rows.shape[0]}\n255\n".encode("ascii") + rows.tobytes())

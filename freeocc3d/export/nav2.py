@@ -78,7 +78,7 @@ def plan(
     occupancy: Occupancy, low: float, high: float, min_free: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """(X, Y) FREE, OCCUPIED or UNKNOWN of the columns over the known voxels' box, from the voxels of one size whose
-    centres lie between two heights z, and the (2,) lower corner of cell (0, 0), metres. Raises ExportError."""
+    centers lie between two heights z, and the (2,) lower corner of cell (0, 0), metres. Raises ExportError."""
     size, (x0, y0, z0) = occupancy.voxel_size, occupancy.origin
     first, last = int(np.ceil((low - z0) / size - 0.5)), int(np.floor((high - z0) / size - 0.5))
     columns = {}

@@ -1,7 +1,7 @@
-"""OctoMap: an octree of free and occupied space, `.bt` (free or occupied), `.ot` (with log-odds, and colours).
+"""OctoMap: an octree of free and occupied space, `.bt` (free or occupied), `.ot` (with log-odds, and colors).
 
 Read by MoveIt, OMPL's examples, octovis and whatever links OctoMap. The tree's resolution is the map's smallest voxel;
-a map of several voxel sizes becomes leaves of other depths. NAME.json beside it holds the frame.
+a map of several voxel sizes becomes leaves of other depths. NAME.json next to it holds the frame.
 Source: the file formats of A. Hornung et al., OctoMap, Autonomous Robots 2013, as its library 1.9 writes them.
 """
 
@@ -22,9 +22,9 @@ from .octree import KEY_ORIGIN, Leaves, Octree, build_octree
 REQUIRES: tuple[str, ...] = ()
 
 _CLAMP = np.log(0.1192 / 0.8808), np.log(0.971 / 0.029)
-"""OctoMap's own range of log-odds."""
+"""OctoMap's default range of log-odds."""
 _LEAST = 0.05  # log-odds: an occupied voxel has more, a free one less than the negative
-_UNSET = 255  # of all three channels: OctoMap's colour of a node that has none
+_UNSET = 255  # of all three channels: OctoMap's color of a node that has none
 
 
 class Options(VoxelOptions, frozen=True):
@@ -35,13 +35,13 @@ class Options(VoxelOptions, frozen=True):
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the tree. Raises ConfigError for another ending than .bt and .ot or colours in a .bt; ExportError if
+    """Write the tree. Raises ConfigError for another ending than .bt and .ot or colors in a .bt; ExportError if
     nothing is known, or the map is larger than a tree of its resolution can be."""
     binary = path.suffix == ".bt"
     if not binary and path.suffix != ".ot":
         raise ConfigError(f"An OctoMap file is named .bt (free or occupied) or .ot (log-odds), got '{path.name}'.")
     if binary and options.color:
-        raise ConfigError("A .bt holds no colours: name the file .ot.")
+        raise ConfigError("A .bt holds no colors: name the file .ot.")
     there = place_voxels(scan_map, options.frame, origin=(0.0, 0.0, 0.0), box=options.box)
     tree = build_octree(collect_leaves(there.occupancy, log_odds=not binary, color=options.color))
     with path.open("wb") as stream:
@@ -86,12 +86,12 @@ def _log_odds(probability: NDArray[np.float32], occupied: NDArray[np.bool_]) -> 
 
 
 def _binary_nodes(tree: Octree) -> bytes:
-    """Two bytes for each node with children, two bits a child; leaves are told by their parents alone."""
+    """Two bytes for each node with children, two bits a child; leaves stand in their parents only."""
     return tree.kinds[tree.children > 0].astype("<u2").tobytes()
 
 
 def _full_nodes(tree: Octree, color: bool) -> bytes:
-    """Log-odds, colour if any, and which children there are, for each node."""
+    """Log-odds, color if any, and which children there are, for each node."""
     fields: list[tuple[Any, ...]] = [("value", "<f4"), *([("color", "u1", 3)] if color else []), ("children", "u1")]
     nodes = np.empty(len(tree), fields)
     nodes["value"], nodes["children"] = tree.values, tree.children

@@ -70,7 +70,7 @@ class _Level:
 
 def build_octree(levels: Sequence[Leaves]) -> Octree:
     """The pruned tree of cubes that do not overlap, level n having edges of 2^n voxels: eight leaves of one value and
-    colour become one of the next size. Corners must lie within the tree, [-KEY_ORIGIN, KEY_ORIGIN)."""
+    color become one of the next size. Corners must lie within the tree, [-KEY_ORIGIN, KEY_ORIGIN)."""
     below = _leaves(levels[0] if levels else None, 0)
     kept: list[_Level] = []
     for height in range(DEPTH):

@@ -37,7 +37,7 @@ def write_vdb(
     """Write one grid of background 0. Raises OSError.
 
     keys: (B, 3) indices of one or more blocks.  values, active: (B, 512), the local index being (i * 8 + j) * 8 + k;
-    what is not active has no value.  center: (3,) position of the centre of voxel (0, 0, 0), where OpenVDB has index 0.
+    what is not active has no value.  center: (3,) position of the center of voxel (0, 0, 0), where OpenVDB has index 0.
     """
     node = keys.astype(np.int64) // _LEAVES
     root = node // _NODES

@@ -1,4 +1,4 @@
-"""Polygon file: the occupied voxels as a mesh of cubes or as points, coloured."""
+"""Polygon file: the occupied voxels as a mesh of cubes or as points, colored."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .export_frames import Frame, PlacedVoxels, VoxelOptions, place_voxels
 REQUIRES: tuple[str, ...] = ()
 
 ColorBy = Literal["rgb", "class", "height", "probability"]
-"""What occupied voxels may be coloured by."""
+"""What occupied voxels may be colored by."""
 
 
 class Options(VoxelOptions, frozen=True):
@@ -30,7 +30,7 @@ class Options(VoxelOptions, frozen=True):
 
     frame: Frame = "map"
     form: Literal["cubes", "points"] = "cubes"
-    """"cubes" for a mesh of the faces between occupied and other voxels, "points" for voxel centres."""
+    """"cubes" for a mesh of the faces between occupied and other voxels, "points" for voxel centers."""
     color: ColorBy = "rgb"
     """"rgb" for the surface's own color, "class" for the class that fits best, "height" above the lowest voxel, or
     "probability" of being occupied, 0 to 1; the last two from dark blue to yellow."""
@@ -45,7 +45,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 
 
 def write_query_ply(occupancy: Occupancy, results: list[QueryResult], path: Path, overwrite: bool = False) -> None:
-    """Write all occupied voxels as cubes, those of the results' regions in one strong colour a word, the others pale.
+    """Write all occupied voxels as cubes, those of the results' regions in one strong color a word, the others pale.
     Raises ExportError."""
     _refuse_empty(occupancy)
     colors = highlight_regions(occupancy.colors, [result.regions for result in results])
@@ -58,7 +58,7 @@ def _refuse_empty(occupancy: Occupancy) -> None:
 
 
 def choose_colors(scan_map: Map, there: PlacedVoxels, by: str) -> NDArray[np.uint8]:
-    """(V, 3) colour of each occupied voxel of a placed map, by one of ``ColorBy``."""
+    """(V, 3) color of each occupied voxel of a placed map, by one of ``ColorBy``."""
     occupancy = there.occupancy
     if by == "class":
         return assign_class_colors(scan_map.vocabulary)[scan_map.labels()[there.rows]]
@@ -87,7 +87,7 @@ def write_colored_ply(
     quads: NDArray[np.int32] | None = None,
     described: dict[str, Any] | None = None,
 ) -> None:
-    """Binary little-endian PLY with coloured vertices and, if given, quads; what describes it in comments. Raises
+    """Binary little-endian PLY with colored vertices and, if given, quads; what describes it in comments. Raises
     OSError."""
     vertices = np.empty(
         len(points), [*((name, "<f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]

@@ -153,7 +153,7 @@ def test_what_cannot_be_written_is_told(tmp_path) -> None:
     scan_map = map_of(scattered())
     with pytest.raises(ConfigError, match=r"named .bt"):
         export_map(scan_map, "octomap", tmp_path / "map.octree")
-    with pytest.raises(ConfigError, match="no colours"):
+    with pytest.raises(ConfigError, match="no colors"):
         export_map(scan_map, "octomap", tmp_path / "map.bt", {"color": True})
     with pytest.raises(ExportError, match="farther than"):
         export_map(map_of(occupancy_of([(40_000, 0, 0)])), "octomap", tmp_path / "map.bt", {"frame": "map"})
