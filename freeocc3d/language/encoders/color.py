@@ -18,18 +18,20 @@ CIE94: CIE publication 116-1995.
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from ...capture.base import Capture
 from ...core.errors import MapError
 from ...core.types import Frame
 from ...settings.option_types import PositiveInt
 from ...settings.typed_options import TypedOptions
 from .base import Encoder, TextEncoder, TextFeatures
+
+if TYPE_CHECKING:
+    from ...capture.base import Capture
 
 REQUIRES: tuple[str, ...] = ()
 
