@@ -242,3 +242,14 @@ def _with_parents(module: str | None) -> list[str]:
 def test_the_list_of_backends_needs_only_the_standard_library() -> None:
     packages = {room_of(imported.module) for imported in imports_of("settings.registry")} - {"freeocc3d"}
     assert not packages & (HEAVY | {"numpy", "yaml"})
+
+
+def test_a_reconstruction_imports_no_evaluation() -> None:
+    waiting, reached = ["pipeline.run"], {"pipeline.run"}
+    while waiting:
+        for imported in imports_of(waiting.pop()):
+            if not imported.typing_only:
+                new = set(_with_parents(own(imported))) - reached
+                reached |= new
+                waiting += new
+    assert not {module for module in reached if room_of(module) == "evaluation"}

@@ -1,9 +1,7 @@
-"""From a folder to a map: the whole run on the built-in room and on a piece of a real scan; interruption, resuming,
-bad input."""
+"""From a folder to a map: the whole run on the built-in room and on a piece of a real scan; bad input."""
 
 from __future__ import annotations
 
-import errno
 import json
 import shutil
 
@@ -11,32 +9,15 @@ import cv2
 import numpy as np
 import pytest
 from helpers import data_folder, truncate, write_scannet, write_seven_scenes
-from vision_servers import saying, serving
+from pipeline_runs import ROOM, listing, notices
 
 import freeocc3d
 from freeocc3d.capture import open_capture
-from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, Interrupted, MapError, TrackingError
+from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, MapError, TrackingError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import FREE, OCCUPIED
-from freeocc3d.core.warnings import Notice, read_notices
-from freeocc3d.pipeline import stages
 from freeocc3d.settings import config
 from freeocc3d.storage import store
-
-ROOM = {"capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "stop": 24}}
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory) -> store.Map:
-    return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", ROOM)
-
-
-def notices(made) -> list[Notice]:
-    return read_notices(made.report["warnings"])
-
-
-def listing(folder) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def test_the_room_becomes_a_map_with_every_layer(room) -> None:
@@ -97,63 +78,6 @@ def test_a_pose_free_run_never_reads_poses_or_class_images(tmp_path, monkeypatch
     assert made.manifest["counts"]["voxels"]["occupied"] > 500
 
 
-class Stopper(Progress):
-    """Ctrl-C after some frames of a stage."""
-
-    def __init__(self, stage: str, after: int):
-        self.target, self.after, self.now = stage, after, ""
-
-    def stage(self, name, total=None) -> None:
-        self.now = name
-
-    def advance(self, done) -> None:
-        if self.now == self.target and done == self.after:
-            raise KeyboardInterrupt
-
-
-@pytest.mark.parametrize(("stage", "after"), [("tracking", 12), ("tracking", 3), ("language", 1)])
-def test_an_interrupted_run_leaves_no_map_and_resumes_to_the_same(tmp_path, room, monkeypatch, stage, after) -> None:
-    monkeypatch.setattr(stages, "_CHECKPOINT_FRAMES", 5)
-    output = tmp_path / "map"
-    with pytest.raises(Interrupted, match="--resume" if after != 3 else "nothing is kept"):
-        freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper(stage, after))
-    assert not output.exists()
-    if after != 3:  # there was a checkpoint
-        with pytest.raises(MapError, match="--resume"):
-            freeocc3d.reconstruct("builtin:room", output, ROOM)
-    resumed = freeocc3d.reconstruct("builtin:room", output, ROOM, resume=True)
-    assert not (tmp_path / "map.partial").exists()
-    np.testing.assert_allclose(resumed.trajectory.T_world_cam[:24], room.trajectory.T_world_cam[:24], atol=5e-3)
-    assert resumed.manifest["keyframes"] == room.manifest["keyframes"]
-
-
-def test_a_run_is_not_resumed_with_other_options_and_loses_nothing_by_the_attempt(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(stages, "_CHECKPOINT_FRAMES", 5)
-    output, work = tmp_path / "map", tmp_path / "map.partial"
-    with pytest.raises(Interrupted):
-        freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper("tracking", 12))
-    before = listing(work)
-    for other in ({"tracking": {"backend": "known"}}, {"tracking": {"rgbd": {"neighbours": -1}}}):
-        with pytest.raises(FreeOccError):
-            freeocc3d.reconstruct("builtin:room", output, {**ROOM, **other}, resume=True)
-    with pytest.raises(CaptureError):
-        freeocc3d.reconstruct(tmp_path / "typo", output, overwrite=True)
-    assert listing(work) == before
-    more_broken = {**ROOM, "capture": {**ROOM["capture"], "max_broken": 0.5}}
-    assert freeocc3d.reconstruct("builtin:room", output, more_broken, resume=True).trajectory.has_pose[:24].all()
-
-
-def test_time_before_an_interruption_counts(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(stages, "_CHECKPOINT_FRAMES", 20)
-    with pytest.raises(Interrupted):
-        freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, progress=Stopper("tracking", 21))
-    state = np.load(tmp_path / "map.partial" / "tracking.npz")
-    spent = json.loads(str(state["log"]))["seconds"]["tracking"]
-    assert spent > 0.05
-    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, resume=True)
-    assert made.report["seconds"]["tracking"] > spent
-
-
 def test_neighbouring_folders_are_left_alone(tmp_path, room) -> None:
     output = shutil.copytree(room.path, tmp_path / "map")
     (tmp_path / "map.old").mkdir()
@@ -169,19 +93,6 @@ def test_neighbouring_folders_are_left_alone(tmp_path, room) -> None:
             freeocc3d.reconstruct("builtin:room", tmp_path / "next", short, **options)
     with pytest.raises(MapError, match="cannot be the name"):
         freeocc3d.reconstruct("builtin:room", ".", short)
-
-
-def test_a_disk_that_fills_up_at_the_very_end_costs_nothing(tmp_path, monkeypatch) -> None:
-    def full(*arguments) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(store, "write_manifest", full)
-        with pytest.raises(MapError, match="disk is full"):
-            freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM)
-    kept = np.load(tmp_path / "map.partial" / "tracking.npz")
-    assert int(kept["done"]) == 24
-    assert freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, resume=True).query("red").matched
 
 
 def test_an_existing_map_is_not_touched_without_overwrite(tmp_path, room) -> None:
@@ -210,24 +121,6 @@ def test_overwrite_replaces_a_map(tmp_path, room) -> None:
     made = freeocc3d.reconstruct("builtin:room", output, short, overwrite=True)
     assert made.manifest["counts"]["frames_with_pose"] == 6
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
-
-
-def test_a_full_disk_is_told_and_what_was_done_is_kept(tmp_path, monkeypatch) -> None:
-    from freeocc3d.storage.keyframes import Keyframes
-
-    written = []
-
-    def append(self, frame) -> None:
-        if len(written) == 1:
-            raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path / "x"))
-        written.append(frame.index)
-        original(self, frame)
-
-    original = Keyframes.append
-    monkeypatch.setattr(Keyframes, "append", append)
-    with pytest.raises(MapError, match=r"disk is full.*--resume"):
-        freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM)
-    assert not (tmp_path / "map").exists()
 
 
 @pytest.mark.parametrize(
@@ -319,20 +212,6 @@ def test_labels_of_the_capture_answer_by_class(tmp_path) -> None:
     assert not made.query("bathtub").matched
 
 
-@pytest.fixture(scope="module")
-def glued(tmp_path_factory):
-    """A folder that holds two places: 15 frames of the bedroom, then 8 of the living room."""
-    folder = tmp_path_factory.mktemp("glued") / "scan"
-    (folder / "results").mkdir(parents=True)
-    house = data_folder() / "house"
-    shutil.copy(house / "bedroom" / "cam_params.json", folder)
-    shown = [*((house / "bedroom", i) for i in range(0, 60, 4)), *((house / "living", i) for i in range(0, 32, 4))]
-    for n, (source, i) in enumerate(shown):
-        for kind in ("frame{:06d}.jpg", "depth{:06d}.png"):
-            shutil.copy(source / "results" / kind.format(i), folder / "results" / kind.format(n))
-    return folder
-
-
 def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -> None:
     from freeocc3d.cli.map_summary import summary_text
 
@@ -354,21 +233,6 @@ def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -
     assert "frames 15 to 22: 8 with a pose" in text
     assert "apart, not in the map" in text
     assert cv2.imread(str(made.path / "trajectory.png")).shape[2] == 3
-
-
-def test_a_run_with_two_submaps_resumes_to_the_same(tmp_path, glued, monkeypatch) -> None:
-    def full(*arguments) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    whole = freeocc3d.reconstruct(glued, tmp_path / "whole")
-    with monkeypatch.context() as patched:
-        patched.setattr(store, "write_manifest", full)
-        with pytest.raises(MapError, match="disk is full"):
-            freeocc3d.reconstruct(glued, tmp_path / "map")
-    resumed = freeocc3d.reconstruct(glued, tmp_path / "map", resume=True)
-    np.testing.assert_allclose(resumed.trajectory.T_world_cam, whole.trajectory.T_world_cam, atol=1e-6)
-    assert resumed.trajectory.keyframes.tolist() == whole.trajectory.keyframes.tolist()
-    np.testing.assert_array_equal(resumed.occupancy.state, whole.occupancy.state)
 
 
 def test_poses_of_another_system_make_a_map(tmp_path) -> None:
@@ -399,57 +263,3 @@ def test_a_color_camera_of_another_focal_length_is_told_and_corrected(tmp_path) 
     (warning,) = (notice.text for notice in notices(found) if notice.code == "color-focal-corrected")
     assert "0.9" in warning
     assert "capture.color_focal=1" in warning
-
-
-def _with_vocabulary(url: str, **more) -> dict:
-    return {**ROOM, "vocabulary": {"endpoint": url, "model": "a-model", "keyframes": 3, "retries": 0, **more}}
-
-
-def test_names_by_a_model_are_kept_in_the_map_and_its_key_is_not(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("ROOM_KEY", "sk-never-written")
-    with serving(saying('["table", "red cup"]', '["table"]')) as server:
-        settings = _with_vocabulary(server.url, api_key_env="ROOM_KEY")
-        made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings)
-    named = made.manifest["vocabulary"]
-    assert len(server.asked) == len(named["keyframes"]) == 3
-    assert set(named["keyframes"]) <= set(made.manifest["keyframes"])
-    assert named["names"]["table"] == {"count": 3, "keyframes": named["keyframes"]}
-    assert named["names"]["red cup"]["count"] == 1
-    assert made.report["seconds"]["vocabulary"] > 0
-    assert server.headers[0]["Authorization"] == "Bearer sk-never-written"
-    assert not any(b"never-written" in content for content in listing(made.path).values())
-    assert "vocabulary.stage.json" not in listing(made.path)
-
-
-def test_a_model_that_cannot_be_asked_costs_names_and_a_warning(tmp_path) -> None:
-    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", _with_vocabulary("http://127.0.0.1:9/v1"))
-    assert made.manifest["vocabulary"]["names"] == {}
-    (warning,) = (notice.text for notice in notices(made) if notice.code == "vocabulary-incomplete")
-    assert "lacks 3 of 3 keyframes" in warning
-    assert made.query("red").matched
-
-
-def test_a_resumed_run_asks_for_no_keyframe_twice(tmp_path) -> None:
-    with serving(saying('["table"]')) as server:
-        settings = _with_vocabulary(server.url)
-        for stage, after in (("vocabulary", 2), ("language", 1)):
-            with pytest.raises(Interrupted):
-                freeocc3d.reconstruct(
-                    "builtin:room",
-                    tmp_path / "map",
-                    settings,
-                    progress=Stopper(stage, after),
-                    resume=stage != "vocabulary",
-                )
-        made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings, resume=True)
-    assert len(server.asked) == 3
-    assert made.manifest["vocabulary"]["names"]["table"]["count"] == 3
-
-
-def test_a_key_that_is_not_set_is_told_before_any_work(tmp_path, monkeypatch) -> None:
-    monkeypatch.delenv("ROOM_KEY", raising=False)
-    with pytest.raises(ConfigError, match="ROOM_KEY"):
-        freeocc3d.reconstruct(
-            "builtin:room", tmp_path / "map", _with_vocabulary("http://127.0.0.1:9/v1", api_key_env="ROOM_KEY")
-        )
-    assert not (tmp_path / "map.partial").exists()

@@ -1,0 +1,19 @@
+"""What tests of whole runs share: a short scan of the built-in room, and what a map's folder holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from freeocc3d.core.warnings import Notice, read_notices
+
+ROOM = {"capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "stop": 24}}
+
+
+def notices(made) -> list[Notice]:
+    """The warnings of a map's report."""
+    return read_notices(made.report["warnings"])
+
+
+def listing(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, with what is in it."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
