@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import statistics
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -55,9 +56,9 @@ def measure_encoders() -> Figures:
                 {
                     "precision": precision,
                     "bytes": package.bytes,
-                    "frame_seconds": time_fastest(lambda e=encoder: e.patches(rgb), RUNS),
-                    "upsampled_frame_seconds": time_fastest(lambda e=encoder: e.encode(frame), RUNS),
-                    "text_seconds": time_fastest(lambda t=text: t.embed(list(WORDS)), RUNS) / len(WORDS),
+                    "frame_seconds": time_fastest(partial(encoder.patches, rgb), RUNS),
+                    "upsampled_frame_seconds": time_fastest(partial(encoder.encode, frame), RUNS),
+                    "text_seconds": time_fastest(partial(text.embed, list(WORDS)), RUNS) / len(WORDS),
                     "patch_cosine": float((patches * exact[0]).sum(axis=-1).min()),
                     "text_cosine": float((words * exact[1]).sum(axis=-1).min()),
                 }

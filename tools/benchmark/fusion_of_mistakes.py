@@ -60,7 +60,8 @@ def _superpixels(image: Any, rng: Any) -> Any:
     from scipy.spatial import cKDTree
 
     height, width = image.shape
-    grid = np.stack(np.mgrid[CELL_PX / 2 : height : CELL_PX, CELL_PX / 2 : width : CELL_PX], axis=-1).reshape(-1, 2)
+    rows, columns = np.mgrid[CELL_PX / 2 : height : CELL_PX, CELL_PX / 2 : width : CELL_PX]
+    grid = np.stack((rows, columns), axis=-1).reshape(-1, 2)
     seeds = grid + rng.uniform(-CELL_PX / 2, CELL_PX / 2, grid.shape)
     cell = cKDTree(seeds).query(np.indices(image.shape).reshape(2, -1).T)[1]
     return np.unique(cell * 256 + image.ravel(), return_inverse=True)[1].reshape(image.shape)

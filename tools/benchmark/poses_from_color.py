@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from freeocc3d.core.progress import Progress
+
 from .figures import Figures, tabulate
 
 STAGES = ("features", "matching", "mapping", "adjustment")
@@ -48,7 +50,7 @@ def choose_stride(frames: int) -> int:
     return STRIDES[frames < LONG]
 
 
-class _Watch:
+class _Watch(Progress):
     """A ``Progress`` that adds up the seconds of each stage."""
 
     def __init__(self) -> None:
@@ -61,12 +63,6 @@ class _Watch:
         if self._stage:
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
         self._stage, self._since = name, now
-
-    def advance(self, done: int) -> None:
-        pass
-
-    def warn(self, text: str) -> None:
-        pass
 
 
 def _defaults(capture: Any, frames: range, true: Any) -> Figures:

@@ -7,6 +7,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,12 +52,11 @@ def _measure_rows(job: Job, names: Sequence[str]) -> list[Figures]:
         slam = _try(f"{job.name}: dense SLAM", lambda: run_dense_slam(job))
     rows: list[Figures] = []
     for name in names:
-        measure: Callable[[], Figures]
         if name in known:
             variant = known[name]
-            measure, title, table = (lambda variant=variant: measure_map(job, variant)), variant.title, variant.table
+            measure, title, table = partial(measure_map, job, variant), variant.title, variant.table
         elif name in PEERS:
-            measure, title, table = (lambda name=name: measure_peer(job, name, slam)), PEERS[name], "Peers"
+            measure, title, table = partial(measure_peer, job, name, slam), PEERS[name], "Peers"
         else:
             continue
         row = _try(f"{job.name}: {name}", measure)

@@ -20,7 +20,7 @@ def measure_splat() -> Figures:
     from freeocc3d.core.voxel_keys import unpack_voxels
     from freeocc3d.occupancy import splat
 
-    options, origin = splat.Options(voxel_size=SPLAT_VOXEL_SIZE_M), np.start_steps(3)
+    options, origin = splat.Options(voxel_size=SPLAT_VOXEL_SIZE_M), np.zeros(3)
 
     def project(gaussians: Any, seconds: dict[str, float]) -> Any:
         mark = time.perf_counter()

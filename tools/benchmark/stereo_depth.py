@@ -61,7 +61,7 @@ def measure_stereo(capture: str, frames: int | None = None) -> Figures:
                 if ratio != 1
                 else frame.depth_m
             )
-            true += np.count_nonzero(truth)
+            true += int(np.count_nonzero(truth))
             found = depth.depth(index)
             if found is not None:
                 both = (truth > 0) & (found[0] > 0)

@@ -110,9 +110,10 @@ def measure_sequence(capture: str, name: str) -> Figures:
     sequence = sequences(len(scan))[name]
     tracker, trajectory, seconds = tracked([(scan, sequence)])
     stated = [scan.pose(index) for index in sequence.frames]
-    known = [n for n, pose in enumerate(stated) if pose is not None and trajectory.has_pose[n]]
-    estimated = Poses(trajectory.timestamps[known], trajectory.T_world_cam[known])
-    true = Poses(trajectory.timestamps[known], np.stack([stated[n] for n in known]))
+    known = {n: pose for n, pose in enumerate(stated) if pose is not None and trajectory.has_pose[n]}
+    rows = list(known)
+    estimated = Poses(trajectory.timestamps[rows], trajectory.T_world_cam[rows])
+    true = Poses(trajectory.timestamps[rows], np.stack(list(known.values())))
     errors = measure_trajectory_errors(estimated, true, align_trajectories(estimated, true))
     lost = set(np.flatnonzero(trajectory.status == "lost").tolist())
     figures = {

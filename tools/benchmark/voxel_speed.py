@@ -64,7 +64,8 @@ def _insertion() -> Figures:
     from freeocc3d.occupancy import carve
 
     room = open_capture("builtin:room", Options(), {"synthetic": {"width": 640, "height": 480}})
-    looks = [PosedFrame(room[index], room.pose(index), 0) for index in range(0, len(room), 6)]
+    poses = {index: pose for index in range(0, len(room), 6) if (pose := room.pose(index)) is not None}
+    looks = [PosedFrame(room[index], pose, 0) for index, pose in poses.items()]
 
     def carving() -> None:
         evidence = carve.DepthEvidence(np.zeros(3), 0.08, carve.Options())
@@ -205,9 +206,9 @@ def _asked() -> Figures:
 
     edge = 128  # blocks along a floor's edge
     keys = np.stack((*np.divmod(np.arange(edge * edge), edge), np.zeros(edge * edge, int)), axis=1).astype(np.int32)
-    state = np.full((edge * edge, 8, 8, 8), UNKNOWN, np.uint8)
-    state[:, :, :, 3] = OCCUPIED
-    state = state.reshape(-1, 512)
+    layers = np.full((edge * edge, 8, 8, 8), UNKNOWN, np.uint8)
+    layers[:, :, :, 3] = OCCUPIED
+    state = layers.reshape(-1, 512)
     nothing = np.zeros(state.shape, np.uint16)
     floor = Occupancy(0.02, np.zeros(3), keys, np.ones(state.shape, np.float32), nothing, nothing, state)
     voxels = floor.occupied_voxels()
