@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,7 @@ import typer
 
 from ..core.errors import FreeOccError, ModelError
 from .console import ConsoleProgress, Json
+from .option_groups import grouped
 
 Precision = Literal["fp32", "fp16", "int8"]
 
@@ -34,7 +36,27 @@ def models_pull(
         print(folder)
 
 
+@dataclass(frozen=True)
+class WordSide:
+    """Where words come from."""
+
+    tokenizer: Annotated[
+        Path | None,
+        typer.Option("--tokenizer", metavar="FOLDER", help="Folder of the tokenizer, if it is not CHECKPOINT."),
+    ] = None
+    text: Annotated[
+        str | None, typer.Option("--text", metavar="CLIP", help="Checkpoint of the CLIP that reads words for a DINOv2.")
+    ] = None
+    text_head: Annotated[
+        Path | None,
+        typer.Option(
+            "--text-head", metavar="FILE", help="With --text: safetensors file with the projection of Talk2DINO."
+        ),
+    ] = None
+
+
 @app.command("export")
+@grouped
 def models_export(
     checkpoint: Annotated[
         str,
@@ -53,22 +75,10 @@ def models_export(
             help="Folder to write. A name without a slash is a folder of the models folder.",
         ),
     ],
+    word_side: WordSide,
     precision: Annotated[
         Precision, typer.Option("--precision", help="Precision of the weights; fp16 and int8 are smaller and faster.")
     ] = "fp32",
-    tokenizer: Annotated[
-        Path | None,
-        typer.Option("--tokenizer", metavar="FOLDER", help="Folder of the tokenizer, if it is not CHECKPOINT."),
-    ] = None,
-    text: Annotated[
-        str | None, typer.Option("--text", metavar="CLIP", help="Checkpoint of the CLIP that reads words for a DINOv2.")
-    ] = None,
-    text_head: Annotated[
-        Path | None,
-        typer.Option(
-            "--text-head", metavar="FILE", help="With --text: safetensors file with the projection of Talk2DINO."
-        ),
-    ] = None,
     license_name: Annotated[
         str | None,
         typer.Option(
@@ -88,9 +98,11 @@ def models_export(
     """
     from ..language.model_export.export_checkpoint import export_checkpoint
 
-    if (text is None) != (text_head is None):
+    if (word_side.text is None) != (word_side.text_head is None):
         raise typer.BadParameter("--text and --text-head belong together.")
-    made = export_checkpoint(checkpoint, output, precision, tokenizer, text, text_head, license_name)
+    made = export_checkpoint(
+        checkpoint, output, precision, word_side.tokenizer, word_side.text, word_side.text_head, license_name
+    )
     print(f"{made.folder}: {made.kind}, {made.dimension} dimensions, {made.precision}, {made.bytes:,} bytes")
 
 
