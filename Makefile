@@ -4,8 +4,14 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-# Tests of the parts that most changes touch; they compile little and map nothing.
-QUICK  := tests/test_imports.py tests/core tests/settings
+# Tests that need seconds of each room: whole folders where none is slow.
+QUICK  := tests/test_imports.py tests/core tests/settings tests/capture tests/occupancy tests/export \
+	$(addprefix tests/tracking/test_, tracking.py frame_selection.py dense_alignment.py) \
+	$(addprefix tests/gaussians/test_, anchors.py denoising.py splat_ply.py) \
+	$(addprefix tests/language/test_, keyframe_choice.py model_packages.py synonyms.py word_matching.py) \
+	$(addprefix tests/query/test_, conditions.py oriented_boxes.py region_splitting.py) \
+	$(addprefix tests/evaluation/test_, confusion.py restricted_unpickler.py scored_classes.py trajectory_errors.py) \
+	$(addprefix tests/tools/test_, peers.py plots.py)
 
 .PHONY: help demo quick test lint docs wheel-test benchmark setup system clean
 

@@ -80,7 +80,7 @@ def test_only_the_blocks_that_a_keyframe_touches_are_made_again(monkeypatch: pyt
     everything = scene.map.update()
     made = []
     monkeypatch.setattr(
-        build, "build_blocks", lambda packed, *a, of=build.of_blocks: made.append(packed) or of(packed, *a)
+        build, "build_blocks", lambda packed, *a, of=build.build_blocks: made.append(packed) or of(packed, *a)
     )
     scene.add(5)
     after = scene.map.update()
