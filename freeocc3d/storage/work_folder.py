@@ -9,7 +9,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,9 @@ from ..settings import config
 from ..settings.config import Settings
 from . import store
 
-STAGES = {
+Stage = Literal["tracking", "gaussians", "language"]
+
+STAGES: dict[Stage, tuple[str, ...]] = {
     "tracking": ("capture", "tracking"),
     "gaussians": ("capture", "tracking", "gaussians", "fitting", "occupancy"),
     "language": ("capture", "tracking", "gaussians", "fitting", "occupancy", "language"),
@@ -50,8 +52,8 @@ class WorkFolder:
         self.warnings: list[Notice] = []
         self.broken: dict[int, str] = {}  # frame -> what is wrong with it
         self._stage, self._since = "", 0.0
-        self._fingerprints: dict[str, str] = {}
-        self._valid: set[str] = set()
+        self._fingerprints: dict[Stage, str] = {}
+        self._valid: set[Stage] = set()
 
     @classmethod
     def open(cls, output: Path, overwrite: bool, resume: bool) -> WorkFolder:
@@ -104,10 +106,7 @@ class WorkFolder:
             stage: config.fingerprint(relevant, sections, identity) for stage, sections in STAGES.items()
         }
         if self.resumed:
-            try:
-                saved = json.loads((self.folder / _MARKS).read_text(encoding="utf-8"))
-            except (OSError, ValueError) as error:
-                raise MapError(f"Cannot read {self.folder / _MARKS}: start again with --overwrite.") from error
+            saved = self._read_marks()
             self._valid = {stage for stage, value in self._fingerprints.items() if saved.get(stage) == value}
             if "tracking" not in self._valid:
                 raise MapError(
@@ -229,7 +228,15 @@ class WorkFolder:
         finally:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - self._since
 
-    def _mark(self, stage: str) -> None:
+    def _read_marks(self) -> dict[str, str]:
+        """Fingerprint of each stage whose result is saved. Raises MapError."""
+        try:
+            saved = json.loads((self.folder / _MARKS).read_text(encoding="utf-8"))
+            return {str(stage): str(value) for stage, value in saved.items()}
+        except (OSError, ValueError, AttributeError) as error:
+            raise MapError(f"Cannot read {self.folder / _MARKS}: start again with --overwrite.") from error
+
+    def _mark(self, stage: Stage) -> None:
         """Record that a stage's result is saved; later stages' results are out of date."""
         order = list(STAGES)
         self._valid = {name for name in self._valid if order.index(name) < order.index(stage)} | {stage}
