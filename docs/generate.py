@@ -78,20 +78,26 @@ def _command(words: tuple[str, ...], command: Any) -> list[str]:
     others = [p for p in command.params if p.param_type_name == "option" and not p.hidden and p.name != "help"]
     usage = " ".join([*words, "[OPTIONS]", *(p.metavar or p.human_readable_name for p in arguments)])
     lines = [f"## `{' '.join(words)}`", "", inspect.cleandoc(command.help or ""), "", "```text", usage, "```", ""]
-    if arguments or others:
-        lines += ["| | |", "|---|---|"]
-    for parameter in arguments:
-        lines.append(f"| `{parameter.metavar or parameter.human_readable_name}` | {_cell(parameter.help)} |")
-    for parameter in others:
-        value = "" if parameter.is_flag else f" {parameter.metavar or 'VALUE'}"
-        names = ", ".join(f"`{name}{value}`" for name in parameter.opts)
-        default = parameter.default
-        stated = default is not None and not parameter.is_flag and not callable(default) and default != ()
-        said = f" Default: `{default}`." if stated else ""
-        if isinstance(parameter.show_default, str):  # in words
-            said = f" Default: {parameter.show_default}."
-        lines.append(f"| {names} | {_cell(parameter.help)}{said} |")
-    return [*lines, ""]
+    rows = [(f"`{p.metavar or p.human_readable_name}`", p.help, p.rich_help_panel) for p in arguments]
+    rows += [(_names(p), f"{p.help or ''}{_default(p)}", p.rich_help_panel) for p in others]
+    panels = dict.fromkeys(panel for *_, panel in rows)
+    for panel in panels:
+        lines += [*([f"**{panel}**", ""] if panel else []), "| | |", "|---|---|"]
+        lines += [f"| {name} | {_cell(text)} |" for name, text, own in rows if own == panel]
+        lines.append("")
+    return lines
+
+
+def _names(option: Any) -> str:
+    value = "" if option.is_flag else f" {option.metavar or 'VALUE'}"
+    return ", ".join(f"`{name}{value}`" for name in option.opts)
+
+
+def _default(option: Any) -> str:
+    """What the option is when it is not given, where that says something."""
+    shown = option.show_default if isinstance(option.show_default, str) else option.default
+    says_nothing = shown is None or shown == () or option.is_flag or callable(shown)
+    return "" if says_nothing else f" Default: {shown if isinstance(option.show_default, str) else f'`{shown}`'}."
 
 
 def options() -> str:
