@@ -40,6 +40,23 @@ def test_links_of_the_top_lead_somewhere(page: Path) -> None:
     assert not [link for link in links if not (ROOT / link).exists()]
 
 
+@pytest.mark.parametrize("module", ["map_summary", "query_answers", "region_details", "scores"])
+def test_every_key_of_json_is_explained(module: str) -> None:
+    """Keys of the dictionaries in functions whose names end in document, or that details are made by."""
+    page = (ROOT / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
+    tree = ast.parse((ROOT / "freeocc3d" / "cli" / f"{module}.py").read_text(encoding="utf-8"))
+    keys = {
+        key.value
+        for function in tree.body
+        if isinstance(function, ast.FunctionDef) and not function.name.endswith("text")
+        for node in ast.walk(function)
+        if isinstance(node, ast.Dict)
+        for key in node.keys
+        if isinstance(key, ast.Constant)
+    }
+    assert not [key for key in keys if f"{key}`" not in page and f'"{key}"' not in page]
+
+
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_python_names_what_there_is(page: Path) -> None:
     """Imports from the package, and attributes of what is imported."""
