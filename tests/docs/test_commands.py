@@ -15,14 +15,12 @@ from freeocc3d.cli.main import app
 from freeocc3d.settings import config, registry
 from freeocc3d.settings.presets import find_preset
 
+pytestmark = pytest.mark.filterwarnings("error::freeocc3d.settings.renamed.RenamedWarning")
+
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 EXAMPLES = {"tripod", "brightness", "csv"}
 """Backends that CONTRIBUTING.md adds."""
-
-
-COMING = ("language.color",)
-"""What others are about to add."""
 
 
 def commands_of(page: Path) -> Iterator[str]:
@@ -68,8 +66,6 @@ def test_commands_are_found() -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_documented_command_parses(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    if any(part in command for part in COMING):
-        pytest.skip("coming")
     words = words_of(command)
     if words and words[0] in typer.main.get_command(app).commands and len(words) > 1:  # type: ignore[attr-defined]
         words = [word for word in words if word not in ("…", "...")]
@@ -95,8 +91,6 @@ def test_documented_settings_exist(page: Path) -> None:
             config.load(None, [f"{s}.{key}={value}" for s, keys in values.items() for key, value in keys.items()])
     for said in re.findall(rf"`((?:{sections})(?:\.[a-z_]+)+(?:=[^`…]+)?)`", text):
         name, _, value = said.partition("=")
-        if said.startswith(COMING):
-            continue
         if not EXAMPLES & set(re.split(r"[.=]", said)) and not re.search(r"\.(npz|ply|png|py|txt|yaml)$", name):
             config.load(None, [f"{name}={value or default_of(name)}"])
 

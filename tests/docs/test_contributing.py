@@ -14,8 +14,6 @@ import pytest
 from helpers import camera_matrix, color_image, depth_image
 
 ROOT = Path(__file__).parents[2]
-pytest.importorskip("freeocc3d.settings.typed_options")
-
 PACKAGE = "example_backends"
 LONGEST = 40
 
