@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -257,7 +256,7 @@ class Map:
         checked = typed_options.build(word_query.Options, options)
         if where is None:
             return ask(checked)
-        every = replace(checked, top_k=max(len(self.occupancy.colors), 1))
+        every = checked.changed(top_k=max(len(self.occupancy.colors), 1))
         references = self._words(where.words, every) if where.words else []
         return conditions.only_where(self.occupancy, self.up, ask(every), references, where, checked.top_k)
 
