@@ -31,7 +31,7 @@ def test_every_command_and_option_is_in_the_reference(site: Path) -> None:
     options = (site / "reference" / "options" / "index.html").read_text(encoding="utf-8")
     assert all(name in options for name in ("voxel_size", "keyframe_overlap", "no_return"))
     occupancy = (site / "reference" / "python" / "occupancy" / "index.html").read_text(encoding="utf-8")
-    assert "freeocc3d.occupancy.splat.Options" in occupancy
+    assert "freeocc3d.occupancy.splat.bin_gaussians" in occupancy
 
 
 def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
