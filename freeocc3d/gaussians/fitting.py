@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ..core.types import Gaussians
 from ..settings.stages import FittingOptions as Options
-from .rasterizers.base import ALPHA_MIN, Rasterizer, Rendered
+from .rasterizers.base import ALPHA_MIN, Rasterizer, Rendered, Splats
 from .rendered_views import CapturedView
 
 _RATES = {"outline": 1e-2, "turn": 1e-2, "shape": 1e-2, "quats": 5e-3, "means": 2e-4, "logits": 5e-2, "colors": 1e-2}
@@ -84,7 +84,7 @@ def _fitted(
         for group, rate in zip(optimiser.param_groups, map(_RATES.get, parameters.optimised), strict=True):
             group["lr"] = rate * _DECAY**late
         view = views[index]
-        rendered = rasterizer.render(*parameters.splats(), view.T_cam_world, view.camera)
+        rendered = rasterizer.render(parameters.splats(), view.T_cam_world, view.camera)
         loss = _loss(rendered, view, options.depth_weight) + parameters.prior()
         optimiser.zero_grad()
         loss.backward()
@@ -125,9 +125,9 @@ class _Parameters:
         """Means, scales, quaternions."""
         raise NotImplementedError
 
-    def splats(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Means, scales, quaternions, opacities, colours."""
-        return *self.shapes(), torch.sigmoid(self.optimised["logits"]), self.optimised["colors"]
+    def splats(self) -> Splats:
+        """The Gaussians as they are rendered."""
+        return Splats(*self.shapes(), torch.sigmoid(self.optimised["logits"]), self.optimised["colors"])
 
     def prior(self) -> Tensor:
         """What keeps shapes near the initialisation."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..core.transforms import invert
 from ..core.types import Frame, Gaussians, Intrinsics
-from .rasterizers.base import Rasterizer, Rendered
+from .rasterizers.base import Rasterizer, Rendered, Splats
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,9 @@ def prepare_captured_view(
 def render_gaussians(gaussians: Gaussians, view: CapturedView, rasterizer: Rasterizer) -> Rendered:
     """The Gaussians as the view's camera sees them; not differentiable."""
     arrays = gaussians.means, gaussians.scales, gaussians.quats_wxyz, gaussians.opacities, gaussians.colors / 255.0
-    means, scales, quats, opacities, colors = (
-        torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(rasterizer.device) for array in arrays
-    )
+    tensors = (torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(rasterizer.device) for array in arrays)
     with torch.no_grad():
-        return rasterizer.render(means, scales, quats, opacities, colors, view.T_cam_world, view.camera)
+        return rasterizer.render(Splats(*tensors), view.T_cam_world, view.camera)
 
 
 @dataclass(frozen=True)

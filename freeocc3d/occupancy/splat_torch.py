@@ -6,7 +6,6 @@ Products become sums of logarithms, in an order that the device chooses: equal t
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,9 +15,7 @@ from torch import Tensor
 from ..core.errors import ConfigError, DependencyError
 from ..core.types import BLOCK
 from ..core.voxel_keys import pack_index, pack_voxels
-
-if TYPE_CHECKING:
-    from .splat import Bins
+from .gaussian_bins import Bins
 
 _PAIRS = 1 << 24  # worked on at once: 60 bytes each
 

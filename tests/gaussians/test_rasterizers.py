@@ -35,7 +35,7 @@ def stacked(rendered: base.Rendered) -> torch.Tensor:
 
 def with_gradients(rasterizer, arrays, T, weights, camera=CAMERA):
     leaves = [array.clone().requires_grad_() for array in arrays]
-    out = stacked(rasterizer.render(*leaves, T, camera))
+    out = stacked(rasterizer.render(base.Splats(*leaves), T, camera))
     (out * weights.to(out.dtype)).sum().backward()
     return out.detach(), [leaf.grad for leaf in leaves]
 
@@ -60,7 +60,9 @@ def test_the_oracles_gradients_are_finite_differences() -> None:
     _, gradients = with_gradients(reference.ReferenceRasterizer(), arrays, T, weights)
 
     def value(changed) -> float:
-        return float((stacked(reference.ReferenceRasterizer().render(*changed, T, CAMERA)) * weights).sum())
+        return float(
+            (stacked(reference.ReferenceRasterizer().render(base.Splats(*changed), T, CAMERA)) * weights).sum()
+        )
 
     rng = np.random.default_rng(4)
     for number, name in enumerate(NAMES):
@@ -86,7 +88,7 @@ def test_one_gaussian_on_the_axis_is_what_the_equations_say(rasterizer) -> None:
         torch.tensor([opacity]),
         torch.tensor([[0.2, 0.5, 0.9]]),
     )
-    out = rasterizer.render(*arrays, torch.eye(4), camera)
+    out = rasterizer.render(base.Splats(*arrays), torch.eye(4), camera)
     variance = (50.0 * sigma / z) ** 2 + base.BLUR
     squared = (np.arange(21) - 10.0)[:, None] ** 2 + (np.arange(21) - 10.0)[None] ** 2
     alpha = opacity * np.exp(-0.5 * squared / variance)
@@ -106,7 +108,7 @@ def test_the_nearer_of_two_hides_the_farther_by_its_alpha(rasterizer) -> None:
         torch.tensor([0.9, 0.6]),
         torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
     )
-    out = rasterizer.render(*arrays, torch.eye(4), camera)
+    out = rasterizer.render(base.Splats(*arrays), torch.eye(4), camera)
     np.testing.assert_allclose(out.image[2, 2].numpy(), (0.4 * 0.9, 0.6, 0.0), atol=1e-5)
     np.testing.assert_allclose(float(out.depth[2, 2]), 0.6 * 1.0 + 0.4 * 0.9 * 3.0, atol=1e-5)
 
@@ -135,9 +137,9 @@ def test_many_opaque_layers_and_tiny_or_huge_gaussians_stay_finite() -> None:
 
 def test_not_a_number_is_left_out() -> None:
     arrays, T = scene(50)
-    expected = cpu.load().render(*arrays, T, CAMERA)
+    expected = cpu.load().render(base.Splats(*arrays), T, CAMERA)
     broken = [torch.cat((array, torch.full_like(array[:1], torch.nan))) for array in arrays]
-    out = cpu.load().render(*broken, T, CAMERA)
+    out = cpu.load().render(base.Splats(*broken), T, CAMERA)
     torch.testing.assert_close(out.image, expected.image)
 
 
@@ -153,7 +155,7 @@ def test_gsplat_and_the_reference_on_cuda_give_the_same_images() -> None:
     pytest.importorskip("gsplat")
     arrays, T = scene(1500)
     on_gpu = [array.cuda() for array in arrays]
-    expected = stacked(reference.ReferenceRasterizer("cuda").render(*on_gpu, T.cuda(), CAMERA))
-    out = stacked(gsplat.load(gsplat.Options()).render(*on_gpu, T.cuda(), CAMERA))
+    expected = stacked(reference.ReferenceRasterizer("cuda").render(base.Splats(*on_gpu), T.cuda(), CAMERA))
+    out = stacked(gsplat.load(gsplat.Options()).render(base.Splats(*on_gpu), T.cuda(), CAMERA))
     # It bounds splats by whole pixels, so that a few at the very edge of alpha are left out.
     assert float((out - expected).abs().mean()) < 1e-3

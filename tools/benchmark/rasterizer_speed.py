@@ -89,8 +89,10 @@ def _timed(rasterizer: Any, scene: tuple[list[Any], Any, Any], repeats: int) -> 
 def _step(rasterizer: Any, arrays: list[Any], T_cam_world: Any, camera: Any) -> Any:
     import torch
 
+    from freeocc3d.gaussians.rasterizers.base import Splats
+
     leaves = [array.clone().requires_grad_() for array in arrays]
-    image, depth, alpha = rasterizer.render(*leaves, T_cam_world, camera)
+    image, depth, alpha = rasterizer.render(Splats(*leaves), T_cam_world, camera)
     (image.sum() + depth.sum() + alpha.sum()).backward()
     if image.is_cuda:
         torch.cuda.synchronize()

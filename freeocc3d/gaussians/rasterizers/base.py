@@ -41,23 +41,27 @@ class Rendered(NamedTuple):
     alpha: Tensor
 
 
+class Splats(NamedTuple):
+    """What a rasterizer takes of N Gaussians, float32 on its device.
+
+    means (N, 3) world metres, scales (N, 3) metres, quats_wxyz (N, 4) of any length but 0, opacities (N,) and colors
+    (N, 3) in 0…1.
+    """
+
+    means: Tensor
+    scales: Tensor
+    quats_wxyz: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+
 class Rasterizer(Protocol):
-    """Renders on ``device``, differentiably in all five arrays of the Gaussians."""
+    """Renders on ``device``, differentiably in all arrays of the splats."""
 
     device: torch.device
 
-    def render(
-        self,
-        means: Tensor,
-        scales: Tensor,
-        quats_wxyz: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        T_cam_world: Tensor,
-        camera: Intrinsics,
-    ) -> Rendered:
-        """means (N, 3) world metres, scales (N, 3) metres, quats_wxyz (N, 4) of any length but 0, opacities (N,) and
-        colors (N, 3) in 0…1, T_cam_world (4, 4); all float32 on ``device``."""
+    def render(self, splats: Splats, T_cam_world: Tensor, camera: Intrinsics) -> Rendered:
+        """The image that ``camera`` sees. T_cam_world: (4, 4) float32 on ``device``."""
         ...
 
 

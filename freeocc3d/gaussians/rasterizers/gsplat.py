@@ -8,7 +8,7 @@ from torch import Tensor
 from ...core.errors import DependencyError
 from ...core.types import Intrinsics
 from ...settings.typed_options import TypedOptions
-from .base import BLUR, NEAR, Rendered
+from .base import BLUR, NEAR, Rendered, Splats
 
 REQUIRES = ("gsplat",)
 
@@ -26,16 +26,7 @@ class GsplatRasterizer:
     def __init__(self, device: str):
         self.device = torch.device(device)
 
-    def render(
-        self,
-        means: Tensor,
-        scales: Tensor,
-        quats_wxyz: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        T_cam_world: Tensor,
-        camera: Intrinsics,
-    ) -> Rendered:
+    def render(self, splats: Splats, T_cam_world: Tensor, camera: Intrinsics) -> Rendered:
         """See ``base.Rasterizer``."""
         from gsplat import rasterization
 
@@ -44,11 +35,11 @@ class GsplatRasterizer:
             ((camera.fx, 0.0, camera.cx + 0.5), (0.0, camera.fy, camera.cy + 0.5), (0.0, 0.0, 1.0)), device=self.device
         )
         out, alpha, _ = rasterization(
-            means=means,
-            quats=quats_wxyz,
-            scales=scales,
-            opacities=opacities,
-            colors=colors,
+            means=splats.means,
+            quats=splats.quats_wxyz,
+            scales=splats.scales,
+            opacities=splats.opacities,
+            colors=splats.colors,
             viewmats=T_cam_world[None],
             Ks=K[None],
             width=camera.width,

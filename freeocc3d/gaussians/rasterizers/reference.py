@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ...core.types import Intrinsics
 from ...settings.typed_options import TypedOptions
-from .base import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR, TRANSMITTANCE_MIN, Rendered, compute_slope_limits
+from .base import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR, TRANSMITTANCE_MIN, Rendered, Splats, compute_slope_limits
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -28,17 +28,9 @@ class ReferenceRasterizer:
     def __init__(self, device: str = "cpu"):
         self.device = torch.device(device)
 
-    def render(
-        self,
-        means: Tensor,
-        scales: Tensor,
-        quats_wxyz: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        T_cam_world: Tensor,
-        camera: Intrinsics,
-    ) -> Rendered:
+    def render(self, splats: Splats, T_cam_world: Tensor, camera: Intrinsics) -> Rendered:
         """See ``base.Rasterizer``; float64 arrays are rendered in float64."""
+        means, scales, quats_wxyz, opacities, colors = splats
         center, covariance, z = project_gaussians(means, scales, quats_wxyz, T_cam_world, camera)
         with torch.no_grad():
             # alpha >= ALPHA_MIN within this box, and nowhere else.
@@ -49,6 +41,7 @@ class ReferenceRasterizer:
             order = torch.argsort(z, stable=True)
             order = order[drawn[order]]
         conic = torch.linalg.inv(covariance)
+        values = torch.cat((colors, z[:, None], torch.ones_like(z)[:, None]), dim=1)
         rows = []
         for top in range(0, camera.height, _TILE):
             tiles = []
@@ -57,18 +50,20 @@ class ReferenceRasterizer:
                 end = torch.tensor((right - 1, bottom - 1), device=means.device)
                 start = torch.tensor((left, top), device=means.device)
                 here = order[((high[order] >= start) & (low[order] <= end)).all(dim=1)]
-                v, u = torch.meshgrid(
-                    torch.arange(top, bottom, device=means.device, dtype=means.dtype),
-                    torch.arange(left, right, device=means.device, dtype=means.dtype),
-                    indexing="ij",
-                )
-                pixels = torch.stack((u, v), dim=-1).reshape(-1, 2)
-                values = torch.cat((colors[here], z[here, None], torch.ones_like(z[here, None])), dim=1)
-                tile = _composite(pixels, center[here], conic[here], opacities[here], values)
+                pixels = _list_pixels(means, top, bottom, left, right)
+                tile = _composite(pixels, center[here], conic[here], opacities[here], values[here])
                 tiles.append(tile.reshape(bottom - top, right - left, 5))
             rows.append(torch.cat(tiles, dim=1))
         out = torch.cat(rows)
         return Rendered(out[..., :3], out[..., 3], out[..., 4])
+
+
+def _list_pixels(like: Tensor, top: int, bottom: int, left: int, right: int) -> Tensor:
+    """(P, 2) pixels of a tile, row by row, of the type and device of ``like``."""
+    rows = torch.arange(top, bottom, device=like.device, dtype=like.dtype)
+    columns = torch.arange(left, right, device=like.device, dtype=like.dtype)
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    return torch.stack((u, v), dim=-1).reshape(-1, 2)
 
 
 def project_gaussians(
