@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "freeocc3d"
@@ -36,6 +38,26 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for path, content in pages.items():
         files.append(File.generated(config, path, content=content))
     return files
+
+
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """On the page for Python, a link [`Name`][] leads to where the package defines that name, wherever that is."""
+    if page.file.src_uri != "reference/python/index.md":
+        return markdown
+    return re.sub(r"\[`(\w+)`\]\[\]", lambda found: f"[`{found[1]}`][{defined(found[1])}]", markdown)
+
+
+def defined(name: str) -> str:
+    """Dotted name of the one class or function of that name in the package, the command line aside."""
+    places = [
+        ".".join(("freeocc3d", *path.relative_to(PACKAGE).with_suffix("").parts, name))
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if path.parent.name != "cli"
+        and re.search(rf"^(?:class|def) {name}\b", path.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+    if len(places) != 1:
+        raise PluginError(f"'{name}' is defined in {len(places)} places: {', '.join(places)}")
+    return places[0]
 
 
 def of_the_top(name: str) -> str:
