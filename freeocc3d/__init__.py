@@ -32,24 +32,24 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .pipeline.run import reconstruct
-    from .storage.store import load_map
+    from .query.scan_map import Map, load_map
 
 __version__ = "0.1.0"
 
 # Numba tries an installed TBB first and warns on stderr if it is too old; the wheels bring OpenMP anyway.
 os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
 
-__all__ = ["__version__", "load_map", "reconstruct"]
+__all__ = ["Map", "__version__", "load_map", "reconstruct"]
 
 
 def __getattr__(name: str) -> Any:
-    """The two calls are imported when first used, so that asking for the version imports nothing."""
+    """Each is imported when first used, so that asking for the version imports nothing."""
     if name == "reconstruct":
         from .pipeline.run import reconstruct
 
         return reconstruct
-    if name == "load_map":
-        from .storage.store import load_map
+    if name in ("Map", "load_map"):
+        from .query import scan_map
 
-        return load_map
+        return getattr(scan_map, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

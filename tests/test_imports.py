@@ -30,7 +30,7 @@ ROOMS = (
 )
 """A room imports from the rooms before it, and from itself."""
 
-STILL_UPWARD = {"editing.scaling", "storage.store"}
+STILL_UPWARD: set[str] = set()
 """Modules that still import a later room."""
 
 MOST_LOOSE = 3
@@ -41,7 +41,7 @@ HEAVY = {"open3d", "torch", "pyvista", "vtk", "numba", "pycolmap", "scipy", "cv2
 FAST = ("storage", "query", "cli", "settings", "core.types", "core.progress", "core.errors", "__init__")
 """Rooms and modules that have to be imported in no time, for a query starts with them."""
 
-SLOW = {"storage.keyframes", "storage.work_folder", "query.best_views", "query.standing_places"}
+SLOW = {"storage.keyframes", "storage.work_folder", "storage.writer", "query.best_views", "query.standing_places"}
 """Modules of fast rooms that a query does not start with."""
 
 

@@ -32,9 +32,9 @@ def export(
 ) -> None:
     """Write a map in another program's format."""
     from ..export import export_map
+    from ..query.scan_map import load_map
     from ..settings import registry
     from ..settings.yaml_files import named_values
-    from ..storage.store import load_map
 
     known = registry.backend("export", format_name).options
     options: dict[str, Any] = {} if frame is None else {"frame": frame}

@@ -10,7 +10,7 @@ from .map_summary import summary_document, summary_text
 
 def info(map_path: MapPath, as_json: Json = False) -> None:
     """Say what is in a map and how it was made."""
-    from ..storage.store import load_map
+    from ..query.scan_map import load_map
 
     loaded = load_map(map_path)
     print(json.dumps(summary_document(loaded)) if as_json else summary_text(loaded))

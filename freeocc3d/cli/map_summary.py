@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from msgspec import to_builtins
+
 from ..core.warnings import read_notices
 
 if TYPE_CHECKING:
-    from ..storage.store import Map
+    from ..query.scan_map import Map
 
 _SHOWN_NAMES = 12
 
@@ -15,34 +17,34 @@ _SHOWN_NAMES = 12
 def summary_document(loaded: Map) -> dict[str, Any]:
     """What ``info --json`` prints."""
     manifest, report = loaded.manifest, loaded.report
-    counts = manifest["counts"]
+    counts = manifest.counts
     return {
-        "version": manifest["freeocc3d"],
+        "version": manifest.freeocc3d,
         "map": str(loaded.path),
-        "capture": manifest["capture"],
-        "frames": counts["frames"],
-        "frames_with_pose": counts["frames_with_pose"],
+        "capture": to_builtins(manifest.capture),
+        "frames": counts.frames,
+        "frames_with_pose": counts.frames_with_pose,
         "frame_status": report["frames"],
-        "keyframes": len(manifest["keyframes"]),
-        "submaps": counts["submaps"],
+        "keyframes": len(manifest.keyframes),
+        "submaps": counts.submaps,
         "submap_frames": [
             {key: submap[key] for key in ("first", "last", "frames", "keyframes", "mapped")}
             for submap in report.get("submaps", [])
         ],
         "color_focal": report.get("color_focal", 1.0),
-        "gaussians": counts["gaussians"],
-        "voxels": {"occupied": counts["voxels"]["occupied"], "free": counts["voxels"]["free"]},
+        "gaussians": counts.gaussians,
+        "voxels": {"occupied": counts.voxels.occupied, "free": counts.voxels.free},
         "metric": loaded.metric,
-        "scale": manifest.get("scale", {"metric": True, "by": "sensor", "factor": 1.0}),
-        "voxel_size_m": manifest["voxel_size_m"],
-        "finest_voxel_m": manifest.get("finest_voxel_m", manifest["voxel_size_m"]),
-        "refined": manifest.get("refined"),
-        "encoder": manifest["encoder"]["name"],
+        "scale": to_builtins(manifest.scale),
+        "voxel_size_m": manifest.voxel_size_m,
+        "finest_voxel_m": manifest.finest_m,
+        "refined": to_builtins(manifest.refined),
+        "encoder": manifest.encoder.name,
         "encoder_knows": loaded.text_encoder.knows,
-        "vocabulary": manifest.get("vocabulary"),
+        "vocabulary": to_builtins(manifest.vocabulary),
         "bytes": {
-            name: sum(size for file, size in manifest["files"].items() if file.split("/")[0] == name)
-            for name in dict.fromkeys(file.split("/")[0] for file in manifest["files"])
+            name: sum(size for file, size in manifest.files.items() if file.split("/")[0] == name)
+            for name in dict.fromkeys(file.split("/")[0] for file in manifest.files)
         },
         "seconds": report["seconds"],
         "peak_memory_bytes": report["peak_memory_bytes"],

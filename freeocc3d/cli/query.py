@@ -21,8 +21,8 @@ from .option_groups import grouped
 if TYPE_CHECKING:
     from ..query.questions import Question
     from ..query.regions import Region
+    from ..query.scan_map import Map
     from ..query.word_query import QueryResult
-    from ..storage.store import Map
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def query(map_path: MapPath, asked: Asked, place: Place, ranking: Ranking, answe
     For a picture (--image), the confidence is the mean similarity.
     """
     from ..query.questions import ask
-    from ..storage.store import load_map
+    from ..query.scan_map import load_map
 
     if asked.list_classes:
         print("\n".join(load_map(map_path).vocabulary))
@@ -263,6 +263,6 @@ def _answer_lines(loaded: Map, question: Question, answer: Answer) -> None:
 def _refined(loaded: Map, region: Region, voxel_size: float, output: Path, overwrite: bool) -> Any:
     from ..editing import box_refinement
 
-    box = box_refinement.enclose_region(region, loaded.manifest["voxel_size_m"])
+    box = box_refinement.enclose_region(region, loaded.manifest.voxel_size_m)
     with ConsoleProgress() as progress:
         return box_refinement.refine_box(loaded, box, voxel_size, output, overwrite=overwrite, progress=progress)

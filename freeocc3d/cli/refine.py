@@ -29,7 +29,7 @@ def refine(
     import numpy as np
 
     from ..editing import adaptive_voxels, box_refinement
-    from ..storage.store import load_map
+    from ..query.scan_map import load_map
 
     scan_map = load_map(map_path)
     with ConsoleProgress() as progress:

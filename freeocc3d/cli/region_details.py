@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..query.oriented_boxes import OrientedBox, oriented_boxes
 from ..query.regions import Region
+from ..query.scan_map import Map
 from ..query.word_query import QueryResult
-from ..storage.store import Map
 
 if TYPE_CHECKING:
-    from ..query.best_views import View
+    from ..query.best_views import RegionView
+    from ..query.oriented_boxes import OrientedBox
 
 
 def describe_regions(
@@ -27,15 +27,13 @@ def describe_regions(
     regions = [region for result in results for region in result.regions]
     if not regions:
         return lambda region: {}
-    boxes = oriented_boxes(scan_map.occupancy, regions, scan_map.T_gravity_map)
+    boxes = scan_map.boxes_of(regions)
     said: dict[int, dict[str, Any]] = {
         id(region): {"oriented_box": _box(box)} for region, box in zip(regions, boxes, strict=True)
     }
     if views:
-        from ..query.best_views import best_views
-
-        seen = best_views(scan_map.occupancy, scan_map.trajectory, scan_map.keyframes, regions)
-        for region, shown, place in zip(regions, seen, scan_map.standing_places(regions), strict=True):
+        seen = scan_map.views_of_each(regions)
+        for region, shown, place in zip(regions, seen, scan_map.stands_of(regions), strict=True):
             said[id(region)] |= {
                 "keyframes": [_view(view) for view in shown],
                 "stand": None if place is None else place.round(4).tolist(),
@@ -51,5 +49,5 @@ def _box(box: OrientedBox) -> dict[str, Any]:
     }
 
 
-def _view(view: View) -> dict[str, Any]:
+def _view(view: RegionView) -> dict[str, Any]:
     return {"frame": view.frame, "box": list(view.box), "visible": round(view.visible, 4)}

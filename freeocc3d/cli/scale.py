@@ -36,7 +36,7 @@ def scale(
     Give one of --factor, --length, --camera-height and --poses.
     """
     from ..editing import scaling
-    from ..storage.store import load_map
+    from ..query.scan_map import load_map
 
     if [factor, length, camera_height, poses].count(None) != 3:
         raise typer.BadParameter("give one of --factor, --length, --camera-height and --poses.")

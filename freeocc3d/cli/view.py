@@ -18,7 +18,7 @@ def view(
     overwrite: Overwrite = False,
 ) -> None:
     """Draw a map from above and from a corner."""
-    from ..storage.store import load_map
+    from ..query.scan_map import load_map
     from ..viewer import map_pictures
 
     loaded = load_map(map_path)

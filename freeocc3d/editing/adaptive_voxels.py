@@ -9,12 +9,11 @@ from the Gaussians of its own size.
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
@@ -29,10 +28,11 @@ from ..core.voxel_keys import pack_voxels, unpack_voxels
 from ..gaussians.surface_cells import cell_keys
 from ..language.feature_codec import Codec
 from ..occupancy import build, carve, levels, splat
+from ..query.scan_map import Map, load_map
 from ..settings.config import Settings
-from ..storage import store
-from ..storage.store import Map, load_map
+from ..storage.manifest import Refined
 from ..storage.work_folder import WorkFolder
+from ..storage.writer import MapParts, write_changed_map
 from .box_refinement import SMALLEST_VOXEL_M, lift_features_again, lift_gaussians, read_settings
 
 _CUBE = 2
@@ -148,17 +148,16 @@ def refine_where_needed(
         finest, progress,
     )  # fmt: skip
     progress.stage("saving")
-    with work.writing(Path(output), [str(scan_map.path), finest], settings) as folder:
-        shutil.copytree(scan_map.path / store.KEYFRAMES, folder / store.KEYFRAMES)
-        for name in (store.GAUSSIANS, store.TRAJECTORY, store.PATH_PICTURE, store.RENDER_PICTURE):
-            if (scan_map.path / name).is_file():
-                shutil.copy2(scan_map.path / name, folder / name)
-        store.write_occupancy(folder, occupancy, Codec.fit(np.asarray(occupancy.features)), scan_map.gaussian_features)
-        (folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
-        kept = {key: value for key, value in scan_map.manifest.items() if key not in ("format_version", "files")}
-        counts = {**kept["counts"], "voxels": store.counts(occupancy)}
-        refined = {"map": str(scan_map.path.absolute())}
-        store.write_manifest(folder, {**kept, **store.sizes(occupancy), "refined": refined, "counts": counts})
+    refined = Refined(map=str(scan_map.path.absolute()))
+    parts = MapParts(
+        msgspec.structs.replace(scan_map.manifest, refined=refined),
+        settings,
+        lambda: scan_map.report,
+        occupancy,
+        Codec.fit(np.asarray(occupancy.features)),
+        scan_map.gaussian_features,
+    )
+    write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)
 
 

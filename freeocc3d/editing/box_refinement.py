@@ -7,35 +7,31 @@ in them, but in the keyframes, which the map keeps. What comes out is a map of t
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import Capture, open_capture
-from ..capture.focal_correction import Reregistered
 from ..core.errors import FreeOccError, MapError
 from ..core.progress import Progress
 from ..core.transforms import back_project, transform
-from ..core.tum_files import write_tum
-from ..core.types import BLOCK, Frame, Gaussians, Occupancy, PosedFrame, Trajectory
+from ..core.types import BLOCK, Frame, Gaussians, PosedFrame, Trajectory
 from ..gaussians import anchors
-from ..gaussians.point_cloud import write_gaussian_ply
 from ..language import lifting
 from ..language.feature_codec import Codec
 from ..occupancy import build
 from ..query.regions import Region
-from ..settings import config, registry
+from ..query.scan_map import Map, load_map
 from ..settings.config import Settings
-from ..storage import store
 from ..storage.keyframes import Keyframes
-from ..storage.store import Map, load_map
+from ..storage.manifest import Refined, vector
 from ..storage.work_folder import WorkFolder
+from ..storage.writer import MapParts, write_changed_map
 
 SMALLEST_VOXEL_M = 0.001
 _MOST_BLOCKS = 1 << 18  # 13 bytes a voxel: 1.7 GB
@@ -83,10 +79,10 @@ def refine_box(
     kept, no keyframe sees a surface in it, or the folder exists.
     """
     progress = progress or Progress()
-    if not SMALLEST_VOXEL_M <= voxel_size <= scan_map.manifest["voxel_size_m"]:
+    if not SMALLEST_VOXEL_M <= voxel_size <= scan_map.manifest.voxel_size_m:
         raise MapError(
             f"Voxels of {voxel_size:g} m cannot be had: give from {SMALLEST_VOXEL_M:g} up to the map's own "
-            f"{scan_map.manifest['voxel_size_m']:g}."
+            f"{scan_map.manifest.voxel_size_m:g}."
         )
     blocks = tuple(math.ceil(edge - 1e-6) for edge in (box.high - box.low) / (BLOCK * voxel_size))
     if math.prod(blocks) > _MOST_BLOCKS:
@@ -97,8 +93,7 @@ def refine_box(
         )
     work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
     settings = read_settings(scan_map).changed("occupancy", voxel_size=voxel_size)
-    seeing, rows, trajectory = _seeing(scan_map, box, AROUND * voxel_size, progress)
-    trajectory = trajectory.only_keyframes(trajectory.keyframes[rows])
+    seeing, trajectory = _seeing(scan_map, box, AROUND * voxel_size, progress)
     poses = trajectory.T_world_keyframe
 
     def posed() -> Iterator[PosedFrame]:
@@ -123,36 +118,31 @@ def refine_box(
     if not len(occupancy.colors):
         raise MapError(f"No voxel of {voxel_size:g} m in the box is occupied: {scan_map.path} holds no surface there.")
     progress.stage("saving")
-    with work.writing(Path(output), [str(scan_map.path), *box.low.tolist(), *box.high.tolist()], settings) as folder:
-        keyframes = Keyframes(folder / store.KEYFRAMES)
-        for frame in seeing:
-            keyframes.append(frame)
-        keyframes.save_index()
-        write_gaussian_ply(gaussians, folder / store.GAUSSIANS)
-        store.write_occupancy(folder, occupancy, Codec.fit(features), features)
-        write_tum(folder / store.TRAJECTORY, trajectory)
-        (folder / store.REPORT).write_text(json.dumps(scan_map.report), encoding="utf-8")
-        store.write_manifest(folder, _manifest(scan_map, box, trajectory.keyframes, gaussians, occupancy))
+    corners = (*vector(box.low), *vector(box.high))
+    refined = Refined(map=str(scan_map.path.absolute()), box=corners)
+    parts = MapParts(
+        msgspec.structs.replace(scan_map.manifest, refined=refined), settings, lambda: scan_map.report, occupancy,
+        Codec.fit(features), features, gaussians, trajectory, seeing, draw=lambda folder: None,
+    )  # fmt: skip
+    write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)
 
 
 def read_settings(scan_map: Map) -> Settings:
     """The map's own; on the processor wherever the map was made."""
-    return config.load_saved(scan_map.path / store.CONFIG).changed("occupancy", device="cpu")
+    return scan_map.settings.changed("occupancy", device="cpu")
 
 
-def _seeing(
-    scan_map: Map, box: Box, margin: float, progress: Progress
-) -> tuple[Keyframes, NDArray[np.int64], Trajectory]:
-    """The keyframes that show something in the box, their rows among all, and the trajectory."""
+def _seeing(scan_map: Map, box: Box, margin: float, progress: Progress) -> tuple[Keyframes, Trajectory]:
+    """The keyframes that show something in the box, and the trajectory with these."""
     trajectory, keyframes = scan_map.trajectory, scan_map.keyframes
     progress.stage("keyframes", len(keyframes))
     seen = np.zeros(len(keyframes), bool)
     for row, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True)):
         seen[row] = box.contains(_points(frame, T, _LOOK_STRIDE)[1], margin).any()
         progress.advance(row + 1)
-    rows = np.flatnonzero(seen)
-    return keyframes.only(trajectory.keyframes[rows]), rows, trajectory
+    frames = trajectory.keyframes[seen]
+    return keyframes.only(frames), trajectory.only_keyframes(frames)
 
 
 def _points(
@@ -208,38 +198,13 @@ def lift_features_again(
     progress: Progress,
 ) -> NDArray[np.float16]:
     """Layer 3 of these Gaussians; where the encoder cannot be had again, the features of the map's own nearest."""
-    name = scan_map.manifest["encoder"]["name"]
-    module = registry.load("language.encoders", name)
     try:
-        capture = _capture(scan_map, settings) if getattr(module, "NEEDS_CAPTURE", True) else None
-        encoder = settings.load_backend("language", capture)
+        encoder = scan_map.encoder
     except FreeOccError as error:
+        name = scan_map.manifest.encoder.name
         progress.warn(f"The encoder '{name}' cannot be used again, so features stay as coarse as the map's: {error}")
         from scipy.spatial import cKDTree
 
         nearest = cKDTree(scan_map.gaussians.means).query(gaussians.means)[1]
         return scan_map.gaussian_features[nearest]
     return lifting.lift_features(gaussians, frames, T_world_cam, encoder, settings.language, progress)
-
-
-def _capture(scan_map: Map, settings: Settings) -> Capture:
-    """The capture that the map was made of, as it was read then. Raises FreeOccError."""
-    path = scan_map.manifest["capture"]["path"]
-    capture = open_capture(path, settings.capture, settings.backends.get("capture"))
-    color_focal = float(scan_map.report.get("color_focal", 1.0))
-    return capture if color_focal == 1 else Reregistered(capture, color_focal)
-
-
-def _manifest(
-    scan_map: Map, box: Box, keyframes: NDArray[np.int32], gaussians: Gaussians, occupancy: Occupancy
-) -> dict[str, Any]:
-    others = "format_version", "files", "finest_voxel_m"
-    kept = {key: value for key, value in scan_map.manifest.items() if key not in others}
-    return {
-        **kept,
-        "voxel_size_m": occupancy.voxel_size,
-        "origin": occupancy.origin.tolist(),
-        "refined": {"map": str(scan_map.path.absolute()), "box": [*box.low.tolist(), *box.high.tolist()]},
-        "counts": {**kept["counts"], "gaussians": len(gaussians), "voxels": store.counts(occupancy)},
-        "keyframes": keyframes.tolist(),
-    }

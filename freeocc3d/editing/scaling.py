@@ -7,32 +7,30 @@ voxels' edges and origin, keyframes' depth. What is no length (probabilities, fe
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import re
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import associate, read_trajectory
 from ..core.errors import FreeOccError, MapError
 from ..core.transforms import back_project, transform
-from ..core.tum_files import write_tum
 from ..core.types import Gaussians, Submap, Trajectory
 from ..core.warnings import read_notices
-from ..evaluation.scoring import reopen_capture
 from ..gaussians import rendered_views
-from ..gaussians.point_cloud import write_gaussian_ply
 from ..occupancy.gravity_frame import is_floor_seen
-from ..settings import config, registry
+from ..query.scan_map import Map, load_map
+from ..settings import registry
 from ..settings.config import Settings
-from ..storage import store
-from ..storage.store import Map, load_map
+from ..storage import map_files
+from ..storage.manifest import Manifest, MapScale, matrix, vector
 from ..storage.work_folder import WorkFolder
+from ..storage.writer import MapParts, write_changed_map
 from ..tracking.trajectory_alignment import Poses, align_trajectories, read_poses, select_estimated_poses
 from ..viewer import render_pictures, trajectory_picture
 
@@ -49,7 +47,7 @@ def scale_map(scan_map: Map, factor: float, by: str, output: str | Path, *, over
     """
     if not (math.isfinite(factor) and factor > 0):
         raise MapError(f"A map is scaled by a positive number, got {factor:g}.")
-    voxel = factor * float(scan_map.manifest.get("finest_voxel_m", scan_map.manifest["voxel_size_m"]))
+    voxel = factor * scan_map.manifest.finest_m
     farthest = factor * max((float(scan_map.keyframes.depth_m(row).max()) for row in _rows(scan_map)), default=0.0)
     if voxel < _LEAST_VOXEL_M or farthest > _MOST_DEPTH_M:
         raise MapError(
@@ -57,19 +55,20 @@ def scale_map(scan_map: Map, factor: float, by: str, output: str | Path, *, over
             f"which a map holds {_LEAST_VOXEL_M:g} m and up, and up to {_MOST_DEPTH_M:.0f} m: check the length."
         )
     work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
-    settings = _settings(scan_map, factor)
     trajectory = _trajectory(scan_map.trajectory, factor)
     gaussians = _gaussians(scan_map.gaussians, factor)
     report = _report(scan_map, factor)
-    with work.writing(Path(output), [str(scan_map.path), factor], settings) as folder:
-        for name in (store.OCCUPANCY, store.FEATURES):
-            shutil.copyfile(scan_map.path / name, folder / name)
-        scan_map.keyframes.write_scaled(folder / store.KEYFRAMES, factor)
-        write_gaussian_ply(gaussians, folder / store.GAUSSIANS)
-        write_tum(folder / store.TRAJECTORY, trajectory)
-        (folder / store.REPORT).write_text(json.dumps(report), encoding="utf-8")
-        _draw(scan_map, folder, trajectory, gaussians, factor)
-        store.write_manifest(folder, _manifest(scan_map, factor, by))
+    parts = MapParts(
+        _manifest(scan_map, factor, by),
+        _settings(scan_map, factor),
+        lambda: report,
+        gaussians=gaussians,
+        trajectory=trajectory,
+        keyframes=scan_map.keyframes,
+        depth_factor=factor,
+        draw=lambda folder: _draw(scan_map, folder, trajectory, gaussians, factor),
+    )
+    write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)
 
 
@@ -119,7 +118,7 @@ def scale_by_poses(scan_map: Map, path: str) -> float:
 def _metric_poses(scan_map: Map, path: str) -> Poses:
     """Those of a file that knows images by name are matched to the capture, if it is still there."""
     if Path(path).is_file() and (found := read_trajectory(path)).names:
-        T = found.of_frames(capture := reopen_capture(scan_map))
+        T = found.of_frames(capture := scan_map.capture)
         has_pose = np.isfinite(T).all(axis=(1, 2))
         return Poses(capture.timestamps[has_pose], T[has_pose])
     return read_poses(path)
@@ -142,7 +141,7 @@ def _point(scan_map: Map, end: str) -> NDArray[np.float64]:
         nearest = sorted(trajectory.keyframes.tolist(), key=lambda index: abs(index - frame))[:3]
         raise MapError(
             f"Frame {frame} is no keyframe of {scan_map.path}; the nearest are {', '.join(map(str, sorted(nearest)))}. "
-            f"Their images are in {scan_map.path / store.KEYFRAMES}."
+            f"Their images are in {scan_map.path / map_files.KEYFRAMES}."
         )
     depth_m, camera = scan_map.keyframes.depth_m(int(rows[0])), scan_map.keyframes.views()[int(rows[0])][1]
     if not (x < camera.width and y < camera.height):
@@ -186,7 +185,7 @@ def _gaussians(gaussians: Gaussians, factor: float) -> Gaussians:
 
 def _settings(scan_map: Map, factor: float) -> Settings:
     """The map's own, with the sizes that were chosen beside the scene."""
-    settings = config.load_saved(scan_map.path / store.CONFIG)
+    settings = scan_map.settings
     for section, key in (("occupancy", "voxel_size"), ("occupancy", "finest"), ("gaussians", "cell_size")):
         value = getattr(getattr(settings, section), key)
         if value is not None:
@@ -205,34 +204,37 @@ def _report(scan_map: Map, factor: float) -> dict[str, Any]:
     return report
 
 
-def _manifest(scan_map: Map, factor: float, by: str) -> dict[str, Any]:
-    kept = {key: value for key, value in scan_map.manifest.items() if key not in ("format_version", "files")}
-    for key in ("voxel_size_m", "finest_voxel_m"):
-        if key in kept:
-            kept[key] = factor * float(kept[key])
-    kept["origin"] = [factor * float(value) for value in kept["origin"]]
-    for key in ("T_world_map", "T_gravity_map"):
-        if key in kept:
-            kept[key] = _moved(np.array(kept[key], np.float64), factor).tolist()
-    if box := (kept.get("refined") or {}).get("box"):
-        kept["refined"] = {**kept["refined"], "box": [factor * float(value) for value in box]}
-    before = float(kept.get("scale", {}).get("factor", 1.0))
-    return {**kept, "scale": {"metric": True, "by": by, "factor": before * factor}}
+def _manifest(scan_map: Map, factor: float, by: str) -> Manifest:
+    said = scan_map.manifest
+    changes: dict[str, Any] = {
+        "voxel_size_m": factor * said.voxel_size_m,
+        "origin": vector(factor * np.array(said.origin)),
+        "T_world_map": matrix(_moved(np.array(said.T_world_map), factor)),
+        "scale": MapScale(metric=True, by=by, factor=said.scale.factor * factor),
+    }
+    if said.finest_voxel_m is not None:
+        changes["finest_voxel_m"] = factor * said.finest_voxel_m
+    if said.T_gravity_map is not None:
+        changes["T_gravity_map"] = matrix(_moved(np.array(said.T_gravity_map), factor))
+    if said.refined is not None and (box := said.refined.box) is not None:
+        low, high = vector(factor * np.array(box[:3])), vector(factor * np.array(box[3:]))
+        changes["refined"] = msgspec.structs.replace(said.refined, box=(*low, *high))
+    return msgspec.structs.replace(said, **changes)
 
 
 def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussians, factor: float) -> None:
     """The pictures again, which tell lengths; of submaps only the mapped one, for the map holds no other."""
-    capture = Path(str(scan_map.manifest["capture"]["path"]))
+    capture = Path(scan_map.manifest.capture.path)
     frames = np.flatnonzero(trajectory.has_pose).astype(np.int32)
     closures = [closure for submap in scan_map.report.get("submaps", [])[:1] for closure in submap["closures"]]
     ends = np.array([closure[:2] for closure in closures], np.int32).reshape(-1, 2)
     held = np.array([closure[2] for closure in closures], bool)
     submap = Submap(frames, trajectory.T_world_cam[frames], trajectory.keyframes, ends, held)
     trajectory_picture.write_path_picture(
-        folder / store.PATH_PICTURE, [submap], trajectory, gaussians, np.array(scan_map.manifest["up"]), capture
+        folder / map_files.PATH_PICTURE, [submap], trajectory, gaussians, scan_map.up, capture
     )
     rasterizer = registry.load("gaussians.rasterizers", "cpu").load()
-    width = config.load_saved(scan_map.path / store.CONFIG).fitting.width
+    width = scan_map.settings.fitting.width
     keyframes = scan_map.keyframes
     shown = []
     for row in np.unique(np.linspace(0, len(keyframes) - 1, render_pictures.SHOWN).astype(int)).tolist():
@@ -240,4 +242,4 @@ def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussi
         frame = frame.scaled(factor)
         view = rendered_views.prepare_captured_view(frame, trajectory.T_world_keyframe[row], width, rasterizer.device)
         shown.append((int(trajectory.keyframes[row]), view))
-    render_pictures.write_render_picture(folder / store.RENDER_PICTURE, gaussians, shown, rasterizer, capture)
+    render_pictures.write_render_picture(folder / map_files.RENDER_PICTURE, gaussians, shown, rasterizer, capture)

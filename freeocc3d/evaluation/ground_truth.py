@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import read_arrays
 from ..core.atomic_files import write_whole
 from ..core.errors import FreeOccError, MapError
 from ..core.types import UNKNOWN
-from ..storage.store import read_arrays
 from .embodiedocc import load_global_package
 from .true_occupancy import GroundTruth
 

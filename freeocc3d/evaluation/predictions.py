@@ -22,8 +22,8 @@ from ..gaussians.splat_ply import read_standard_ply
 from ..language.encoders.base import TextEncoder, TextFeatures
 from ..occupancy import build, splat
 from ..query import word_query
+from ..query.scan_map import Map
 from ..settings.config import Settings
-from ..storage.store import Map
 from ..tracking.trajectory_alignment import Poses, TrajectoryAlignment
 from .confusion import Prediction
 from .ground_truth import read_grid_arrays, read_lattice, require_array

@@ -14,15 +14,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import open_capture
-from ..capture.base import Capture
 from ..core.errors import FreeOccError
 from ..core.types import UNKNOWN
 from ..gaussians.splat_ply import read_standard_ply
 from ..occupancy.up_direction import estimate_up
+from ..query.scan_map import Map, load_map
 from ..settings import config
-from ..settings.config import Settings
-from ..storage.store import CONFIG, Map, load_map
+from ..storage.map_files import CONFIG
 from ..tracking.trajectory_alignment import (
     Poses,
     TrajectoryAlignment,
@@ -82,7 +80,7 @@ def score_map(
     estimated = select_estimated_poses(scan_map.trajectory)
     if poses is None:
         try:
-            poses = read_true_poses(reopen_capture(scan_map, settings))
+            poses = _own_poses(scan_map)
         except FreeOccError:
             if how != "none":
                 raise
@@ -232,7 +230,7 @@ def evaluate_scenes(asked: ScoringRequest) -> Evaluation:
         maps = _in_split(maps, asked.split)
     count = max(len(maps), 1)
     listed = None if asked.classes is None else load_class_map(asked.classes)
-    captures = [str(scan_map.manifest["capture"]["path"]) for scan_map in maps] or list(asked.poses)
+    captures = [scan_map.manifest.capture.path for scan_map in maps] or list(asked.poses)
     truths = _truths(captures, asked.ground_truths, count, listed)
     if len(asked.poses) not in (0, count):
         raise FreeOccError(
@@ -265,7 +263,7 @@ def evaluate_scenes(asked: ScoringRequest) -> Evaluation:
 
 def name_scene(scan_map: Map) -> str:
     """A map's scene: the name of the capture's folder."""
-    return Path(str(scan_map.manifest["capture"]["path"])).name
+    return Path(scan_map.manifest.capture.path).name
 
 
 def _in_split(maps: list[Map], split: Path) -> list[Map]:
@@ -299,15 +297,13 @@ def _truths(captures: Sequence[str], paths: Sequence[Path], count: int, classes:
     return [load_ground_truth(path, names) for path in paths]
 
 
-def reopen_capture(scan_map: Map, settings: Settings | None = None) -> Capture:
-    """The capture that a map was made of, opened as it was then. Raises FreeOccError if it is not there any more."""
-    settings = settings or config.load_saved(scan_map.path / CONFIG)
-    path = scan_map.manifest["capture"]["path"]
-    if not str(path).startswith("builtin:") and not Path(path).exists():
-        raise FreeOccError(
-            f"The capture {path}, of which {scan_map.path} was made, is not there: name the true poses with --poses."
-        )
-    return open_capture(path, settings.capture, settings.backends.get("capture"))
+def _own_poses(scan_map: Map) -> Poses:
+    """The poses that the map's capture states. Raises FreeOccError."""
+    try:
+        capture = scan_map.capture
+    except FreeOccError as error:
+        raise FreeOccError(f"{error} Name the true poses with --poses.") from error
+    return read_true_poses(capture)
 
 
 def collect_common_classes(truths: Sequence[GroundTruth]) -> ClassMap:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ..core.atomic_files import write_whole
+from ..query.scan_map import Map
 from ..settings import registry
-from ..storage.store import Map
 
 
 def export_map(

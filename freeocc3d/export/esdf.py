@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import ConfigError, ExportError
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
-from ..storage.store import Map
+from ..query.scan_map import Map
 from .distance_transform import LONGEST, transform_signed
 from .export_frames import Box, PlacedVoxels, VoxelOptions, find_world, place_voxels
 from .openvdb_files import write_vdb

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.errors import ConfigError, ExportError
 from ..core.transforms import invert
 from ..core.types import BLOCK, OCCUPIED, UNKNOWN, Occupancy
+from ..query.scan_map import Map
 from ..settings.option_types import Finite, converted
 from ..settings.typed_options import TypedOptions
-from ..storage.store import Map
 
 Frame = Literal["map", "gravity", "first-camera"]
 """The map's frame; z up with the floor at z = 0 and the walls along x and y; z up with the first camera at the origin,
@@ -171,7 +171,7 @@ def write_description(path: Path, described: dict[str, Any]) -> None:
 
 def find_world(scan_map: Map, T_frame_map: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) from the frame to the world that the map's ``T_world_map`` leads to."""
-    return np.asarray(np.array(scan_map.manifest["T_world_map"], np.float64) @ invert(T_frame_map))
+    return np.asarray(np.array(scan_map.manifest.T_world_map, np.float64) @ invert(T_frame_map))
 
 
 def _on_lattice(occupancy: Occupancy, origin: ArrayLike | None) -> bool:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import ExportError
+from ..query.scan_map import Map
 from ..settings.typed_options import TypedOptions
-from ..storage.store import Map
 from .export_frames import Frame, to_frame, write_description
 
 REQUIRES: tuple[str, ...] = ()

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from ..core.errors import ExportError
 from ..core.transforms import transform
 from ..query.regions import Region
+from ..query.scan_map import Map
 from ..settings.typed_options import TypedOptions
-from ..storage.store import Map
 from .export_frames import UprightFrame, to_frame
 
 REQUIRES: tuple[str, ...] = ()

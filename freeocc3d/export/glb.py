@@ -18,7 +18,7 @@ from .. import __version__
 from ..core.errors import ExportError
 from ..core.transforms import invert
 from ..occupancy.surface_faces import find_exposed_faces
-from ..storage.store import Map
+from ..query.scan_map import Map
 from .export_frames import PlacedVoxels, VoxelOptions, place_voxels
 from .ply import ColorBy, choose_colors
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import ConfigError, ExportError
-from ..storage.store import Map
+from ..query.scan_map import Map
 from .export_frames import PlacedVoxels
 from .map_server_files import COSTS, CellGrid, encode_costs, write_map
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..core.errors import ConfigError, ExportError
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
+from ..query.scan_map import Map
 from ..settings.option_types import Finite, NotNegative, Positive, Share
-from ..storage.store import Map
 from .export_frames import BoxOptions, UprightFrame, find_floor_z, place_voxels, write_description
 from .keepout_masks import parse_avoided, write_layers
 from .map_server_files import PLAN, CellGrid, write_map

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import ExportError
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
-from ..storage.store import Map
+from ..query.scan_map import Map
 from .export_frames import Frame, VoxelOptions, find_world, place_voxels
 
 REQUIRES: tuple[str, ...] = ()

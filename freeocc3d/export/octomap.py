@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import ConfigError, ExportError
 from ..core.types import FREE, OCCUPIED, Occupancy
-from ..storage.store import Map
+from ..query.scan_map import Map
 from .export_frames import VoxelOptions, place_voxels, write_description
 from .octree import KEY_ORIGIN, Leaves, Octree, build_octree
 

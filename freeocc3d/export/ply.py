@@ -14,8 +14,8 @@ from ..core.errors import ExportError
 from ..core.ply_files import write_ply
 from ..core.types import OCCUPIED, Occupancy
 from ..occupancy.surface_faces import find_exposed_faces
+from ..query.scan_map import Map
 from ..query.word_query import QueryResult
-from ..storage.store import Map
 from ..viewer.palette import assign_class_colors, color_by_height, color_by_value, highlight_regions
 from .export_frames import Frame, PlacedVoxels, VoxelOptions, place_voxels
 

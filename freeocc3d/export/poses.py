@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from ..core.errors import ExportError
 from ..core.transforms import invert, rotations_to_quats, transform
 from ..core.types import Gaussians, Intrinsics
+from ..query.scan_map import Map
 from ..settings.option_types import NotNegativeInt
 from ..settings.typed_options import TypedOptions
-from ..storage.store import Map
 from .export_frames import Frame, to_frame, write_description
 from .ply import write_colored_ply
 

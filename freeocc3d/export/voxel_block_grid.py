@@ -29,7 +29,7 @@ from ..core.errors import ConfigError, ExportError, FreeOccError
 from ..core.types import BLOCK, OCCUPIED, Occupancy
 from ..core.voxel_keys import pack_voxels
 from ..language.feature_codec import CodedFeatures, Features
-from ..storage.store import Map
+from ..query.scan_map import Map
 from .export_frames import Frame, VoxelOptions, find_world, place_voxels, write_description
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         features = scan_map.occupancy.features[there.rows]
         beside |= _vocabulary(scan_map, _basis(features))
         encoder = scan_map.text_encoder
-        described |= {"encoder": scan_map.manifest["encoder"]["name"], "threshold": encoder.threshold}
+        described |= {"encoder": scan_map.manifest.encoder.name, "threshold": encoder.threshold}
     write_grid(path, there.occupancy, features, beside)
     write_description(path, described)
 

@@ -1,1 +1,1 @@
-"""The only room that knows all four layers: capture -> track -> gaussians -> language -> occupancy -> store."""
+"""The only room that knows all four layers: capture -> track -> gaussians -> language -> occupancy -> storage."""

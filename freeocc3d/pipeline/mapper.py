@@ -24,7 +24,7 @@ from ..language import lifting
 from ..language.encoders.base import Encoder
 from ..occupancy import build
 from ..settings.config import Settings
-from ..storage import store
+from ..storage import map_files
 from ..storage.keyframes import Keyframes
 from ..tracking.base import Tracked, Tracker
 
@@ -38,7 +38,7 @@ class Mapper:
     def __init__(self, settings: Settings, capture: Capture, folder: Path):
         self.settings = settings
         self.capture = capture
-        self.keyframes = Keyframes(folder / store.KEYFRAMES)
+        self.keyframes = Keyframes(folder / map_files.KEYFRAMES)
         self.tracker: Tracker = settings.load_backend("tracking", capture)
         if self.tracker.needs_depth and not capture.has_depth:
             raise TrackingError(

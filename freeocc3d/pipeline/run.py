@@ -13,9 +13,9 @@ from ..capture.focal_correction import Reregistered
 from ..core.errors import Interrupted, MapError, TrackingError
 from ..core.progress import Progress
 from ..language.encoders.base import Encoder
+from ..query.scan_map import Map, load_map
 from ..settings import config
 from ..settings.config import Settings
-from ..storage.store import Map, load_map
 from ..storage.work_folder import WorkFolder
 from ..tracking.rgbd import focal_calibration
 from .checks import check, warn_of_color_focal

@@ -14,11 +14,11 @@ from ..storage.keyframes import Keyframes
 from .regions import Region
 
 MOST = 3
-"""Views of a region that are told."""
+"""Keyframes of a region that are found."""
 
 
 @dataclass(frozen=True)
-class View:
+class RegionView:
     """A keyframe that shows a region.
 
     frame: index of the keyframe's frame in the capture.  box: x0, y0, x1, y1, pixels of its image around the voxels
@@ -32,8 +32,8 @@ class View:
 
 def best_views(
     occupancy: Occupancy, trajectory: Trajectory, keyframes: Keyframes, regions: Sequence[Region], most: int = MOST
-) -> list[list[View]]:
-    """For each region, at most so many of the keyframes that show a part of it: those that show most voxels, to a tenth
+) -> list[list[RegionView]]:
+    """For each region, at most ``most`` keyframes that show a part of it: those that show most voxels, to a tenth
     of what the best one shows, and of these the ones in whose images it is largest.
 
     A keyframe shows a voxel whose centre falls on a pixel with a depth that differs from the centre's by no more than
@@ -42,7 +42,7 @@ def best_views(
     voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
     centers = [occupancy.centers(voxels[region.rows], edges[region.rows]) for region in regions]
     sizes = [edges[region.rows] * occupancy.finest for region in regions]
-    found: list[list[View]] = [[] for _ in regions]
+    found: list[list[RegionView]] = [[] for _ in regions]
     cameras = [camera for _, camera in keyframes.views()]
     poses = zip(trajectory.keyframes, trajectory.T_world_keyframe, cameras, strict=True)
     for row, (frame, T, camera) in enumerate(poses):
@@ -61,7 +61,7 @@ def best_views(
             if shown.any():
                 half = 0.5 * np.stack((camera.fx, camera.fy)) * (size / z)[inside][shown, None]
                 box = _box(pixels[inside][shown], half, camera.width, camera.height)
-                found[region].append(View(int(frame), box, float(shown.sum() / len(points))))
+                found[region].append(RegionView(int(frame), box, float(shown.sum() / len(points))))
     return [_best(views)[:most] for views in found]
 
 
@@ -72,11 +72,11 @@ def _box(pixels: NDArray[np.float64], half: NDArray[np.float64], width: int, hei
     return x0, y0, x1, y1
 
 
-def _best(views: list[View]) -> list[View]:
+def _best(views: list[RegionView]) -> list[RegionView]:
     """The views, best first."""
     most = max((view.visible for view in views), default=1.0)
 
-    def worth(view: View) -> tuple[float, int]:
+    def worth(view: RegionView) -> tuple[float, int]:
         x0, y0, x1, y1 = view.box
         return round(view.visible / most, 1), (x1 + 1 - x0) * (y1 + 1 - y0)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.errors import FreeOccError
 from ..core.types import Frame, Intrinsics, Occupancy
 from ..language.feature_codec import Features, compute_cosines, mask_known
-from ..settings import registry
+from ..storage.saved_map import SavedMap
 from .word_query import Options, QueryResult, found_regions
 
 if TYPE_CHECKING:
@@ -24,21 +24,17 @@ _ALIKE = 0.5
 Box = tuple[int, int, int, int]
 
 
-def image_encoder(name: str, config_file: Path) -> Encoder:
-    """The image side of a map's encoder, as the map's configuration tells.
+def picture_encoder(scan_map: SavedMap) -> Encoder:
+    """The encoder of a map, to look at a picture.
 
-    Raises FreeOccError for one that takes more than an image, or that cannot be had again.
+    Raises FreeOccError for one that takes more than a picture, or that cannot be loaded again.
     """
-    from ..settings import config
-
-    module = registry.load("language.encoders", name)
-    if getattr(module, "NEEDS_CAPTURE", True):
+    if scan_map.encoder_needs_capture:
         raise FreeOccError(
-            f"The map's encoder '{name}' reads what the capture brings and cannot look at a picture: ask for words."
+            f"The map's encoder '{scan_map.manifest.encoder.name}' reads more of the capture than its pictures, so it "
+            "cannot look at a picture: ask for words."
         )
-    settings = config.load_saved(config_file)
-    encoder: Encoder = settings.load_backend("language", None)
-    return encoder
+    return scan_map.encoder
 
 
 def patch_feature(

@@ -11,7 +11,7 @@ from .conditions import Where
 from .word_query import QueryResult
 
 if TYPE_CHECKING:
-    from ..storage.store import Map
+    from .scan_map import Map
 
 
 @dataclass(frozen=True)

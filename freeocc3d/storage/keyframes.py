@@ -5,6 +5,7 @@ while the camera is tracked, and read one at a time."""
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import overload
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.atomic_files import is_temporary, replace_text
 from ..core.errors import MapError
 from ..core.types import Frame, Intrinsics
 
@@ -55,16 +57,20 @@ class Keyframes(Sequence[Frame]):
              **({} if frame.depth_sigma_m is None else {_SIGMA: 1.0})}
         )  # fmt: skip
 
-    def write_scaled(self, folder: Path, factor: float) -> None:
-        """Write them to another folder with depth times ``factor``; colour is copied. Raises OSError, MapError."""
+    def copy_to(self, folder: Path, depth_factor: float = 1.0) -> None:
+        """Write them to another folder, with depth times a factor. Raises OSError, MapError."""
         folder.mkdir(parents=True, exist_ok=True)
-        written = Keyframes(folder)
-        for entry, frame in zip(self._entries, self, strict=True):
-            color_path = self._paths(frame.index)[0]
-            (folder / color_path.name).write_bytes(color_path.read_bytes())
-            written._write_depth(frame.scaled(factor))
-            written._entries.append(entry)
-        written.save_index()
+        copied = Keyframes(folder)
+        for entry in self._entries:
+            color_path, *depth_paths = self._paths(int(entry["frame"]))
+            shutil.copyfile(color_path, folder / color_path.name)
+            if depth_factor == 1:
+                for path in depth_paths[: 1 + (_SIGMA in entry)]:
+                    shutil.copyfile(path, folder / path.name)
+            else:
+                copied._write_depth(self._read(entry).scaled(depth_factor))
+            copied._entries.append(entry)
+        copied.save_index()
 
     def only(self, frames: NDArray[np.integer]) -> Keyframes:
         """Those of the given frames of the capture, in the same folder."""
@@ -80,16 +86,14 @@ class Keyframes(Sequence[Frame]):
     def drop_unlisted(self) -> None:
         """Remove images that a run left which was interrupted after its last checkpoint."""
         listed = {path for entry in self._entries for path in self._paths(int(entry["frame"]))}
-        for path in [*self.folder.glob("*.color.jpg"), *self.folder.glob("*.depth*.png")]:
-            if path not in listed:
+        for path in self.folder.iterdir():
+            if path not in listed and (path.match("*.color.jpg") or path.match("*.depth*.png") or is_temporary(path)):
                 path.unlink()
 
     def save_index(self) -> None:
         """Write the index, whole or not at all. Raises OSError."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        temporary = self.folder / (INDEX + ".tmp")
-        temporary.write_text(json.dumps(self._entries, indent=0), encoding="utf-8")
-        temporary.replace(self.folder / INDEX)
+        replace_text(self.folder / INDEX, json.dumps(self._entries, indent=0))
 
     def __len__(self) -> int:
         return len(self._entries)

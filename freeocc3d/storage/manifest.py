@@ -1,49 +1,253 @@
-"""What a map's manifest has to say, checked before anything else is read."""
+"""The manifest of a map, map.yaml: every key with its type, its default and the format version that brought it.
+
+A map states the newest version among the keys that it uses, so that an earlier freeocc3d reads every map that it can.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple, get_type_hints
+
+import msgspec
+import numpy as np
+import yaml
+from numpy.typing import NDArray
 
 from ..core.errors import MapError
+from ..core.transforms import is_rigid
+from .map_files import MANIFEST
 
-MANIFEST = "map.yaml"
+FORMAT_VERSION = 3
+"""The newest format, and the newest that is read."""
 
+OLDEST_VERSION = 2
+"""The oldest format that is read; the one before it packed features in another way."""
 
-def check_manifest(manifest: dict[str, Any], path: Path) -> None:
-    """Raises MapError for a manifest of the map at ``path`` that lacks what every map says, or names a file outside."""
-    needed = {
-        "voxel_size_m": float, "origin": list, "up": list, "encoder": dict, "keyframes": list, "files": dict,
-        "counts": dict, "capture": dict, "T_world_map": list, "freeocc3d": str,
-    }  # fmt: skip
-    for key, kind in needed.items():
-        if not isinstance(manifest.get(key), kind):
-            raise MapError(f"{path / MANIFEST} is damaged: '{key}' is missing or not a {kind.__name__}.")
-    inner: dict[str, tuple[str, ...]] = {
-        "encoder": ("name", "state"),
-        "capture": ("path", "format"),
-        "counts": ("gaussians", "voxels", "frames", "frames_with_pose", "submaps"),
-    }
-    for key, names in inner.items():
-        if missing := [name for name in names if name not in manifest[key]]:
-            raise MapError(f"{path / MANIFEST} is damaged: '{key}' lacks {', '.join(missing)}.")
-    if (named := manifest.get("vocabulary")) is not None and not _is_vocabulary(named):
-        raise MapError(f"{path / MANIFEST} is damaged: 'vocabulary' does not hold names with their counts.")
-    scale = manifest.get("scale", {"metric": True})
-    if not isinstance(scale, dict) or not isinstance(scale.get("metric"), bool):
-        raise MapError(f"{path / MANIFEST} is damaged: 'scale' does not say whether lengths are metres.")
-    for name in manifest["files"]:
-        inside = (path / str(name)).resolve().is_relative_to(path.resolve())
-        if not inside:
-            raise MapError(f"{path / MANIFEST} is damaged: '{name}' lies outside the map's folder.")
+POSES = "camera to world"
+CODEC = "transform coding, 8, 4 and 2 bits a direction"
 
 
-def _is_vocabulary(named: Any) -> bool:
-    """Whether an entry of a manifest is what ``language.scene_vocabulary`` makes."""
-    if not isinstance(named, dict) or not isinstance(named.get("keyframes"), list):
-        return False
-    names = named.get("names")
-    return isinstance(names, dict) and all(
-        isinstance(name, str) and isinstance(entry, dict) and isinstance(entry.get("count"), int)
-        for name, entry in names.items()
-    )
+def _key(description: str, since: int = OLDEST_VERSION, **bounds: Any) -> msgspec.Meta:
+    return msgspec.Meta(description=description, extra={"since": since}, **bounds)
+
+
+Vector = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+Matrix = tuple[Row, Row, Row, Row]
+Count = Annotated[int, msgspec.Meta(ge=0)]
+
+
+def matrix(T: NDArray[np.float64]) -> Matrix:
+    """A (4, 4) transform as a manifest holds it."""
+    rows = [tuple(row) for row in T.tolist()]
+    return rows[0], rows[1], rows[2], rows[3]
+
+
+def vector(values: NDArray[np.float64]) -> Vector:
+    """Three numbers as a manifest holds them."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+class CaptureRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """The capture that a map was made of. path: a folder, a file, or ``builtin:room``.  frames: all that it has."""
+
+    path: str
+    format: str
+    frames: Count = 0
+
+
+class EncoderRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """The encoder of the features. state: what its word side needs to be made again.  dimension: of its features."""
+
+    name: str
+    dimension: Count = 0
+    state: Any
+
+
+class MapScale(msgspec.Struct, frozen=True, kw_only=True):
+    """The unit of length. metric: whether it is the metre.  by: what says so.  factor: metres in a unit of what the
+    tracker gave."""
+
+    metric: bool
+    by: str = "sensor"
+    factor: float = 1.0
+
+
+class VoxelCounts(msgspec.Struct, frozen=True, kw_only=True):
+    """Numbers of voxels, of any size; unknown ones count within the blocks only."""
+
+    occupied: Count
+    free: Count
+    unknown: Count = 0
+
+
+class MapCounts(msgspec.Struct, frozen=True, kw_only=True):
+    """How much of everything the map holds. frames: of the capture."""
+
+    gaussians: Count
+    voxels: VoxelCounts
+    frames: Count
+    frames_with_pose: Count
+    submaps: Count
+
+
+class NameCount(msgspec.Struct, frozen=True, kw_only=True):
+    """How many keyframes have a name, and which."""
+
+    count: Count
+    keyframes: tuple[int, ...] = ()
+
+
+class SceneWords(msgspec.Struct, frozen=True, kw_only=True):
+    """Names that a vision-language model gave. keyframes: those that it named.  names: the most frequent first."""
+
+    model: str = ""
+    keyframes: tuple[int, ...]
+    names: dict[str, NameCount]
+
+
+class Refined(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The map of larger voxels that this one was made of. box: x0 y0 z0 x1 y1 z1 of the part of it, metres; None for
+    the whole."""
+
+    map: str
+    box: tuple[float, float, float, float, float, float] | None = None
+
+
+class MapFacts(msgspec.Struct, frozen=True, kw_only=True):
+    """What only the manifest says of a map."""
+
+    capture: Annotated[CaptureRecord, _key("the capture that the map was made of")]
+    frame: Annotated[str, _key("the frame of the map, in words")] = ""
+    poses: Annotated[str, _key("the direction of the poses, in words")] = POSES
+    scale: Annotated[MapScale, _key("the unit of length")] = MapScale(metric=True)
+    up: Annotated[Vector, _key("unit vector x y z that points up in the map's frame")]
+    T_world_map: Annotated[Matrix, _key("4 x 4, rigid, from the map's frame to the world of the capture's own poses")]
+    T_gravity_map: Annotated[Matrix | None, _key("4 x 4, rigid, to the frame with z up and the floor at z = 0")] = None
+    encoder: Annotated[EncoderRecord, _key("the encoder of the features")]
+    codec: Annotated[str, _key("how features are packed, in words")] = CODEC
+    vocabulary: Annotated[SceneWords | None, _key("names that a model gave to what is in the scene")] = None
+    refined: Annotated[Refined | None, _key("the map of larger voxels that this one was made of")] = None
+
+
+class Manifest(MapFacts, frozen=True, kw_only=True):
+    """What map.yaml says: the facts, and what it repeats of the other files, so that they can be checked."""
+
+    freeocc3d: Annotated[str, _key("version of the package that wrote the map")]
+    voxel_size_m: Annotated[float, _key("edge of the largest voxels, metres", gt=0)]
+    finest_voxel_m: Annotated[float | None, _key("edge of the smallest, if sizes differ, metres", since=3)] = None
+    origin: Annotated[Vector, _key("x y z of the lower corner of voxel (0, 0, 0), map's frame, metres")]
+    counts: Annotated[MapCounts, _key("numbers of Gaussians, voxels, frames and submaps")]
+    keyframes: Annotated[tuple[Count, ...], _key("the capture's frames that are keyframes, ascending")]
+    files: Annotated[dict[str, Count], _key("files of the folder with their sizes, bytes")]
+
+    @property
+    def finest_m(self) -> float:
+        """Edge of the smallest voxels, metres."""
+        return self.finest_voxel_m or self.voxel_size_m
+
+    @property
+    def format_version(self) -> int:
+        """The newest version among the keys that are used."""
+        return max(key.since for key in manifest_keys() if getattr(self, key.name) is not None)
+
+
+class ManifestKey(NamedTuple):
+    """A key of map.yaml, for the documentation. since: the format version that brought it."""
+
+    name: str
+    required: bool
+    since: int
+    description: str
+
+
+def manifest_keys() -> Iterator[ManifestKey]:
+    """The keys of a manifest in the order of the file."""
+    hints = get_type_hints(Manifest, include_extras=True)
+    for field in msgspec.structs.fields(Manifest):
+        meta: msgspec.Meta = hints[field.name].__metadata__[0]
+        assert meta.extra is not None
+        yield ManifestKey(field.name, field.required, meta.extra["since"], meta.description or "")
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write map.yaml. Raises OSError."""
+    content = {name: value for name, value in msgspec.to_builtins(manifest).items() if value is not None}
+    text = yaml.safe_dump({"format_version": manifest.format_version, **content}, sort_keys=False)
+    (folder / MANIFEST).write_text(text, encoding="utf-8")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of the map in a folder. Raises MapError: not a map, another version, damaged."""
+    path = folder / MANIFEST
+    if not folder.is_dir():
+        raise MapError(f"There is no map folder {folder}.")
+    try:
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_SafeLoader)
+    except FileNotFoundError as error:
+        raise MapError(f"{folder} is not a map: it has no {MANIFEST}.") from error
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise MapError(f"{path} cannot be read: {' '.join(str(error).split())}.") from error
+    version = content.get("format_version") if isinstance(content, dict) else None
+    if not isinstance(version, int):
+        raise MapError(f"{path} is not a map's manifest: it states no format_version.")
+    if version > FORMAT_VERSION:
+        raise MapError(
+            f"The map {folder} has format {version}, this freeocc3d reads up to {FORMAT_VERSION}: upgrade freeocc3d."
+        )
+    if version < OLDEST_VERSION:
+        raise MapError(f"The map {folder} has format {version}, of an earlier freeocc3d: map the capture again.")
+    try:
+        manifest = msgspec.convert(content, Manifest)
+    except msgspec.ValidationError as error:
+        raise MapError(f"{path} is damaged: {_what_is_wrong(error)}.") from error
+    if problem := _problem(manifest, folder):
+        raise MapError(f"{path} is damaged: {problem}.")
+    return manifest
+
+
+def _problem(manifest: Manifest, folder: Path) -> str:
+    """What is wrong with a manifest whose types are right, empty if nothing is."""
+    lengths = np.array((manifest.voxel_size_m, manifest.finest_m, *manifest.origin, *manifest.up))
+    if not np.isfinite(lengths).all():
+        return "'voxel_size_m', 'finest_voxel_m', 'origin' or 'up' holds a number that is not finite"
+    for name in ("T_world_map", "T_gravity_map"):
+        T = getattr(manifest, name)
+        if T is not None and not is_rigid(np.array(T)):
+            return f"'{name}' is no rigid transform"
+    root = folder.resolve()
+    outside = next((name for name in manifest.files if not (folder / name).resolve().is_relative_to(root)), None)
+    return "" if outside is None else f"'files' names {outside}, which lies outside the map's folder"
+
+
+_KINDS = {
+    "float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false", "array": "a list",
+    "object": "a group of keys", "null": "nothing",
+}  # fmt: skip
+_SHAPES = (
+    (r"Object missing required field `(?P<key>\w+)`", "lacks '{key}'"),
+    (r"Expected `(?P<wanted>[^`]+)`, got `(?P<found>\w+)`", "has {found} in place of {wanted}"),
+    (r"Expected `array` of length (?P<wanted>\d+), got (?P<found>\d+)", "has {found} entries in place of {wanted}"),
+    (r"Expected `\w+` (?P<bound>[<>]=? \S+)", "has a number that is not {bound}"),
+)
+
+
+def _what_is_wrong(error: msgspec.ValidationError) -> str:
+    """A validation error as a part of a sentence that names the field."""
+    message, _, where = str(error).partition(" - at `$")
+    field = where.strip("`.")
+    for pattern, sentence in _SHAPES:
+        if match := re.fullmatch(pattern, message):
+            said = {name: _in_words(value) for name, value in match.groupdict().items()}
+            return f"{repr(field) if field else 'it'} {sentence.format(**said)}"
+    return f"'{field}': {message}"
+
+
+def _in_words(kinds: str) -> str:
+    return " or ".join(_KINDS.get(kind, kind) for kind in kinds.split(" | "))
+
+
+_SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -14,6 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import read_arrays, write_arrays
+from ..core.atomic_files import is_temporary, replace_text
 from ..core.errors import MapError
 from ..core.progress import Progress
 from ..core.types import Gaussians
@@ -21,7 +23,7 @@ from ..core.warnings import Notice, read_notices
 from ..gaussians.point_cloud import read_gaussian_ply, write_gaussian_ply
 from ..settings import config
 from ..settings.config import Settings
-from . import store
+from . import map_files
 
 Stage = Literal["tracking", "gaussians", "language"]
 
@@ -34,11 +36,9 @@ STAGES: dict[Stage, tuple[str, ...]] = {
 
 _TRACKING, _STAGE_FEATURES, _MARKS = "tracking.npz", "features.stage.npz", "stages.json"
 _ANSWERS, _OFFLINE = "vocabulary.stage.json", "offline"
-_STAGE_FILES = (_TRACKING, "tracking.tmp.npz", _STAGE_FEATURES, _ANSWERS, f"{_ANSWERS}.tmp", _MARKS, f"{_MARKS}.tmp")
+_STAGE_FILES = (_TRACKING, _STAGE_FEATURES, _ANSWERS, _MARKS)
 _OWN_FILES = {
-    *_STAGE_FILES, _OFFLINE, store.MANIFEST, store.CONFIG, store.REPORT,
-    store.TRAJECTORY, store.PATH_PICTURE, store.RENDER_PICTURE, store.GAUSSIANS, store.OCCUPANCY, store.FEATURES,
-    store.KEYFRAMES,
+    *_STAGE_FILES, _OFFLINE, map_files.MANIFEST, map_files.KEYFRAMES, *map_files.ALWAYS, *map_files.PICTURES,
 }  # fmt: skip
 
 
@@ -63,10 +63,12 @@ class WorkFolder:
         folder = output.with_name(output.name + ".partial")
         if output.exists() and not overwrite:
             raise MapError(f"{output} exists: choose another folder, or replace it with --overwrite.")
-        if output.exists() and not (output / store.MANIFEST).is_file():
+        if output.exists() and not (output / map_files.MANIFEST).is_file():
             raise MapError(f"{output} is not a map, so it is not overwritten: choose another folder.")
         if folder.exists():
-            strange = folder.is_file() or {path.name for path in folder.iterdir()} - _OWN_FILES
+            strange = folder.is_file() or any(
+                path.name not in _OWN_FILES and not is_temporary(path) for path in folder.iterdir()
+            )
             if strange:
                 raise MapError(f"{folder} is in the way, and is not an interrupted run's: move it, or choose another.")
             if (folder / _MARKS).is_file() and not (resume or overwrite):
@@ -84,14 +86,11 @@ class WorkFolder:
         return cls.open(output, overwrite, resume=False)
 
     @contextlib.contextmanager
-    def writing(self, output: Path, identity: list[Any], settings: Settings) -> Iterator[Path]:
-        """The folder, in which the configuration stands; what is written to it inside is the map ``output`` afterwards,
-        and gone where that fails. Raises MapError where nothing can be written."""
+    def begun_anew(self, output: Path) -> Iterator[None]:
+        """The folder is there and empty at first, and gone where writing ``output`` fails. Raises MapError then."""
         try:
-            self.begin(identity, settings)
-            (self.folder / store.CONFIG).write_text(config.dump(settings), encoding="utf-8")
-            yield self.folder
-            self.finish(output)
+            self._make()
+            yield
         except BaseException as error:
             self.discard()
             if isinstance(error, OSError):
@@ -114,6 +113,10 @@ class WorkFolder:
                     "with the same ones, or start again with --overwrite."
                 )
             return
+        self._make()
+
+    def _make(self) -> None:
+        """Raises MapError where the folder cannot be made."""
         if self.folder.exists():
             shutil.rmtree(self.folder)
         try:
@@ -123,12 +126,9 @@ class WorkFolder:
 
     def save_tracking(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Keep layer 1's state, in place of the one before."""
-        temporary = self.folder / "tracking.tmp.npz"
         seconds = {**self.seconds, self._stage: self.seconds.get(self._stage, 0.0) + time.perf_counter() - self._since}
         log = {"broken": self.broken, "warnings": [notice.to_dict() for notice in self.warnings], "seconds": seconds}
-        arrays: dict[str, Any] = {**state, "log": np.array(json.dumps(log))}
-        np.savez(temporary, **arrays)
-        temporary.replace(self.folder / _TRACKING)
+        write_arrays(self.folder / _TRACKING, {**state, "log": np.array(json.dumps(log))})
         self._mark("tracking")
 
     def restore_tracking(self) -> dict[str, NDArray[Any]] | None:
@@ -136,7 +136,7 @@ class WorkFolder:
         path = self.folder / _TRACKING
         if "tracking" not in self._valid or not path.is_file():
             return None
-        state = store.read_arrays(path, {})
+        state = read_arrays(path, {})
         log = json.loads(str(state.pop("log")))
         self.broken = {int(index): text for index, text in log["broken"].items()}
         self.warnings = read_notices(log["warnings"])
@@ -149,7 +149,7 @@ class WorkFolder:
 
     def gaussians(self, compute: Callable[[], Gaussians]) -> Gaussians:
         """The saved result of layer 2, or ``compute()``, saved."""
-        path = self.folder / store.GAUSSIANS
+        path = self.folder / map_files.GAUSSIANS
         if "gaussians" in self._valid and path.is_file():
             return read_gaussian_ply(path)
         result = compute()
@@ -162,9 +162,9 @@ class WorkFolder:
         """The saved result of layer 3, or ``compute()``, saved."""
         path = self.folder / _STAGE_FEATURES
         if "language" in self._valid and path.is_file():
-            return np.asarray(store.read_arrays(path, {"features": ("f", 2)})["features"], np.float16)
+            return np.asarray(read_arrays(path, {"features": ("f", 2)})["features"], np.float16)
         features = compute()
-        np.savez(path, features=features)
+        write_arrays(path, {"features": features})
         self._mark("language")
         return features
 
@@ -194,8 +194,9 @@ class WorkFolder:
 
     def finish(self, output: Path) -> None:
         """The work folder takes the map's name; a map that it replaces is gone only when the new one stands."""
-        for name in _STAGE_FILES:
-            (self.folder / name).unlink(missing_ok=True)
+        for path in self.folder.iterdir():
+            if path.name in _STAGE_FILES or is_temporary(path):
+                path.unlink()
         shutil.rmtree(self.folder / _OFFLINE, ignore_errors=True)
         if not output.exists():
             self.folder.rename(output)
@@ -241,6 +242,4 @@ class WorkFolder:
         order = list(STAGES)
         self._valid = {name for name in self._valid if order.index(name) < order.index(stage)} | {stage}
         marks = {name: self._fingerprints[name] for name in self._valid}
-        temporary = self.folder / f"{_MARKS}.tmp"
-        temporary.write_text(json.dumps(marks), encoding="utf-8")
-        temporary.replace(self.folder / _MARKS)
+        replace_text(self.folder / _MARKS, json.dumps(marks))

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..core.atomic_files import write_whole
 from ..core.errors import DependencyError
-from ..query.best_views import View, best_views
-from ..query.oriented_boxes import oriented_boxes
+from ..query.best_views import RegionView
+from ..query.scan_map import Map
 from ..query.word_query import QueryResult
-from ..storage.store import Map
 from .map_pictures import draw_query
 from .palette import HIGHLIGHTS
 
@@ -54,9 +53,9 @@ def _page(scan_map: Map, results: Sequence[QueryResult]) -> str:
     except DependencyError as error:
         picture, why = "", str(error)
     regions = [region for result in results for region in result.regions]
-    views = best_views(scan_map.occupancy, scan_map.trajectory, scan_map.keyframes, regions)
-    stands = scan_map.standing_places(regions)
-    boxes = oriented_boxes(scan_map.occupancy, regions, scan_map.T_gravity_map)
+    views = scan_map.views_of_each(regions)
+    stands = scan_map.stands_of(regions)
+    boxes = scan_map.boxes_of(regions)
     row_of = {int(frame): row for row, frame in enumerate(scan_map.trajectory.keyframes)}
     answers, at = [], 0
     for number, result in enumerate(results):
@@ -75,7 +74,7 @@ def _page(scan_map: Map, results: Sequence[QueryResult]) -> str:
     )
 
 
-def _crop(image: NDArray[np.uint8], view: View, color: tuple[int, ...]) -> str:
+def _crop(image: NDArray[np.uint8], view: RegionView, color: tuple[int, ...]) -> str:
     """The box of a view with what is around it, as the source of an <img>."""
     height, width = image.shape[:2]
     x0, y0, x1, y1 = view.box

@@ -13,10 +13,10 @@ from ..core.atomic_files import write_whole
 from ..core.errors import ExportError
 from ..core.transforms import transform
 from ..occupancy.surface_faces import find_exposed_faces
-from ..query.oriented_boxes import OrientedBox, oriented_boxes
+from ..query.oriented_boxes import OrientedBox
 from ..query.regions import Region
+from ..query.scan_map import Map
 from ..query.word_query import QueryResult
-from ..storage.store import Map
 from .palette import HIGHLIGHTS, assign_class_colors, color_by_height, highlight_regions
 from .scene_rendering import (
     BACKGROUND,
@@ -135,7 +135,7 @@ def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region,
     turned = vertices.astype(np.float64) @ R.T
     trajectory = scan_map.trajectory
     way = trajectory.T_world_cam[trajectory.has_pose][:, :3, 3] @ R.T
-    upright = oriented_boxes(occupancy, [region for region, _ in regions], scan_map.T_gravity_map)
+    upright = scan_map.boxes_of([region for region, _ in regions])
     boxes = tuple((_corners(box) @ R.T, color) for box, (_, color) in zip(upright, regions, strict=True))
     return DrawnScene(turned, quads, shade_faces(turned, colors[rows]), way, boxes)
 
@@ -189,9 +189,9 @@ def _size(scan_map: Map) -> str:
 
 
 def _title(scan_map: Map) -> str:
-    counts = scan_map.manifest["counts"]
-    name = Path(str(scan_map.manifest["capture"]["path"])).name
+    counts = scan_map.manifest.counts
+    name = Path(scan_map.manifest.capture.path).name
     return (
-        f"{name}: {counts['voxels']['occupied']:,} occupied voxels of {_size(scan_map)}, "
-        f"{counts['frames_with_pose']} of {counts['frames']} frames; above {CUT:.0%} of the height is cut away"
+        f"{name}: {counts.voxels.occupied:,} occupied voxels of {_size(scan_map)}, "
+        f"{counts.frames_with_pose} of {counts.frames} frames; above {CUT:.0%} of the height is cut away"
     )

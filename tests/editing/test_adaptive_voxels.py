@@ -19,8 +19,8 @@ from freeocc3d.occupancy import build, carve, levels, splat
 from freeocc3d.occupancy.connected_components import label_components
 from freeocc3d.pipeline import checks
 from freeocc3d.pipeline import run as pipeline
+from freeocc3d.query.scan_map import Map
 from freeocc3d.settings import config
-from freeocc3d.storage.store import Map
 from freeocc3d.viewer.map_pictures import write_map_picture
 
 RED, YELLOW = (np.array(CUPS[name]) + (0, 0, 0.5 * CUP_HEIGHT) for name in ("red", "yellow"))
@@ -188,8 +188,8 @@ def test_cups_that_were_one_lump_are_two_in_the_map_of_the_room(fine: Map) -> No
 
 def test_saved_loaded_exported_and_drawn(room: Map, fine: Map, tmp_path: Path) -> None:
     again = load_map(fine.path)
-    assert again.manifest["format_version"] == 3
-    assert room.manifest["format_version"] == 2
+    assert again.manifest.format_version == 3
+    assert room.manifest.format_version == 2
     np.testing.assert_array_equal(again.occupancy.levels, fine.occupancy.levels)
     assert len(again.keyframes) == len(room.keyframes)
     export_map(again, "ply", tmp_path / "map.ply")

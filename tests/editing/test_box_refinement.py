@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import refused, run
+from msgspec import structs
 
 from freeocc3d.capture.builtin_room import CUP_HEIGHT, CUPS
 from freeocc3d.core.errors import MapError
@@ -15,7 +16,7 @@ from freeocc3d.editing import box_refinement
 from freeocc3d.language.encoders import color
 from freeocc3d.occupancy.connected_components import label_components
 from freeocc3d.pipeline import run as pipeline
-from freeocc3d.storage.store import Map
+from freeocc3d.query.scan_map import Map
 
 RED, YELLOW = (np.array(CUPS[name]) + (0, 0, 0.5 * CUP_HEIGHT) for name in ("red", "yellow"))
 """Middles of the two cups, which stand on a table of 75 cm."""
@@ -75,11 +76,11 @@ def test_surfaces_are_where_they_are_to_a_voxel(cups: Map) -> None:
 
 def test_what_is_refined_is_a_map_that_can_be_refined_again(cups: Map) -> None:
     again = box_refinement.refine_box(cups, box_refinement.Box(RED - 0.06, RED + 0.06), 0.004, cups.path.parent / "red")
-    assert again.manifest["voxel_size_m"] == 0.004
+    assert again.manifest.voxel_size_m == 0.004
     assert again.query("red cup").regions[0].volume_m3 > 1e-5
-    assert again.manifest["refined"]["map"].endswith("cups")
+    assert again.manifest.refined.map.endswith("cups")
     assert len(again.keyframes) <= len(cups.keyframes)
-    assert len(again.gaussians) == again.manifest["counts"]["gaussians"]
+    assert len(again.gaussians) == again.manifest.counts.gaussians
 
 
 def test_boxes_that_cannot_be_refined(room: Map, tmp_path: Path) -> None:
@@ -110,7 +111,7 @@ def test_a_map_that_has_moved_to_another_machine(room: Map, needed: bool, tmp_pa
     told = []
     progress = Progress()
     progress.warn = told.append  # type: ignore[method-assign]
-    moved = Map(room.path, {**room.manifest, "capture": {**room.manifest["capture"], "path": "/gone"}})
+    moved = Map(room.path, structs.replace(room.manifest, capture=structs.replace(room.manifest.capture, path="/gone")))
     found = box_refinement.refine_box(
         moved, box_refinement.Box(MIDDLE - REACH, MIDDLE + REACH), 0.01, tmp_path / "map", progress=progress
     )

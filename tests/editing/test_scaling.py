@@ -17,8 +17,9 @@ from freeocc3d.core.tum_files import write_tum
 from freeocc3d.core.warnings import Notice, read_notices
 from freeocc3d.editing import scaling
 from freeocc3d.pipeline import run as pipeline
-from freeocc3d.storage import store
-from freeocc3d.storage.store import Map, load_map
+from freeocc3d.query.scan_map import Map, load_map
+from freeocc3d.storage import map_files
+from freeocc3d.storage.manifest import MapScale
 from freeocc3d.tracking.trackers import file, known
 from freeocc3d.viewer import map_pictures
 
@@ -39,12 +40,12 @@ def room(tmp_path_factory) -> Map:
 def half(room: Map) -> Map:
     """Half as large, in no unit."""
     made = scaling.scale_map(room, 0.5, "given", room.path.parent / "half")
-    manifest = yaml.safe_load((made.path / store.MANIFEST).read_text())
+    manifest = yaml.safe_load((made.path / map_files.MANIFEST).read_text())
     manifest["scale"] = {"metric": False, "by": "none", "factor": 1.0}
     report = {**made.report, "warnings": [Notice("scale-unknown", "").to_dict(), ANOTHER.to_dict()]}
-    (made.path / store.REPORT).write_text(json.dumps(report))
-    manifest["files"][store.REPORT] = (made.path / store.REPORT).stat().st_size
-    (made.path / store.MANIFEST).write_text(yaml.safe_dump(manifest))
+    (made.path / map_files.REPORT).write_text(json.dumps(report))
+    manifest["files"][map_files.REPORT] = (made.path / map_files.REPORT).stat().st_size
+    (made.path / map_files.MANIFEST).write_text(yaml.safe_dump(manifest))
     return load_map(made.path)
 
 
@@ -79,8 +80,8 @@ def test_everything_that_is_a_length_is_scaled(room: Map, half: Map) -> None:
         transform(half.T_gravity_map, cameras), 0.5 * transform(room.T_gravity_map, 2 * cameras), atol=1e-6
     )
     assert half.report["rendering"]["depth_l1_m"] == pytest.approx(0.5 * room.report["rendering"]["depth_l1_m"])
-    assert (half.path / store.PATH_PICTURE).read_bytes() != (room.path / store.PATH_PICTURE).read_bytes()
-    assert (half.path / store.RENDER_PICTURE).is_file()
+    assert (half.path / map_files.PATH_PICTURE).read_bytes() != (room.path / map_files.PATH_PICTURE).read_bytes()
+    assert (half.path / map_files.RENDER_PICTURE).is_file()
 
 
 def test_words_are_found_at_half_the_place(room: Map, half: Map) -> None:
@@ -92,8 +93,8 @@ def test_words_are_found_at_half_the_place(room: Map, half: Map) -> None:
 def test_scaling_back_gives_the_map_that_it_was(room: Map, half: Map, tmp_path: Path) -> None:
     back = scaling.scale_map(half, 2.0, "length", tmp_path / "back")
     assert back.metric
-    assert back.manifest["scale"] == {"metric": True, "by": "length", "factor": 2.0}
-    assert back.manifest["voxel_size_m"] == pytest.approx(room.manifest["voxel_size_m"])
+    assert back.manifest.scale == MapScale(metric=True, by="length", factor=2.0)
+    assert back.manifest.voxel_size_m == pytest.approx(room.manifest.voxel_size_m)
     np.testing.assert_allclose(back.gaussians.means, room.gaussians.means, rtol=1e-5)
     assert read_notices(back.report["warnings"]) == [ANOTHER], "that the scale is unknown is said no more"
     assert not list(tmp_path.glob("*.partial"))
@@ -167,7 +168,7 @@ def test_the_cameras_height_above_the_floor(half: Map, tmp_path: Path) -> None:
 
 def test_metric_poses_of_the_capture_or_of_a_file(room: Map, half: Map, tmp_path: Path) -> None:
     assert scaling.scale_by_poses(half, "builtin:room") == pytest.approx(2.0, rel=1e-4)
-    assert scaling.scale_by_poses(half, str(room.path / store.TRAJECTORY)) == pytest.approx(2.0, rel=1e-4)
+    assert scaling.scale_by_poses(half, str(room.path / map_files.TRAJECTORY)) == pytest.approx(2.0, rel=1e-4)
     rng = np.random.default_rng(0)
     T = room.trajectory.T_world_cam.copy()
     T[:, :3, 3] = rng.normal(size=(len(T), 3))

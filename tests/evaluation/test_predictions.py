@@ -88,7 +88,7 @@ def test_a_map_of_finer_cells_claims_the_same_voxels(room: Any, tmp_path: Path) 
 
 
 def test_the_rooms_map_agrees_with_its_truth(room: Any) -> None:
-    capture = scoring.reopen_capture(room)
+    capture = room.capture
     arrays = capture.ground_truth()  # type: ignore[attr-defined]
     truth = GroundTruth(arrays["labels"], arrays["origin"], arrays["voxel_size"], tuple(arrays["classes"].tolist()))
     scene = scoring.score_map(room, truth, map_each_to_itself(truth.classes))

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from manifests import tiny_manifest
 from scenes import occupancy_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
@@ -20,7 +21,7 @@ def map_of(occupancy, labels=None):
     return SimpleNamespace(
         metric=True,
         occupancy=occupancy,
-        manifest={"T_world_map": np.eye(4).tolist()},
+        manifest=tiny_manifest(),
         vocabulary=["cup", "table"],
         labels=lambda: labels,
     )

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from manifests import tiny_manifest
 from scenes import occupancy_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
@@ -21,7 +22,7 @@ def map_of(occupancy: Occupancy, T_gravity_map=CAMERA_TO_UP):
     return SimpleNamespace(
         metric=True,
         occupancy=occupancy,
-        manifest={"T_world_map": np.eye(4).tolist()},
+        manifest=tiny_manifest(),
         vocabulary=["cup", "table"],
         labels=lambda: (np.arange(len(occupancy.colors)) % 3).astype(np.uint8),
         up=np.array((0.0, -1.0, 0.0)),

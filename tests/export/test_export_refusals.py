@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from manifests import tiny_manifest
 from scenes import gaussians, occupancy_of, wall_frame
 from test_export_frames import CAMERA_TO_UP, map_of
 from test_geojson import asked
@@ -17,6 +18,7 @@ from freeocc3d.export import export_map
 from freeocc3d.language.encoders.labels import LabelWords
 from freeocc3d.settings import registry
 from freeocc3d.storage.keyframes import Keyframes
+from freeocc3d.storage.manifest import EncoderRecord
 
 FILES = {
     "ply": ("map.ply",), "npz": ("map.npz",), "octomap": ("map.bt", "map.ot"), "nav2": ("map.yaml",),
@@ -44,7 +46,7 @@ def whole(occupancy, keyframes, T_gravity_map=Z_UP):
     scan_map.keyframes = keyframes
     scan_map.text_encoder = LabelWords(["nothing", "cup", "table"])
     scan_map.vocabulary = scan_map.text_encoder.contrast_words()
-    scan_map.manifest["encoder"] = {"name": "labels"}
+    scan_map.manifest = tiny_manifest(encoder=EncoderRecord(name="labels", state={}))
     scan_map.trajectory.T_world_keyframe = cameras(2)
     return scan_map
 

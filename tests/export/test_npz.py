@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from manifests import tiny_manifest
 from scenes import occupancy_of
 
 from freeocc3d.export import export_map
@@ -13,7 +14,7 @@ def exported(tmp_path, words, labels, options=None):
     """What is read back of a map of two voxels with that vocabulary and those labels."""
     scan_map = SimpleNamespace(
         metric=True,
-        occupancy=occupancy_of([(-1, 0, 0), (0, 0, 0)]), manifest={"T_world_map": np.eye(4).tolist()},
+        occupancy=occupancy_of([(-1, 0, 0), (0, 0, 0)]), manifest=tiny_manifest(),
         vocabulary=words, labels=lambda: np.array(labels, np.uint8),
     )  # fmt: skip
     export_map(scan_map, "npz", tmp_path / "map.npz", options)

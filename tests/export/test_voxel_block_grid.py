@@ -8,6 +8,7 @@ import numpy as np
 import open3d as o3d
 import open3d.core as o3c
 import pytest
+from manifests import tiny_manifest
 from scenes import lifted, occupancy_of, posed, wall_frame
 from test_export_frames import map_of
 
@@ -19,6 +20,7 @@ from freeocc3d.export.voxel_block_grid import read_occupancy, write_grid
 from freeocc3d.language.encoders.base import TextFeatures
 from freeocc3d.language.feature_codec import Codec, CodedFeatures, compute_cosines
 from freeocc3d.occupancy import build, carve, splat
+from freeocc3d.storage.manifest import EncoderRecord
 
 WORDS = ["cup", "table"]
 DIMENSION = 60
@@ -47,7 +49,7 @@ def scan_map(wall: Occupancy) -> Any:
     assert len(codec.basis) < DIMENSION  # the grid keeps fewer numbers than features have
     found = map_of(wall.replace(features=CodedFeatures(codec, codec.encode(wall.features))))
     found.vocabulary = WORDS
-    found.manifest["encoder"] = {"name": "clip"}
+    found.manifest = tiny_manifest(encoder=EncoderRecord(name="clip", state={}))
     found.text_encoder = SimpleNamespace(
         threshold=0.3, encode_words=lambda words: TextFeatures(text, tuple(words), np.array((0.5, 1.0), np.float32))
     )

@@ -13,7 +13,7 @@ import tiny_models
 import freeocc3d
 from freeocc3d.cli.main import main
 from freeocc3d.core.errors import FreeOccError, ModelError
-from freeocc3d.storage import store
+from freeocc3d.query.scan_map import load_map
 
 QUICK = {
     "capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "stop": 16, "color_focal": 1.0},
@@ -33,12 +33,12 @@ def test_a_map_is_made_asked_and_outlives_its_model(
 ) -> None:
     language = {"encoder": "clip", "clip": {"model": "tiny", "short_side": 64, "threshold": 0.0, "stride": 8}}
     made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", {**QUICK, "language": language})
-    assert made.manifest["encoder"]["dimension"] == 24
+    assert made.manifest.encoder.dimension == 24
     assert made.gaussian_features.any(axis=1).mean() > 0.9
-    state = made.manifest["encoder"]["state"]
+    state = made.manifest.encoder.state
     assert (state["model"], state["folder"]) == ("tiny", str(model))
 
-    loaded = store.load_map(tmp_path / "map")
+    loaded = load_map(tmp_path / "map")
     result = loaded.query("椅子", threshold=-1.0)
     assert result.understood == "椅子"
     text = loaded.text_encoder.encode_words(["椅子"]).features[0]
@@ -50,7 +50,7 @@ def test_a_map_is_made_asked_and_outlives_its_model(
         loaded.query(" ")
 
     shutil.rmtree(model)
-    again = store.load_map(tmp_path / "map")
+    again = load_map(tmp_path / "map")
     assert again.query("椅子", threshold=-1.0).scores == pytest.approx(result.scores, abs=1e-5)
     with pytest.raises(ModelError, match="need the text side of the model 'tiny'"):
         again.query("a word that was never asked")

@@ -9,11 +9,11 @@ from helpers import data_folder
 from pipeline_runs import ROOM
 
 import freeocc3d
-from freeocc3d.storage import store
+from freeocc3d import Map
 
 
 @pytest.fixture(scope="session")
-def room(tmp_path_factory) -> store.Map:
+def room(tmp_path_factory) -> Map:
     return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", ROOM)
 
 

@@ -17,7 +17,7 @@ from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, MapEr
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import FREE, OCCUPIED
 from freeocc3d.settings import config
-from freeocc3d.storage import store
+from freeocc3d.storage import map_files
 
 
 def test_the_room_becomes_a_map_with_every_layer(room) -> None:
@@ -28,7 +28,7 @@ def test_the_room_becomes_a_map_with_every_layer(room) -> None:
     assert np.count_nonzero(states == OCCUPIED) > 300
     assert np.count_nonzero(states == FREE) > np.count_nonzero(states == OCCUPIED)
     assert len(room.occupancy.features) == len(room.occupancy.occupied_voxels())
-    assert room.gaussian_features.shape == (len(room.gaussians), room.manifest["encoder"]["dimension"])
+    assert room.gaussian_features.shape == (len(room.gaussians), room.manifest.encoder.dimension)
     assert len(room.keyframes) == len(room.trajectory.keyframes)
     assert {p.name for p in room.path.iterdir()} == {
         "map.yaml", "config.yaml", "report.json", "trajectory.txt", "gaussians.ply", "occupancy.npz", "features.npz",
@@ -60,7 +60,7 @@ def test_the_report_says_how_well_the_map_renders(room) -> None:
     assert rendering["psnr_measured"] > 20
     assert 0 < rendering["depth_l1_m"] < 0.15
     assert 0.8 < rendering["covered"] <= 1
-    assert cv2.imread(str(room.path / store.RENDER_PICTURE)).std() > 10
+    assert cv2.imread(str(room.path / map_files.RENDER_PICTURE)).std() > 10
 
 
 def test_a_pose_free_run_never_reads_poses_or_class_images(tmp_path, monkeypatch) -> None:
@@ -74,8 +74,8 @@ def test_a_pose_free_run_never_reads_poses_or_class_images(tmp_path, monkeypatch
     made = freeocc3d.reconstruct(
         data_folder() / "7scenes-kitchen", tmp_path / "map", {"capture": {"stop": 40, "stride": 4}}
     )
-    assert made.manifest["counts"]["frames_with_pose"] == 10
-    assert made.manifest["counts"]["voxels"]["occupied"] > 500
+    assert made.manifest.counts.frames_with_pose == 10
+    assert made.manifest.counts.voxels.occupied > 500
 
 
 def test_neighbouring_folders_are_left_alone(tmp_path, room) -> None:
@@ -119,7 +119,7 @@ def test_overwrite_replaces_a_map(tmp_path, room) -> None:
     output = shutil.copytree(room.path, tmp_path / "map")
     short = {"capture": {**ROOM["capture"], "stop": 6}}
     made = freeocc3d.reconstruct("builtin:room", output, short, overwrite=True)
-    assert made.manifest["counts"]["frames_with_pose"] == 6
+    assert made.manifest.counts.frames_with_pose == 6
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
 
 
@@ -216,15 +216,15 @@ def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -
     from freeocc3d.cli.map_summary import summary_text
 
     made = freeocc3d.reconstruct(glued, tmp_path / "map")
-    assert made.manifest["counts"]["submaps"] == 2
-    assert made.manifest["counts"]["frames_with_pose"] == 15
+    assert made.manifest.counts.submaps == 2
+    assert made.manifest.counts.frames_with_pose == 15
     assert made.report["frames"]["apart"] == 8
     assert [(s["first"], s["last"], s["mapped"]) for s in made.report["submaps"]] == [(0, 14, True), (15, 22, False)]
     assert (made.trajectory.status[15:] == "apart").all()
     (warning,) = (notice.text for notice in notices(made) if notice.code == "submaps-apart")
     assert "8 frames" in warning
     assert "frame 15" in warning
-    assert len(made.keyframes) == len(made.trajectory.keyframes) == len(made.manifest["keyframes"])
+    assert len(made.keyframes) == len(made.trajectory.keyframes) == len(made.manifest.keyframes)
     assert [frame.index for frame in made.keyframes] == made.trajectory.keyframes.tolist()
     assert len(list((made.path / "keyframes").glob("*.color.jpg"))) == len(made.keyframes)
     assert made.gaussians.anchor_keyframe.max() < len(made.keyframes)
@@ -244,9 +244,9 @@ def test_poses_of_another_system_make_a_map(tmp_path) -> None:
         "tracking": {"backend": "file", "file": {"path": str(tmp_path / "kitti.txt")}},
     }
     made = freeocc3d.reconstruct(capture, tmp_path / "map", settings)
-    assert made.manifest["counts"]["frames_with_pose"] == 10
+    assert made.manifest.counts.frames_with_pose == 10
     np.testing.assert_allclose(made.trajectory.T_world_cam[8], poses[8], atol=1e-5)
-    assert made.manifest["frame"].startswith("world frame of the trajectory file")
+    assert made.manifest.frame.startswith("world frame of the trajectory file")
 
 
 def test_a_color_camera_of_another_focal_length_is_told_and_corrected(tmp_path) -> None:

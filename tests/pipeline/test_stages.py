@@ -15,7 +15,8 @@ from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, Inter
 from freeocc3d.core.progress import Progress
 from freeocc3d.pipeline import stages
 from freeocc3d.pipeline.mapper import Mapper
-from freeocc3d.storage import store
+from freeocc3d.storage import writer
+from freeocc3d.storage.manifest import NameCount
 
 
 class Stopper(Progress):
@@ -45,7 +46,7 @@ def test_an_interrupted_run_leaves_no_map_and_resumes_to_the_same(tmp_path, room
     resumed = freeocc3d.reconstruct("builtin:room", output, ROOM, resume=True)
     assert not (tmp_path / "map.partial").exists()
     np.testing.assert_allclose(resumed.trajectory.T_world_cam[:24], room.trajectory.T_world_cam[:24], atol=5e-3)
-    assert resumed.manifest["keyframes"] == room.manifest["keyframes"]
+    assert resumed.manifest.keyframes == room.manifest.keyframes
 
 
 def test_a_resumed_run_takes_up_refined_poses(tmp_path, room, monkeypatch) -> None:
@@ -93,7 +94,7 @@ def test_a_disk_that_fills_up_at_the_very_end_costs_nothing(tmp_path, monkeypatc
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr(store, "write_manifest", full)
+        patched.setattr(writer, "write_manifest", full)
         with pytest.raises(MapError, match="disk is full"):
             freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM)
     kept = np.load(tmp_path / "map.partial" / "tracking.npz")
@@ -125,7 +126,7 @@ def test_a_run_with_two_submaps_resumes_to_the_same(tmp_path, glued, monkeypatch
 
     whole = freeocc3d.reconstruct(glued, tmp_path / "whole")
     with monkeypatch.context() as patched:
-        patched.setattr(store, "write_manifest", full)
+        patched.setattr(writer, "write_manifest", full)
         with pytest.raises(MapError, match="disk is full"):
             freeocc3d.reconstruct(glued, tmp_path / "map")
     resumed = freeocc3d.reconstruct(glued, tmp_path / "map", resume=True)
@@ -143,11 +144,11 @@ def test_names_by_a_model_are_kept_in_the_map_and_its_key_is_not(tmp_path, monke
     with serving(saying('["table", "red cup"]', '["table"]')) as server:
         settings = _with_vocabulary(server.url, api_key_env="ROOM_KEY")
         made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings)
-    named = made.manifest["vocabulary"]
-    assert len(server.asked) == len(named["keyframes"]) == 3
-    assert set(named["keyframes"]) <= set(made.manifest["keyframes"])
-    assert named["names"]["table"] == {"count": 3, "keyframes": named["keyframes"]}
-    assert named["names"]["red cup"]["count"] == 1
+    named = made.manifest.vocabulary
+    assert len(server.asked) == len(named.keyframes) == 3
+    assert set(named.keyframes) <= set(made.manifest.keyframes)
+    assert named.names["table"] == NameCount(count=3, keyframes=named.keyframes)
+    assert named.names["red cup"].count == 1
     assert made.report["seconds"]["vocabulary"] > 0
     assert server.headers[0]["Authorization"] == "Bearer sk-never-written"
     assert not any(b"never-written" in content for content in listing(made.path).values())
@@ -156,7 +157,7 @@ def test_names_by_a_model_are_kept_in_the_map_and_its_key_is_not(tmp_path, monke
 
 def test_a_model_that_cannot_be_asked_costs_names_and_a_warning(tmp_path) -> None:
     made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", _with_vocabulary("http://127.0.0.1:9/v1"))
-    assert made.manifest["vocabulary"]["names"] == {}
+    assert made.manifest.vocabulary.names == {}
     (warning,) = (notice.text for notice in notices(made) if notice.code == "vocabulary-incomplete")
     assert "lacks 3 of 3 keyframes" in warning
     assert made.query("red").matched
@@ -176,7 +177,7 @@ def test_a_resumed_run_asks_for_no_keyframe_twice(tmp_path) -> None:
                 )
         made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings, resume=True)
     assert len(server.asked) == 3
-    assert made.manifest["vocabulary"]["names"]["table"]["count"] == 3
+    assert made.manifest.vocabulary.names["table"].count == 3
 
 
 def test_a_key_that_is_not_set_is_told_before_any_work(tmp_path, monkeypatch) -> None:

@@ -12,8 +12,9 @@ from freeocc3d.capture.base import NOMINAL_DEPTH
 from freeocc3d.core.transforms import back_project, rotations_to_quats, transform
 from freeocc3d.editing import scaling
 from freeocc3d.pipeline import run
+from freeocc3d.query.scan_map import Map
 from freeocc3d.settings import config
-from freeocc3d.storage.store import Map
+from freeocc3d.storage.manifest import MapScale
 
 UNIT_M = 2.5
 """Metres per unit of what the other system gives."""
@@ -69,8 +70,8 @@ def codes(scan_map) -> set[str]:
 
 def test_a_video_becomes_a_map_whose_scale_is_said_to_be_unknown_and_can_be_given(scan: Path, tmp_path: Path) -> None:
     scan_map = made(scan, tmp_path / "map")
-    assert scan_map.manifest["capture"]["format"] == "video"
-    assert scan_map.manifest["scale"] == {"metric": False, "by": "none", "factor": 1.0}
+    assert scan_map.manifest.capture.format == "video"
+    assert scan_map.manifest.scale == MapScale(metric=False, by="none", factor=1.0)
     assert "scale-unknown" in codes(scan_map)
     cell = config.load_saved(scan_map.path / "config.yaml").gaussians.cell_size
     assert cell == pytest.approx(0.01 * NOMINAL_DEPTH)
@@ -83,7 +84,7 @@ def test_a_video_becomes_a_map_whose_scale_is_said_to_be_unknown_and_can_be_give
 
 def test_with_a_scale_given_from_the_start_the_map_is_metric(scan: Path, tmp_path: Path) -> None:
     scan_map = made(scan, tmp_path / "map", scale=UNIT_M)
-    assert scan_map.manifest["scale"] == {"metric": True, "by": "given", "factor": UNIT_M}
+    assert scan_map.manifest.scale == MapScale(metric=True, by="given", factor=UNIT_M)
     assert "scale-unknown" not in codes(scan_map)
     assert config.load_saved(scan_map.path / "config.yaml").gaussians.cell_size is None
     room = open_capture("builtin:room", None, ROOM)

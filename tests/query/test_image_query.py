@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers import truncate
+from manifests import tiny_manifest
 from numpy.typing import NDArray
 from test_word_query import CUP, SOFA, box, feature, occupancy
 
@@ -16,7 +17,8 @@ from freeocc3d.language.encoders.color import ColorEncoder, ColorWords
 from freeocc3d.language.feature_codec import Codec, CodedFeatures
 from freeocc3d.query import image_query
 from freeocc3d.query.word_query import Options
-from freeocc3d.settings import config
+from freeocc3d.storage.manifest import EncoderRecord
+from freeocc3d.storage.saved_map import SavedMap
 
 ENCODER = ColorEncoder()
 
@@ -122,8 +124,7 @@ def test_what_the_map_does_not_hold_is_not_found() -> None:
 def test_the_image_side_is_that_of_the_map_where_there_is_one(tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     path.write_text("language: {encoder: colour, colour: {stride: 2}}\n", encoding="utf-8")
-    config.load(path)
-    encoder = image_query.image_encoder("colour", path)
-    assert encoder.options.stride == 2
-    with pytest.raises(FreeOccError, match="'labels' reads what the capture brings and cannot look at a picture"):
-        image_query.image_encoder("labels", path)
+    assert image_query.picture_encoder(SavedMap(tmp_path, tiny_manifest())).options.stride == 2
+    labels = tiny_manifest(encoder=EncoderRecord(name="labels", state={}))
+    with pytest.raises(FreeOccError, match="'labels' reads more of the capture than its pictures"):
+        image_query.picture_encoder(SavedMap(tmp_path, labels))

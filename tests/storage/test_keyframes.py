@@ -40,7 +40,7 @@ def test_a_sigma_below_what_is_kept_is_not_zero(tmp_path: Path) -> None:
 
 
 def test_both_are_scaled(kept: Keyframes, tmp_path: Path) -> None:
-    kept.write_scaled(tmp_path / "half", 0.5)
+    kept.copy_to(tmp_path / "half", 0.5)
     for frame, half in zip(kept, Keyframes.load(tmp_path / "half"), strict=True):
         np.testing.assert_allclose(half.depth_m, 0.5 * frame.depth_m, atol=6e-4)
         np.testing.assert_array_equal(half.color, frame.color)

@@ -10,10 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from msgspec import structs
 
 from freeocc3d.core.errors import DependencyError, ExportError
 from freeocc3d.pipeline.run import reconstruct
-from freeocc3d.storage.store import Map
+from freeocc3d.query.best_views import RegionView
+from freeocc3d.query.scan_map import Map
+from freeocc3d.storage.manifest import MapScale
 from freeocc3d.viewer import answer_page
 
 
@@ -74,7 +77,8 @@ def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path, monkeyp
     answer_page.write_query_page(room, results, tmp_path / "q.html", overwrite=True)
     assert (tmp_path / "q.html").read_text(encoding="utf-8") == text
     assert "Metres in the map" in text
-    monkeypatch.setitem(room.manifest, "scale", {"metric": False, "by": "unknown", "factor": 1.0})
+    unknown = structs.replace(room.manifest, scale=MapScale(metric=False, by="none"))
+    monkeypatch.setattr(room, "manifest", unknown)
     answer_page.write_query_page(room, results, tmp_path / "q.html", overwrite=True)
     text = (tmp_path / "q.html").read_text(encoding="utf-8")
     assert "lengths are not metres" in text
@@ -87,14 +91,14 @@ def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path, monkeyp
 def test_a_crop_holds_the_box_in_the_words_colour() -> None:
     image = np.full((120, 160, 3), 90, np.uint8)
     image[40:60, 50:90] = 255
-    crop = decoded(answer_page._crop(image, answer_page.View(0, (50, 40, 89, 59), 1.0), (255, 60, 30)))
+    crop = decoded(answer_page._crop(image, RegionView(0, (50, 40, 89, 59), 1.0), (255, 60, 30)))
     red = (crop[..., 0] > 200) & (crop[..., 1] < 130)
     white = crop.min(axis=-1) > 200
     rows, columns = np.nonzero(red)
     assert rows.min() < np.nonzero(white)[0].min()
     assert columns.max() > np.nonzero(white)[1].max()
     assert white.mean() > 0.2
-    edge = decoded(answer_page._crop(image, answer_page.View(0, (0, 0, 159, 119), 1.0), (255, 60, 30)))
+    edge = decoded(answer_page._crop(image, RegionView(0, (0, 0, 159, 119), 1.0), (255, 60, 30)))
     assert edge.shape == (240, 320, 3)
 
 

@@ -5,10 +5,12 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from manifests import tiny_manifest
 from scenes import occupancy_of
 
 from freeocc3d.core.errors import ExportError
 from freeocc3d.core.types import Trajectory
+from freeocc3d.query.oriented_boxes import oriented_boxes
 from freeocc3d.query.regions import Region
 from freeocc3d.viewer import map_pictures
 from freeocc3d.viewer.palette import HIGHLIGHTS, assign_class_colors
@@ -31,16 +33,15 @@ def room_map(tmp_path):
     T_gravity_map = np.eye(4)
     T_gravity_map[:3, :3] = (1, 0, 0), (0, 0, 1), (0, -1, 0)
     labels = np.where((occupancy.colors == (215, 20, 20)).all(axis=1), 2, 1).astype(np.uint8)
-    return SimpleNamespace(
+    room = SimpleNamespace(
         path=tmp_path, metric=True, occupancy=occupancy, up=np.array((0.0, -1.0, 0.0)), T_gravity_map=T_gravity_map,
         vocabulary=["wall", "red"],
         labels=lambda: labels,
         trajectory=Trajectory(np.arange(2.0), T, np.array([0, 1], np.int32), np.array(["keyframe"] * 2), np.ones(2)),
-        manifest={
-            "capture": {"path": "room"},
-            "counts": {"voxels": {"occupied": len(voxels)}, "frames_with_pose": 2, "frames": 2},
-        },
+        manifest=tiny_manifest(),
     )  # fmt: skip
+    room.boxes_of = lambda regions: oriented_boxes(room.occupancy, regions, T_gravity_map)
+    return room
 
 
 def shown(path, color, tolerance=30) -> int:

@@ -12,6 +12,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
+
 from .figures import Figures, Line
 from .plan_agreement import measure_plan, plan_lines
 from .processes import COMMAND, run_timed
@@ -58,7 +60,7 @@ def measure_exports(capture: str) -> Figures:
 
 def measure_map_exports(map_path: str) -> Figures:
     """Seconds, peak bytes and bytes written of each of EXPORTS; OctoMap's own file; the plan's agreement."""
-    from freeocc3d.storage.store import load_map
+    from freeocc3d.query.scan_map import load_map
 
     loaded = load_map(map_path)
     words = ", ".join(f"{word}{how}" for word, how in zip(loaded.vocabulary, (":40%", ":0.5", ":1:60%"), strict=False))
@@ -77,9 +79,9 @@ def measure_map_exports(map_path: str) -> Figures:
         if _octomaps_own(loaded, own):
             bodies = [path.read_bytes().split(b"data\n", 1)[1] for path in (Path(folder) / BT / "map.bt", own)]
             octomap = {"bt_bytes": len(bodies[0]), "octomaps_bytes": len(bodies[1]), "same": bodies[0] == bodies[1]}
-    counts = loaded.manifest["counts"]["voxels"]
+    counts = structs.asdict(loaded.manifest.counts.voxels)
     figures = {"voxel_size_m": loaded.occupancy.finest, "voxels": counts, "exports": rows, "octomap": octomap}
-    truth = Path(loaded.manifest["capture"]["path"]) / "ground_truth.npz"
+    truth = Path(loaded.manifest.capture.path) / "ground_truth.npz"
     return {**figures, **({"plan": measure_plan(map_path)} if truth.is_file() else {})}
 
 

@@ -16,13 +16,12 @@ KINDS = ("superpixels", "components")
 def measure_fusion(map_path: str) -> Figures:
     """mIoU of a map of class images, as a share of that of the nearest true labels at the same voxels, and what is left
     when a share of each keyframe's regions shows a class at random: ours, plain averages, the last keyframe's word."""
-    from freeocc3d.evaluation import scoring
     from freeocc3d.language.encoders.labels import LabelsEncoder
-    from freeocc3d.storage.store import load_map
+    from freeocc3d.query.scan_map import load_map
 
     scan_map = load_map(map_path)
-    capture = scoring.reopen_capture(scan_map)
-    scene = _Scene(scan_map, Path(str(scan_map.manifest["capture"]["path"])) / "ground_truth.npz")
+    capture = scan_map.capture
+    scene = _Scene(scan_map, Path(scan_map.manifest.capture.path) / "ground_truth.npz")
 
     def encoder(kind: str | None, seed: int) -> LabelsEncoder:
         images = capture.labels if kind is None else Flipped(capture.labels, len(capture.classes), kind, seed)

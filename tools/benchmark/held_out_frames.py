@@ -11,11 +11,10 @@ EVERY = 10
 def measure_held_out(loaded: Any) -> dict[str, Any]:
     """PSNR and depth error on every tenth frame that has a pose and is no keyframe, at the map's own poses."""
     from freeocc3d.capture.focal_correction import Reregistered
-    from freeocc3d.evaluation.scoring import reopen_capture
     from freeocc3d.gaussians import fitting, rendered_views
     from freeocc3d.gaussians.rasterizers import cpu
 
-    capture, trajectory = reopen_capture(loaded), loaded.trajectory
+    capture, trajectory = loaded.capture, loaded.trajectory
     ratio = loaded.report.get("color_focal", 1.0)
     if ratio != 1:
         capture = Reregistered(capture, ratio)

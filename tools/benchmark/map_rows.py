@@ -54,11 +54,11 @@ def score_map(map: str, capture: str, out: str) -> Figures:
     from freeocc3d.evaluation import scoring
     from freeocc3d.evaluation.ground_truth import load_ground_truth
     from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors
-    from freeocc3d.storage.store import load_map
+    from freeocc3d.query.scan_map import load_map
     from freeocc3d.tracking.trajectory_alignment import align_trajectories, read_true_poses, select_estimated_poses
 
     loaded = load_map(map)
-    estimated, true = select_estimated_poses(loaded.trajectory), read_true_poses(scoring.reopen_capture(loaded))
+    estimated, true = select_estimated_poses(loaded.trajectory), read_true_poses(loaded.capture)
     how = "se3" if loaded.metric else "sim3"
     alignment = align_trajectories(estimated, true, how)
     errors = measure_trajectory_errors(estimated, true, alignment)

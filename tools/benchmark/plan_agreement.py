@@ -30,16 +30,15 @@ def measure_plan(map_path: str) -> Figures:
     import yaml
 
     from freeocc3d.core.transforms import invert, transform
-    from freeocc3d.evaluation import scoring
     from freeocc3d.evaluation.ground_truth import load_ground_truth
     from freeocc3d.export import export_map
     from freeocc3d.export.nav2 import Options
-    from freeocc3d.storage.store import load_map
+    from freeocc3d.query.scan_map import load_map
     from freeocc3d.tracking.trajectory_alignment import align_trajectories, read_true_poses, select_estimated_poses
 
     made = load_map(map_path)
-    capture = scoring.reopen_capture(made)
-    truth = load_ground_truth(Path(made.manifest["capture"]["path"]) / "ground_truth.npz")
+    capture = made.capture
+    truth = load_ground_truth(Path(made.manifest.capture.path) / "ground_truth.npz")
     with tempfile.TemporaryDirectory() as folder:
         export_map(made, "nav2", Path(folder) / "plan.yaml")
         told = yaml.safe_load((Path(folder) / "plan.yaml").read_text())

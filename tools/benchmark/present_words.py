@@ -93,7 +93,7 @@ def time_queries(map_path: str) -> Figures:
     """Of a process that answers one word, in text, in JSON and with all details; and of one word after the other, each
     for the first time, in a loaded map: median, longest, and median of the processor's time, on which other programs
     have no part."""
-    from freeocc3d.storage.store import load_map
+    from freeocc3d.query.scan_map import load_map
 
     loaded = load_map(map_path)
     words = loaded.text_encoder.contrast_words()

@@ -17,7 +17,7 @@ def measure_query(map_path: str) -> Figures:
     it."""
     command = [*COMMAND, "query", map_path, QUERY_WORD, "--json"]
     cold = statistics.median(run_timed(command)[0] for _ in range(COLD_STARTS))  # before this process imports anything
-    from freeocc3d.storage.store import load_map
+    from freeocc3d.query.scan_map import load_map
 
     mark = time.perf_counter()
     loaded = load_map(map_path)

@@ -1,0 +1,146 @@
+"""A map that answers: words, classes, pictures, and where the regions are that it finds. Imports little, to start fast.
+
+Lengths are metres and coordinates the map's frame throughout, unless ``SavedMap.metric`` says otherwise.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..settings import typed_options
+from ..storage.saved_map import SavedMap
+from . import word_query
+
+if TYPE_CHECKING:
+    from .best_views import RegionView
+    from .conditions import Where
+    from .oriented_boxes import OrientedBox
+    from .regions import Region
+    from .word_query import Options, QueryResult
+
+
+class Map(SavedMap):
+    """A saved map. ``query("red cup")`` asks it; its parts are properties that are read when first used."""
+
+    def query(self, word: str, **options: Any) -> QueryResult:
+        """Where ``word`` is: regions with score, box, centroid and volume. ``options``: fields of
+        ``query.word_query.Options``."""
+        return self.query_words([word], **options)[0]
+
+    def query_words(
+        self,
+        words: list[str],
+        contrast: Sequence[str] = (),
+        negative: Sequence[str] = (),
+        where: Where | None = None,
+        **options: Any,
+    ) -> list[QueryResult]:
+        """``query`` for several words. contrast: words for what else is there, besides the encoder's own.  negative:
+        words for what is not meant.  where: conditions on the regions' places; see ``query.conditions.Where``."""
+        return self._placed(lambda asked: self._words(words, asked, contrast, negative), where, options)
+
+    def query_classes(self, names: list[str], where: Where | None = None, **options: Any) -> list[QueryResult]:
+        """The voxels whose nearest name of ``vocabulary`` is each of these; see ``query.class_query``. Of the options
+        ``top_k`` and ``narrow`` count."""
+        from .class_query import query_classes
+
+        ask = functools.partial(query_classes, self.occupancy, self.text_encoder, self.vocabulary, names, up=self.up)
+        return self._placed(ask, where, options)
+
+    def query_image(
+        self,
+        image: str | Path | NDArray[np.uint8],
+        box: tuple[int, int, int, int] | None = None,
+        where: Where | None = None,
+        **options: Any,
+    ) -> QueryResult:
+        """Where it looks as in a picture, a file or (H, W, 3) RGB, or in a box x0 y0 x1 y1 of its pixels; see
+        ``query.image_query``."""
+        from . import image_query
+
+        feature = image_query.patch_feature(image_query.picture_encoder(self), image, box)
+        name = "the picture" if isinstance(image, np.ndarray) else Path(image).name
+        found = self._placed(
+            lambda asked: [image_query.query_feature(self.occupancy, feature, name, asked, self.up)], where, options
+        )
+        return found[0]
+
+    def labels(self) -> NDArray[np.uint8]:
+        """(V,) class of each occupied voxel: 0 = nothing known, k = ``vocabulary[k - 1]``."""
+        return self._class_labels
+
+    def box_of(self, region: Region) -> OrientedBox:
+        """The upright box of least level area around a region, turned as the region is."""
+        return self.boxes_of([region])[0]
+
+    def boxes_of(self, regions: Sequence[Region]) -> list[OrientedBox]:
+        """``box_of`` for several regions."""
+        if not regions:
+            return []
+        from .oriented_boxes import oriented_boxes
+
+        return oriented_boxes(self.occupancy, regions, self.T_gravity_map)
+
+    def views_of(self, region: Region) -> list[RegionView]:
+        """The up to three keyframes that show a region best, with the pixel box in each; see ``query.best_views``."""
+        return self.views_of_each([region])[0]
+
+    def views_of_each(self, regions: Sequence[Region]) -> list[list[RegionView]]:
+        """``views_of`` for several regions."""
+        if not regions:
+            return []
+        from .best_views import best_views
+
+        return best_views(self.occupancy, self.trajectory, self.keyframes, regions)
+
+    def stand_of(self, region: Region) -> NDArray[np.float64] | None:
+        """(3,) the nearest place on the floor, map frame, where a robot could stand and see a region; see
+        ``query.standing_places``. None where there is none, or where lengths are not metres, for a robot has a size."""
+        return self.stands_of([region])[0]
+
+    def stands_of(self, regions: Sequence[Region]) -> list[NDArray[np.float64] | None]:
+        """``stand_of`` for several regions."""
+        if not regions or not self.metric:
+            return [None] * len(regions)
+        from .standing_places import standing_places
+
+        return standing_places(self.occupancy, self.T_gravity_map, regions)
+
+    @functools.cached_property
+    def _class_labels(self) -> NDArray[np.uint8]:
+        text = self.text_encoder.encode_words(self.vocabulary[:253])
+        return (word_query.nearest_word(self.occupancy.features, text) + 1).astype(np.uint8)
+
+    def _words(
+        self, words: list[str], options: Options, contrast: Sequence[str] = (), negative: Sequence[str] = ()
+    ) -> list[QueryResult]:
+        named = self.scene_words if self.text_encoder.open_vocabulary else []
+        others = [*named, *contrast]
+        return word_query.query(self.occupancy, self.text_encoder, words, options, others, negative, self.up)
+
+    def _placed(
+        self, ask: Callable[[Options], list[QueryResult]], where: Where | None, options: dict[str, Any]
+    ) -> list[QueryResult]:
+        """What a question finds, in the places that are asked for."""
+        checked = typed_options.build(word_query.Options, options)
+        if where is None:
+            return ask(checked)
+        from . import conditions
+
+        every = checked.changed(top_k=max(len(self.occupancy.colors), 1))
+        references = self._words(where.words, every) if where.words else []
+        return conditions.only_where(self.occupancy, self.up, ask(every), references, where, checked.top_k)
+
+
+def load_map(path: str | Path) -> Map:
+    """Open a map folder: the manifest is read, and every file that it lists must be there and have its size.
+
+    Raises MapError: no such folder, not a map, from a newer version, a missing or damaged file.
+    """
+    return Map.open(path)

@@ -1,0 +1,206 @@
+"""A saved map, opened: its manifest is read at once, each other part when it is first used.
+
+Nothing is unpickled, and the size of an array is checked against that of its file before memory is taken.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import FreeOccError, MapError
+from ..core.tum_files import read_tum
+from ..core.types import Gaussians, Occupancy, Trajectory
+from ..settings import registry
+from .manifest import Manifest, read_manifest
+from .map_files import CONFIG, GAUSSIANS, KEYFRAMES, REPORT, TRAJECTORY
+from .occupancy_file import read_features, read_occupancy
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from ..capture import Capture
+    from ..language.encoders.base import Encoder, TextEncoder
+    from ..language.feature_codec import Codec
+    from ..settings.config import Settings
+    from .keyframes import Keyframes
+
+
+class SavedMap:
+    """The parts of a map folder, as properties that are read when first used. Each raises MapError for a damaged
+    file."""
+
+    def __init__(self, path: Path, manifest: Manifest):
+        self.path = path
+        self.manifest = manifest
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """Open a map folder: the manifest is read, and every file that it lists must be there and have its size.
+
+        Raises MapError: no such folder, not a map, from a newer version, a missing or damaged file.
+        """
+        path = Path(path)
+        opened = cls(path, read_manifest(path))
+        for name in opened.manifest.files:
+            opened._require(name)
+        return opened
+
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """(3,) unit vector that points up in the map's frame, as well as the camera's attitude tells."""
+        return np.array(self.manifest.up, np.float64)
+
+    @property
+    def metric(self) -> bool:
+        """Whether lengths are metres; where not, their unit is unknown."""
+        return self.manifest.scale.metric
+
+    @functools.cached_property
+    def T_gravity_map(self) -> NDArray[np.float64]:
+        """(4, 4) to the frame with z up and the floor at z = 0; found now where an earlier version made the map."""
+        if self.manifest.T_gravity_map is None:
+            from ..occupancy.gravity_frame import estimate_gravity_frame
+
+            return estimate_gravity_frame(self.trajectory.T_world_keyframe, self.gaussians)
+        return np.array(self.manifest.T_gravity_map, np.float64)
+
+    @functools.cached_property
+    def settings(self) -> Settings:
+        """The configuration that the map was made with."""
+        from ..settings import config
+
+        return config.load_saved(self.path / CONFIG)
+
+    @functools.cached_property
+    def capture(self) -> Capture:
+        """The capture that the map was made of, opened as it was then: with the same options, and with the focal length
+        of the color camera that the run found. Raises FreeOccError if it is not there any more, or changed."""
+        from ..capture import open_capture
+        from ..capture.focal_correction import Reregistered
+
+        path = self.manifest.capture.path
+        if not path.startswith("builtin:") and not Path(path).exists():
+            raise FreeOccError(f"The capture {path}, of which {self.path} was made, is not there any more.")
+        opened = open_capture(path, self.settings.capture, self.settings.backends.get("capture"))
+        color_focal = float(self.report.get("color_focal", 1.0))
+        return opened if color_focal == 1 else Reregistered(opened, color_focal)
+
+    @functools.cached_property
+    def occupancy(self) -> Occupancy:
+        """The voxels with probabilities, evidence, features and colours."""
+        return read_occupancy(self.path, self.manifest, self._codec)
+
+    @functools.cached_property
+    def gaussians(self) -> Gaussians:
+        """The anchored Gaussians (imports Open3D)."""
+        from ..gaussians.point_cloud import read_gaussian_ply
+
+        self._require(GAUSSIANS)
+        return read_gaussian_ply(self.path / GAUSSIANS)
+
+    @functools.cached_property
+    def gaussian_features(self) -> NDArray[np.float16]:
+        """(N, D) unit features of the Gaussians."""
+        return self._codec.decode(self._features[1])
+
+    @functools.cached_property
+    def trajectory(self) -> Trajectory:
+        """Poses, status and confidence of all frames of the capture."""
+        try:
+            log = self.report["frame_log"]
+            timestamps = np.array(log["timestamp"], np.float64)
+            return Trajectory(
+                timestamps=timestamps,
+                T_world_cam=_of_frames(timestamps, *read_tum(self.path / TRAJECTORY)),
+                keyframes=np.array(self.manifest.keyframes, np.int32),
+                status=np.array(log["status"], dtype="<U12"),
+                confidence=np.array(log["confidence"], np.float32),
+            )
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise MapError(f"{self.path / REPORT} or {TRAJECTORY} is damaged: {error}.") from error
+
+    @functools.cached_property
+    def report(self) -> dict[str, Any]:
+        """Timings, frames used and lost, memory, warnings of the run that made the map."""
+        try:
+            return dict(json.loads((self.path / REPORT).read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            raise MapError(f"Cannot read {self.path / REPORT}: {error}.") from error
+
+    @functools.cached_property
+    def keyframes(self) -> Keyframes:
+        """The keyframes' images."""
+        from .keyframes import Keyframes
+
+        return Keyframes.load(self.path / KEYFRAMES)
+
+    @functools.cached_property
+    def encoder(self) -> Encoder:
+        """The picture side of the encoder that the map was built with, with the options that it had then. Raises
+        FreeOccError where it cannot be loaded again, or where it needs a capture that is not there any more."""
+        loaded: Encoder = self.settings.load_backend("language", self.capture if self.encoder_needs_capture else None)
+        return loaded
+
+    @property
+    def encoder_needs_capture(self) -> bool:
+        """Whether the encoder reads more of a frame than its picture."""
+        module = registry.load("language.encoders", self.manifest.encoder.name)
+        return bool(getattr(module, "NEEDS_CAPTURE", True))
+
+    @functools.cached_property
+    def text_encoder(self) -> TextEncoder:
+        """The word side of the encoder that the map was built with."""
+        encoder = self.manifest.encoder
+        restored: TextEncoder = registry.load("language.encoders", encoder.name).load_text(encoder.state)
+        return restored
+
+    @property
+    def vocabulary(self) -> list[str]:
+        """The words that pictures and exports by class use: what the encoder tells apart without being asked, or of one
+        of open vocabulary, what a model has named in the scene."""
+        named = self.scene_words if self.text_encoder.open_vocabulary else []
+        return named or self.text_encoder.contrast_words()
+
+    @property
+    def scene_words(self) -> list[str]:
+        """Names that a vision-language model gave to what is in the scene, the most frequent first. A name that only
+        one of several keyframes has is left out: most things are seen twice."""
+        named = self.manifest.vocabulary
+        if named is None:
+            return []
+        least = 2 if len(named.keyframes) > 3 else 1
+        count = {name: entry.count for name, entry in named.names.items() if entry.count >= least}
+        return sorted(count, key=lambda name: -count[name])
+
+    @functools.cached_property
+    def _features(self) -> tuple[Codec, NDArray[np.uint8]]:
+        return read_features(self.path)
+
+    @property
+    def _codec(self) -> Codec:
+        return self._features[0]
+
+    def _require(self, name: str) -> None:
+        expected = self.manifest.files.get(name)
+        try:
+            size = (self.path / name).stat().st_size
+        except OSError as error:
+            raise MapError(f"The map {self.path} lacks its {name}: copy the whole folder, or map again.") from error
+        if size != expected:
+            raise MapError(f"{self.path / name} is damaged: it has {size} bytes in place of {expected}.")
+
+
+def _of_frames(
+    timestamps: NDArray[np.float64], times: NDArray[np.float64], T: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(N, 4, 4) with the pose of each timestamp that a trajectory has, NaN elsewhere."""
+    out = np.full((len(timestamps), 4, 4), np.nan)
+    row = np.clip(np.searchsorted(timestamps, times), 0, max(len(timestamps) - 1, 0))
+    out[row[timestamps[row] == times]] = T[timestamps[row] == times]
+    return out
