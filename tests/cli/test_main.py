@@ -35,7 +35,7 @@ def test_info_json_has_the_documented_keys(room) -> None:
 
 def test_list_names_every_backend_without_importing_them() -> None:
     text = run("list").stdout
-    for name in ("seven_scenes", "replica", "scannet", "synthetic", "rgbd", "known", "colour", "labels", "npz", "ply"):
+    for name in ("seven_scenes", "replica", "scannet", "synthetic", "rgbd", "known", "color", "labels", "npz", "ply"):
         assert f"  {name} " in text
     assert "encoder" in json.loads(run("list", "--json").stdout)
     exporters = run("list", "exporters").stdout
