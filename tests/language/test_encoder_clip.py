@@ -185,9 +185,9 @@ def test_other_precisions_stay_near(folder: Path, tmp_path: Path, precision: str
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"attention": "nackclip"}, "'attention' must be one of plain"),
-        ({"short_side": 3}, "'short_side' must lie between"),
-        ({"window": -1}, "'window' must be 0"),
+        ({"attention": "nackclip"}, "'attention' must be plain, maskclip"),
+        ({"short_side": 3}, "'short_side' must be from 16 to 4096"),
+        ({"window": -1}, "'window' must be from 0 to 4096"),
         ({"stride": -1}, "'stride' must be at least 0"),
         ({"templates": ("a photo",)}, "'templates' must each hold {}"),
         ({"contrast": ("wall", " ")}, "'contrast' must not hold empty words"),

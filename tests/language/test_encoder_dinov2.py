@@ -88,5 +88,5 @@ def test_resampling_equals_pytorchs() -> None:
 
 
 def test_options_out_of_range_are_told() -> None:
-    with pytest.raises(ConfigError, match="'short_side' must lie"):
+    with pytest.raises(ConfigError, match="'short_side' must be from 16 to 4096"):
         dinov2.Options(short_side=0)

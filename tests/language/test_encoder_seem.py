@@ -85,5 +85,5 @@ def test_words_are_found_again(folder: Path, tmp_path: Path, monkeypatch: pytest
 
 
 def test_options_out_of_range_are_told() -> None:
-    with pytest.raises(ConfigError, match="'mask_probability' must lie between 0 and 1"):
+    with pytest.raises(ConfigError, match="'mask_probability' must be greater than 0 and less than 1"):
         seem.Options(mask_probability=1.0)

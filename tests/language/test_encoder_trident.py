@@ -185,5 +185,5 @@ def test_lacking_and_mistaken_models_are_told(folders: dict[str, str]) -> None:
         trident.load(trident.Options(**{**folders, "sam": ""}))
     with pytest.raises(ModelError, match=r"language\.trident\.dino needs a model of kind backbone; .* is of kind sam"):
         trident.load(trident.Options(**{**folders, "dino": folders["sam"]}))
-    with pytest.raises(ConfigError, match="'points' must lie between"):
+    with pytest.raises(ConfigError, match="'points' must be from 0 to 64"):
         trident.Options(points=100)

@@ -170,7 +170,7 @@ def test_the_key_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("bad", "told"),
     [
-        ({"endpoint": "http://localhost/v1"}, r"vocabulary\.model"),
+        ({"endpoint": "http://localhost/v1"}, "'model' must name the model"),
         ({"endpoint": "localhost", "model": "m"}, "must be an address"),
         ({"keyframes": 0}, "keyframes"),
         ({"timeout": 0.0}, "timeout"),
@@ -179,7 +179,7 @@ def test_the_key_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> 
 )
 def test_options_out_of_range_are_refused(bad: dict[str, Any], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
-        Options(**bad)
+        load_namer(Options(**bad))
 
 
 def test_no_answers_make_an_empty_vocabulary() -> None:

@@ -235,9 +235,9 @@ def test_torch_projects_as_the_kernels_do(device: str, projection: str, monkeypa
 def test_a_gpu_that_is_not_there_is_told() -> None:
     torch = pytest.importorskip("torch")
     with pytest.raises(ConfigError, match="cpu or cuda"):
-        splat.Options(device="gpu")
+        splat.check(splat.Options(device="gpu"))
     with pytest.raises(ConfigError, match="on the processor only"):
         splat.Options(device="cuda:0", projection="integrated")
     if not torch.cuda.is_available():
         with pytest.raises(DependencyError, match="needs a GPU"):
-            splat.Options(device="cuda:0")
+            splat.check(splat.Options(device="cuda:0"))

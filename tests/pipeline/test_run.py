@@ -128,9 +128,9 @@ def test_overwrite_replaces_a_map(tmp_path, room) -> None:
     [
         ({"traking": {}}, "tracking"),
         ({"tracking": {"odometry": {"itertions": [1, 1, 1]}}}, "iterations"),
-        ({"occupancy": {"voxel_size": "big"}}, "must be float"),
+        ({"occupancy": {"voxel_size": "big"}}, "must be a number greater than 0"),
         ({"tracking": {"backend": "rgdb"}}, "rgbd"),
-        ({"language": {"encoder": "color"}}, "colour"),
+        ({"language": {"encoder": "colr"}}, "did you mean .color"),
         ({"occupancy": {"voxel_size": -0.1}}, "voxel_size"),
     ],
 )

@@ -179,7 +179,7 @@ def test_what_is_above_is_asked_not_the_lattice(turn: float) -> None:
 
 
 def test_a_share_of_a_width_lies_between_0_and_1() -> None:
-    with pytest.raises(ConfigError, match="'narrow' must lie between 0 and 1, got 1"):
+    with pytest.raises(ConfigError, match="'narrow' must be from 0 to 1, got 1"):
         Options(narrow=1.5)
 
 

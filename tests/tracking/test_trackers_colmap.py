@@ -237,7 +237,7 @@ def test_frames_are_undistorted(room: tuple[Reconstruction, Path], tmp_path: Pat
 
 def test_options_are_checked() -> None:
     images, _, camera = walk()
-    with pytest.raises(ConfigError, match="'order' must be auto or video or photos"):
+    with pytest.raises(ConfigError, match="'order' must be auto, video or photos"):
         Options(order="film")
     with pytest.raises(ConfigError, match="needs the camera"):
         colmap.load(Options(intrinsics="fixed"), Photographs(images, camera, known=False))
