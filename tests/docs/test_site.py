@@ -26,11 +26,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_command_and_option_is_in_the_reference(site: Path) -> None:
-    command_line = (site / "reference" / "command-line" / "index.html").read_text(encoding="utf-8")
+    command_line = (site / "reference" / "command-line.html").read_text(encoding="utf-8")
     assert all(f"freeocc3d {name}" in command_line for name in ("reconstruct", "query", "models export", "info"))
-    options = (site / "reference" / "options" / "index.html").read_text(encoding="utf-8")
+    options = (site / "reference" / "options.html").read_text(encoding="utf-8")
     assert all(name in options for name in ("voxel_size", "keyframe_overlap", "no_return"))
-    occupancy = (site / "reference" / "python" / "occupancy" / "index.html").read_text(encoding="utf-8")
+    occupancy = (site / "reference" / "python" / "occupancy.html").read_text(encoding="utf-8")
     assert "freeocc3d.occupancy.splat.bin_gaussians" in occupancy
 
 
