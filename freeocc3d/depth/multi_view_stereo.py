@@ -33,7 +33,7 @@ from .scan_points import ScanPoints, confirm_points, merge_points
 from .surface_depth import prefer_own_depth, render_surface_depth
 from .view_depth import measure_depth
 from .view_selection import APART, SelectedViews, select_partners
-from .watertight_surface import Surface, build_surface
+from .watertight_surface import WatertightSurface, build_surface
 
 __all__ = ["Options", "StereoDepth", "StereoView"]
 
@@ -193,7 +193,7 @@ class StereoDepth:
         inverse = np.concatenate([image[image > 0] for image in some])
         return merge_points(advancing(), 1.0 / float(np.median(inverse)) if len(inverse) else 1.0)
 
-    def _render(self, frame: int, surface: Surface, planes: Layout) -> DepthImage:
+    def _render(self, frame: int, surface: WatertightSurface, planes: Layout) -> DepthImage:
         view = self._view(frame)
         depth = render_surface_depth(surface, planes, view.intrinsics, view.T_world_cam)
         depth = prefer_own_depth(self._depth("measured", frame), depth)
@@ -207,7 +207,7 @@ class StereoDepth:
     def _surface_path(self) -> Path:
         return self.folder / "surface.npz"
 
-    def _surface(self) -> Surface:
+    def _surface(self) -> WatertightSurface:
         stored = read_arrays(self._surface_path, _SURFACE)
         vertices, triangles = stored["vertices"], stored["triangles"]
         shapes = tuple(stored[name].shape for name in ("vertices", "sigma_m", "triangles", "cell_m"))
@@ -215,7 +215,7 @@ class StereoDepth:
             raise MapError(f"{self._surface_path} is damaged: its arrays do not fit each other.")
         if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
             raise MapError(f"{self._surface_path} is damaged: it has triangles of points that it does not have.")
-        return Surface(vertices, stored["sigma_m"], triangles, float(stored["cell_m"][0]))
+        return WatertightSurface(vertices, stored["sigma_m"], triangles, float(stored["cell_m"][0]))
 
     def _layout(self) -> Layout:
         path = self.folder / "layout.npz"
@@ -224,7 +224,7 @@ class StereoDepth:
         except ValueError as error:
             raise MapError(f"{path} is damaged: it has {error}.") from error
 
-    def _save(self, surface: Surface, planes: Layout) -> None:
+    def _save(self, surface: WatertightSurface, planes: Layout) -> None:
         """The surface last: where it is, both are."""
         write_arrays(self.folder / "layout.npz", planes.to_arrays())
         arrays = {name: getattr(surface, name) for name in ("vertices", "sigma_m", "triangles")}

@@ -9,7 +9,7 @@ from ..core.types import Intrinsics
 from .building_planes import Layout
 from .cross_view_check import DepthImage
 from .photo_consistency import compute_rays
-from .watertight_surface import SIDE_BY_SIDE, Surface
+from .watertight_surface import SIDE_BY_SIDE, WatertightSurface
 
 _SPANNED, _FACING = 40.0, 0.4  # cells: no gap is spanned by longer edges, nor by what is seen at a cosine below that
 _ALIKE = 0.2  # relative
@@ -17,7 +17,7 @@ _SUREST, _LAYOUT_SIGMA, _SPANNED_SIGMA = 0.005, 0.01, 0.04  # standard deviation
 
 
 def render_surface_depth(
-    surface: Surface, layout: Layout, camera: Intrinsics, T_world_cam: NDArray[np.float64]
+    surface: WatertightSurface, layout: Layout, camera: Intrinsics, T_world_cam: NDArray[np.float64]
 ) -> DepthImage:
     """The surface as a camera sees it, where it was measured; where it only spans a gap, the layout's plane near it, or
     else what spans the gap, if that is small."""

@@ -41,7 +41,7 @@ class RayHits:
 
 
 @dataclass(frozen=True)
-class Surface:
+class WatertightSurface:
     """vertices: (V, 3) float32 world.  sigma_m: (V,) float32 standard deviations.  triangles: (F, 3) int32.
     cell_m: between vertices that were measured side by side."""
 
@@ -91,7 +91,7 @@ class Surface:
         return edges, np.median(self.sigma_m[self.triangles], axis=1)
 
 
-def build_surface(points: ScanPoints, centres: NDArray[np.float64]) -> Surface:
+def build_surface(points: ScanPoints, centres: NDArray[np.float64]) -> WatertightSurface:
     """The surface of points that cameras at (C, 3) ``centres`` measured; its triangles turn counterclockwise seen from
     the free side. There must be five points and centres that do not lie in a plane."""
     count = len(points.points)
@@ -100,7 +100,7 @@ def build_surface(points: ScanPoints, centres: NDArray[np.float64]) -> Surface:
     seen = collect_votes(space, points.ray_point, (points.ray_camera + count).astype(np.int32), soft)
     free = cut_cells(space, seen)
     sigma_m = np.concatenate((points.sigma_m, np.zeros(len(centres))))
-    return Surface(
+    return WatertightSurface(
         space.vertices.astype(np.float32), sigma_m.astype(np.float32), extract_boundary(space, free), points.cell_m
     )
 

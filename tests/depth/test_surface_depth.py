@@ -7,12 +7,12 @@ from textured import CAMERA, looking
 
 from freeocc3d.depth.building_planes import Layout, Plane
 from freeocc3d.depth.surface_depth import render_surface_depth
-from freeocc3d.depth.watertight_surface import Surface
+from freeocc3d.depth.watertight_surface import WatertightSurface
 
 _DEEP = 2.0
 
 
-def _wall(cell: float) -> Surface:
+def _wall(cell: float) -> WatertightSurface:
     """The wall at z = 2 m: to the left in small triangles, to the right of x = 0 in large ones."""
     vertices: list[tuple[float, float, float]] = []
     triangles = []
@@ -22,7 +22,7 @@ def _wall(cell: float) -> Surface:
                 k = len(vertices)
                 vertices += [(x, y, _DEEP), (x + step, y, _DEEP), (x + step, y + step, _DEEP), (x, y + step, _DEEP)]
                 triangles += [(k, k + 1, k + 2), (k, k + 2, k + 3)]
-    return Surface(np.array(vertices, np.float32), np.full(len(vertices), 0.01, np.float32),
+    return WatertightSurface(np.array(vertices, np.float32), np.full(len(vertices), 0.01, np.float32),
                    np.array(triangles, np.int32), cell)  # fmt: skip
 
 
@@ -66,5 +66,5 @@ def test_small_gaps_are_shown_as_guesses_unless_they_are_seen_edge_on() -> None:
 
 
 def test_no_surface_no_depth() -> None:
-    empty = Surface(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.int32), 0.01)
+    empty = WatertightSurface(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.int32), 0.01)
     assert not render_surface_depth(empty, _layout(2.0), CAMERA, looking(0.3)).inverse.any()

@@ -8,7 +8,13 @@ import scipy.optimize
 
 from freeocc3d.depth.scan_points import ScanPoints
 from freeocc3d.depth.tetrahedra import BEHIND, CellVotes, Tetrahedra, collect_votes, tetrahedralize
-from freeocc3d.depth.watertight_surface import Surface, build_surface, cut_cells, extract_boundary, measure_roundness
+from freeocc3d.depth.watertight_surface import (
+    WatertightSurface,
+    build_surface,
+    cut_cells,
+    extract_boundary,
+    measure_roundness,
+)
 
 
 def _crossings(space: Tetrahedra, start, way, length: float):
@@ -110,14 +116,14 @@ def _sphere(count: int) -> np.ndarray:
     return np.stack((np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)), axis=1)
 
 
-def _closed(surface: Surface) -> bool:
+def _closed(surface: WatertightSurface) -> bool:
     """Whether each edge is passed once in either direction by as many triangles."""
     edges = np.concatenate([surface.triangles[:, [k, (k + 1) % 3]] for k in range(3)]).tolist()
     there, back = sorted(edges), sorted(edge[::-1] for edge in edges)
     return there == back
 
 
-def _volume(surface: Surface) -> float:
+def _volume(surface: WatertightSurface) -> float:
     corners = surface.vertices[surface.triangles].astype(float)
     return float(np.linalg.det(corners).sum() / 6.0)
 

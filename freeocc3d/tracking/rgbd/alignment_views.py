@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...core.depth_noise import NOT_STATED
 from ...core.types import Frame, Intrinsics
-from .dense_residuals import AlignmentSurface
+from .dense_residuals import Surface
 
 WIDTH = 160
 """Views are about this wide."""
@@ -48,9 +48,9 @@ class AlignmentView:
         return np.array((K.fx, K.fy, K.cx, K.cy))
 
     @property
-    def levels(self) -> tuple[AlignmentSurface, ...]:
+    def levels(self) -> tuple[Surface, ...]:
         """The surface with the intensities of each size, the largest first."""
-        return tuple(AlignmentSurface(self.points, self.normals, self.sigma_m, gray) for gray in self.gray)
+        return tuple(Surface(self.points, self.normals, self.sigma_m, gray) for gray in self.gray)
 
     @property
     def covered(self) -> float:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ...core.transforms import nearest_rigid
 from .alignment_views import AlignmentView
-from .dense_residuals import AlignmentSurface, NormalEquations, Weighting, linearize, make_equations
+from .dense_residuals import NormalEquations, Surface, Weighting, linearize, make_equations
 
 PHOTOMETRIC = 0.2
 """Weight of the intensities: neighbouring ones are far from independent."""
@@ -117,8 +117,8 @@ def compute_correlation(stats: NDArray[np.float64]) -> float:
 
 @njit(nogil=True, cache=True)
 def _descend(
-    source: tuple[AlignmentSurface, ...],
-    target: tuple[AlignmentSurface, ...],
+    source: tuple[Surface, ...],
+    target: tuple[Surface, ...],
     camera: NDArray[np.float64],
     T: NDArray[np.float64],
     iterations: NDArray[np.int64],

@@ -58,7 +58,7 @@ _EXPOSURE = 8  # unknowns: rotation, translation, gain, offset
 _POSE = 6
 
 
-class AlignmentSurface(NamedTuple):
+class Surface(NamedTuple):
     """What the residuals see of a view.
 
     points: (h, w, 3) camera frame, metres; z = 0 where there is none.  normals: (h, w, 3) unit.  sigma_m: (h, w)
@@ -103,8 +103,8 @@ def make_equations() -> NormalEquations:
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def linearize(
-    source: AlignmentSurface,
-    target: AlignmentSurface,
+    source: Surface,
+    target: Surface,
     camera: NDArray[np.float64],
     T: NDArray[np.float64],
     stride: int,
