@@ -41,10 +41,24 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
-    """On the page for Python, a link [`Name`][] leads to where the package defines that name, wherever that is."""
-    if page.file.src_uri != "reference/python/index.md":
-        return markdown
-    return re.sub(r"\[`(\w+)`\]\[\]", lambda found: f"[`{found[1]}`][{defined(found[1])}]", markdown)
+    """On the page for Python, a link [`Name`][] leads to where the package defines that name, wherever that is; on that
+    for maps, MANIFEST_KEYS is a table of them."""
+    if page.file.src_uri == "reference/map-format.md":
+        return markdown.replace("MANIFEST_KEYS", manifest_table())
+    if page.file.src_uri == "reference/python/index.md":
+        return re.sub(r"\[`(\w+)`\]\[\]", lambda found: f"[`{found[1]}`][{defined(found[1])}]", markdown)
+    return markdown
+
+
+def manifest_table() -> str:
+    """The keys of map.yaml, from the manifest's type."""
+    from freeocc3d.storage.manifest import manifest_keys
+
+    rows = ["| key | |", "|---|---|"]
+    for key in manifest_keys():
+        optional = "" if key.required else " (optional)"
+        rows.append(f"| `{key.name}` | {_cell(key.description)}{optional} |")
+    return "\n".join(rows)
 
 
 def defined(name: str) -> str:

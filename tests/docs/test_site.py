@@ -30,6 +30,9 @@ def test_every_command_and_option_is_in_the_reference(site: Path) -> None:
     assert all(f"freeocc3d {name}" in command_line for name in ("reconstruct", "query", "models export", "info"))
     options = (site / "reference" / "options.html").read_text(encoding="utf-8")
     assert all(name in options for name in ("voxel_size", "keyframe_overlap", "no_return"))
+    map_format = (site / "reference" / "map-format.html").read_text(encoding="utf-8")
+    assert "voxel_size_m" in map_format
+    assert "MANIFEST_KEYS" not in map_format
     occupancy = (site / "reference" / "python" / "occupancy.html").read_text(encoding="utf-8")
     assert "freeocc3d.occupancy.splat.bin_gaussians" in occupancy
 
