@@ -41,9 +41,9 @@ def color_image(index: int, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
     return np.stack((red, green, np.full(red.shape, 10.0 * index % 256)), axis=-1).astype(np.uint8)
 
 
-def depth_image(index: int, units_per_metre: float = 1000.0, size: tuple[int, int] = SIZE) -> NDArray[np.uint16]:
+def depth_image(index: int, units_per_meter: float = 1000.0, size: tuple[int, int] = SIZE) -> NDArray[np.uint16]:
     """(H, W) depth as stored: a plane that faces the camera, with a left column that is not measured."""
-    depth = np.full(size[::-1], round((DEPTH_M + 0.01 * index) * units_per_metre), np.uint16)
+    depth = np.full(size[::-1], round((DEPTH_M + 0.01 * index) * units_per_meter), np.uint16)
     depth[:, 0] = 0
     return depth
 

@@ -26,7 +26,7 @@ class Photographs(Capture):
         self.timestamps = np.arange(len(images), dtype=np.float64)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return False
 
     def __getitem__(self, index: int) -> Frame:

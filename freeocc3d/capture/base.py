@@ -19,8 +19,8 @@ from ..core.warnings import Notice
 from ..settings.stages import CaptureOptions as Options
 
 NOMINAL_DEPTH = 2.0
-"""The median depth that scans of unknown scale are given, as rooms have it in metres: voxels and tolerances, which are
-in metres, are then of a sensible size beside the scene."""
+"""The median depth that scans of unknown scale are given, as rooms have it in meters: voxels and tolerances, which are
+in meters, are then of a sensible size beside the scene."""
 
 
 class Capture(ABC):
@@ -29,7 +29,7 @@ class Capture(ABC):
     format: ClassVar[str]
     """The reader's name, the same as its file's."""
     layout: ClassVar[str]
-    """What ``recognises`` looks for, in words, for the message about an unrecognised folder."""
+    """What ``recognizes`` looks for, in words, for the message about an unrecognized folder."""
 
     general: ClassVar[bool] = False
     """Whether other formats' folders may look like this one's, too, so that they are looked for first."""
@@ -44,7 +44,7 @@ class Capture(ABC):
     focal_stated: bool = True
     """Whether at least the focal length is stated, if roughly, as EXIF does; true where the intrinsics are known."""
     metric_poses: bool = True
-    """Whether ``pose`` is in metres."""
+    """Whether ``pose`` is in meters."""
     warnings: tuple[Notice, ...] = ()
     """What the user should know of what was found, such as files that are left out."""
     classes: tuple[str, ...] = ()
@@ -56,7 +56,7 @@ class Capture(ABC):
 
     @classmethod
     @abstractmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         """Whether the folder ``path`` has this format's layout (cheap: looks at names only)."""
 
     def __len__(self) -> int:
@@ -67,12 +67,12 @@ class Capture(ABC):
         """Decode frame ``index``. Thread-safe. Raises FrameError if one of its files is missing or broken."""
 
     def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
-        """(H, W) depth as stored (0 = no measurement) and its units per metre, or None where depth is not stored as
+        """(H, W) depth as stored (0 = no measurement) and its units per meter, or None where depth is not stored as
         integers. Read by ``check_depth_scale`` alone. Raises FrameError."""
         return None
 
     def name(self, index: int) -> str:
-        """File name of the frame's colour image, by which other systems' poses may know it; "" where there is none."""
+        """File name of the frame's color image, by which other systems' poses may know it; "" where there is none."""
         return ""
 
     def turned(self, index: int) -> int:

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 SIZE = (5.2, 4.2, 2.5)
-"""Extent of the room, metres; the world's origin is the middle of the floor, z is up."""
+"""Extent of the room, meters; the world's origin is the middle of the floor, z is up."""
 
 CLASSES = (
     "nothing", "wall", "floor", "ceiling", "rug", "table", "cup", "chair", "sofa", "cushion", "bed", "pillow",
@@ -18,10 +18,10 @@ CLASSES = (
 )  # fmt: skip
 
 CUPS = {"red": (1.92, 0.14, 0.75), "yellow": (1.92, 0.26, 0.75)}
-"""Middle of each paper cup's foot on the table, metres, world."""
+"""Middle of each paper cup's foot on the table, meters, world."""
 
 CUP_HEIGHT, CUP_FOOT, CUP_RIM = 0.09, 0.028, 0.038
-"""Height and radii of a paper cup, metres."""
+"""Height and radii of a paper cup, meters."""
 
 PLAIN, WOOD, CHECKER, BOOKS, PATCHES, PLASTER, STRIPES, PAINTING = range(8)
 """Kinds of texture."""
@@ -29,14 +29,14 @@ PLAIN, WOOD, CHECKER, BOOKS, PATCHES, PLASTER, STRIPES, PAINTING = range(8)
 Point = tuple[float, float, float]
 Color = tuple[int, int, int]
 Triangles = NDArray[np.float64]
-"""(T, 3, 3) corners, counter-clockwise seen from outside, metres, world."""
+"""(T, 3, 3) corners, counter-clockwise seen from outside, meters, world."""
 
 _LIGHT = (0.34, -0.24, 0.91)  # unit vector towards the light; the same for all points, as of a large lamp
 
 
 @dataclass(frozen=True)
 class Material:
-    """A procedural texture between two colours (RGB 0…255). scale: size of its features, metres."""
+    """A procedural texture between two colors (RGB 0…255). scale: size of its features, meters."""
 
     color: Color
     texture: int = PLAIN
@@ -49,9 +49,9 @@ class Room:
     """All objects as T triangles.
 
     objects: class name of each object.
-    Per triangle: triangles (T, 3, 3) float32 corners, metres, world; normals (T, 3) float32, unit, outwards;
+    Per triangle: triangles (T, 3, 3) float32 corners, meters, world; normals (T, 3) float32, unit, outwards;
     class_ids (T,) uint8, index into CLASSES; object_ids (T,) int32, index into ``objects``;
-    textures (T,) int32 kinds; colors (T, 2, 3) float32, the two of its material; scales (T,) float32 metres.
+    textures (T,) int32 kinds; colors (T, 2, 3) float32, the two of its material; scales (T,) float32 meters.
     """
 
     objects: tuple[str, ...]
@@ -297,11 +297,11 @@ def shade(
     scales: NDArray[np.float32],
     normals: NDArray[np.float32],
 ) -> NDArray[np.uint8]:
-    """(P, 3) RGB of P surface points: a mix of the two colours of their triangle's material, times a fixed light, so
+    """(P, 3) RGB of P surface points: a mix of the two colors of their triangle's material, times a fixed light, so
     that a point looks the same from everywhere. Detail finer than a pixel fades out.
 
-    points: (P, 3) metres, world.  triangle: (P,) its row in the arrays of ``Room``, -1 = nothing, which is black.
-    footprint: (P,) metres of surface that a pixel covers.
+    points: (P, 3) meters, world.  triangle: (P,) its row in the arrays of ``Room``, -1 = nothing, which is black.
+    footprint: (P,) meters of surface that a pixel covers.
     """
     image = np.zeros((len(points), 3), np.uint8)
     for p in range(len(points)):
@@ -326,7 +326,7 @@ def shade(
 
 @njit(cache=True)
 def _texture(kind: int, x: float, y: float, z: float, normal: NDArray[np.float32], scale: float, pixel: float) -> float:
-    """Place between a material's two colours, mostly in 0…1."""
+    """Place between a material's two colors, mostly in 0…1."""
     # Two coordinates on the surface: those that are not along its normal.
     nx, ny, nz = abs(normal[0]), abs(normal[1]), abs(normal[2])
     if nz >= nx and nz >= ny:
@@ -342,7 +342,7 @@ def _texture(kind: int, x: float, y: float, z: float, normal: NDArray[np.float32
     if kind == CHECKER:
         wave = math.sin(math.pi * a / scale) * math.sin(math.pi * b / scale)
         return min(max(0.5 + wave * scale / (math.pi * pixel + 1e-6), 0.0), 1.0)  # edges one pixel soft
-    if kind == BOOKS:  # each its own colour, between the two and beyond
+    if kind == BOOKS:  # each its own color, between the two and beyond
         return 1.6 * _bands(a, scale, math.floor(z / 0.4), pixel) - 0.3
     if kind == PATCHES:
         return 1.5 * _noise(a / scale, b / scale, 0.5, 11) - 0.25

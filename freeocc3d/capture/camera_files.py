@@ -17,7 +17,7 @@ from .base import Options
 from .image_decoding import Size
 
 ASPECT_TOLERANCE = 0.02
-"""Relative difference of two aspect ratios up to which two images are taken to show the same view (ScanNet's colour and
+"""Relative difference of two aspect ratios up to which two images are taken to show the same view (ScanNet's color and
 depth differ by 0.4 %, a 16:9 and a 4:3 image by 33 %)."""
 
 MAX_SKEW_PX = 1.0
@@ -26,12 +26,12 @@ MAX_SKEW_PX = 1.0
 
 USUAL_FOCAL = 0.85
 """Focal length over the longer side of an image where nothing says it: between a phone's main camera (a 24 to 28 mm
-equivalent: 0.72 to 0.78 of a photograph, 0.8 to 0.95 of a video, which stabilisation crops) and the 0.82 to 0.96 of
-depth cameras' colour images; within a fifth of all of them, from where it can be estimated."""
+equivalent: 0.72 to 0.78 of a photograph, 0.8 to 0.95 of a video, which stabilization crops) and the 0.82 to 0.96 of
+depth cameras' color images; within a fifth of all of them, from where it can be estimated."""
 
 
 DIAGONAL_35MM = 43.27
-"""Of the 36 x 24 mm frame, millimetres."""
+"""Of the 36 x 24 mm frame, millimeters."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def rescale_camera(camera: Intrinsics, size: Size) -> Intrinsics:
     if not same_view((camera.width, camera.height), size):
         raise CaptureError(
             f"One camera cannot have taken images of {camera.width} x {camera.height} and of {size[0]} x {size[1]} "
-            "pixels: colour and depth need a calibration each (the scannet layout has room for both)."
+            "pixels: color and depth need a calibration each (the scannet layout has room for both)."
         )
     return camera.resized(*size)
 
@@ -91,7 +91,7 @@ def guess_camera(size: Size) -> Intrinsics:
 
 
 def convert_35mm(focal_35mm: float, size: Size) -> Intrinsics | None:
-    """The camera of images of ``size`` whose lens is stated as the focal length in millimetres of a 35 mm camera with
+    """The camera of images of ``size`` whose lens is stated as the focal length in millimeters of a 35 mm camera with
     the same view across its diagonal; None where it cannot be one."""
     if not 8 <= focal_35mm <= 500:
         return None
@@ -110,7 +110,7 @@ def reduce_camera(camera: Intrinsics, max_size: int | None) -> Intrinsics:
 
 
 def read_given_calibration(options: Options) -> Calibration | None:
-    """What ``capture.intrinsics`` says of the colour camera."""
+    """What ``capture.intrinsics`` says of the color camera."""
     return Calibration(options.intrinsics, None, "capture.intrinsics") if options.intrinsics else None
 
 

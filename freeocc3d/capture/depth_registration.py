@@ -1,8 +1,8 @@
-"""Brings the colour and the depth images of one rig to one pixel grid.
+"""Brings the color and the depth images of one rig to one pixel grid.
 
-Three cases. The cameras are the same: nothing is done. They share a viewpoint but not their size or intrinsics: colour
+Three cases. The cameras are the same: nothing is done. They share a viewpoint but not their size or intrinsics: color
 is resampled to the depth camera's pixels (areas are averaged where it shrinks), depth is left alone but for pixels
-that the colour image does not reach, which become 0. They stand apart: colour is resized to the smaller of the two
+that the color image does not reach, which become 0. They stand apart: color is resized to the smaller of the two
 sizes and each depth pixel is moved there as a patch that covers what the pixel covered, the nearest patch winning.
 Depth is never interpolated: every value that comes out was measured, if from another viewpoint.
 """
@@ -20,16 +20,16 @@ SAME_PX = 0.25
 """Two cameras whose pixels differ by less than this everywhere are the same camera."""
 
 SAME_M = 1e-4
-"""Extrinsics whose entries differ from the identity by less than this (metres; radians) are the identity."""
+"""Extrinsics whose entries differ from the identity by less than this (meters; radians) are the identity."""
 
 OVERLAP_PX = 0.25
 """A patch is grown by this much on each side, so that no cracks open between patches where a surface is slanted."""
 
 
 class PixelGrid:
-    """The common pixel grid of a colour and a depth camera.
+    """The common pixel grid of a color and a depth camera.
 
-    color, depth: the two cameras.  T_color_depth: (4, 4) depth to colour camera frame, None if they coincide.
+    color, depth: the two cameras.  T_color_depth: (4, 4) depth to color camera frame, None if they coincide.
     """
 
     intrinsics: Intrinsics
@@ -48,16 +48,16 @@ class PixelGrid:
         self._reach = None if self._color_from_grid is None else _reached(self._color_from_grid, self.intrinsics)
 
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) of the colour camera to (h, w, 3)."""
+        """(H, W, 3) of the color camera to (h, w, 3)."""
         shrinks = image.shape[0] >= self.intrinsics.height and image.shape[1] >= self.intrinsics.width
         return self._resample(image, cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR, cv2.INTER_LINEAR)
 
     def classes(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W) class image of the colour camera to (h, w), each pixel the class of the nearest one."""
+        """(H, W) class image of the color camera to (h, w), each pixel the class of the nearest one."""
         return self._resample(image, cv2.INTER_NEAREST_EXACT, cv2.INTER_NEAREST)
 
     def depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) metres of the depth camera to (h, w) metres; may change its argument."""
+        """(H, W) meters of the depth camera to (h, w) meters; may change its argument."""
         if self._patches is not None:
             return self._patches.move(depth_m)
         if self._reach is not None:
@@ -80,7 +80,7 @@ class DepthPatches:
     """Forward warp of depth images into another camera with a z-buffer.
 
     A depth pixel is a square patch that faces the camera; its size in the target is that of the pixel, times the ratio
-    of the focal lengths (the cameras of a rig are centimetres apart, so that the ratio of their depths is near 1).
+    of the focal lengths (the cameras of a rig are centimeters apart, so that the ratio of their depths is near 1).
     """
 
     def __init__(self, depth: Intrinsics, target: Intrinsics, T_target_depth: NDArray[np.float64]):
@@ -92,7 +92,7 @@ class DepthPatches:
         self._offset = T_target_depth[:3, 3].astype(np.float32)
 
     def move(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) metres to (h, w) metres in the target camera; 0 where no patch falls."""
+        """(H, W) meters to (h, w) meters in the target camera; 0 where no patch falls."""
         width, height = self._target.width, self._target.height
         flat = depth_m.reshape(-1)
         measured = np.flatnonzero(flat)
@@ -112,7 +112,7 @@ class DepthPatches:
 def _covered(
     center: NDArray[np.float32], half: float, length: int
 ) -> list[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
-    """The pixels 0…length-1 whose centres lie in ``center ± half``: their first, second, … for all centres at once,
+    """The pixels 0…length-1 whose centers lie in ``center ± half``: their first, second, … for all centers at once,
     each with a mask of those that there are."""
     first = np.ceil(np.clip(center - half, -1.0, length)).astype(np.int64)
     pixels = (first + step for step in range(int(2 * half) + 1))
@@ -120,7 +120,7 @@ def _covered(
 
 
 def _pixel_map(grid: Intrinsics, color: Intrinsics) -> NDArray[np.float64] | None:
-    """(2, 3) map of grid pixels to pixels of a colour image of the same size and viewpoint, None if they coincide."""
+    """(2, 3) map of grid pixels to pixels of a color image of the same size and viewpoint, None if they coincide."""
     ax, ay = color.fx / grid.fx, color.fy / grid.fy
     to_color = np.array([[ax, 0.0, color.cx - ax * grid.cx], [0.0, ay, color.cy - ay * grid.cy]])
     corners = np.array([[0.0, 0.0], [grid.width - 1.0, grid.height - 1.0]])
@@ -129,7 +129,7 @@ def _pixel_map(grid: Intrinsics, color: Intrinsics) -> NDArray[np.float64] | Non
 
 
 def _reached(color_from_grid: NDArray[np.float64], grid: Intrinsics) -> tuple[slice, slice]:
-    """Rows and columns of the grid that lie inside of the colour image."""
+    """Rows and columns of the grid that lie inside of the color image."""
     spans = []
     for axis, length in ((1, grid.height), (0, grid.width)):
         position = color_from_grid[axis, axis] * np.arange(length) + color_from_grid[axis, 2]

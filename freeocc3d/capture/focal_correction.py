@@ -1,4 +1,4 @@
-"""A capture whose colour camera has another focal length than its files say: colour is brought to depth's pixels."""
+"""A capture whose color camera has another focal length than its files say: color is brought to depth's pixels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .depth_registration import PixelGrid
 
 
 class Reregistered(Capture):
-    """``capture`` with colour and class images resampled as those of a camera at the same place whose focal length is
+    """``capture`` with color and class images resampled as those of a camera at the same place whose focal length is
     ``color_focal`` times the depth camera's. Depth, poses and intrinsics stay as they are."""
 
     def __init__(self, capture: Capture, color_focal: float):
@@ -25,7 +25,7 @@ class Reregistered(Capture):
         self._grids: dict[Intrinsics, PixelGrid] = {}
 
     @classmethod
-    def recognises(cls, path: object) -> bool:
+    def recognizes(cls, path: object) -> bool:
         return False
 
     def __getitem__(self, index: int) -> Frame:

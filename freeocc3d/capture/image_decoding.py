@@ -38,10 +38,10 @@ def read_color(path: Path) -> NDArray[np.uint8]:
 
 
 def read_depth(path: Path) -> NDArray[np.uint16]:
-    """(H, W) uint16 depth as stored. Raises FrameError, also for an image that is not 16-bit grey."""
+    """(H, W) uint16 depth as stored. Raises FrameError, also for an image that is not 16-bit gray."""
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype != np.uint16:
-        raise FrameError(f"{path} is not a depth image: expected 16-bit grey, got {_kind(image)}.")
+        raise FrameError(f"{path} is not a depth image: expected 16-bit gray, got {_kind(image)}.")
     return image
 
 
@@ -50,7 +50,7 @@ def read_classes(path: Path, count: int) -> NDArray[np.uint8]:
     has a name. Raises FrameError, also for a value that has no class."""
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
-        raise FrameError(f"{path} is not a class image: expected 8- or 16-bit grey, got {_kind(image)}.")
+        raise FrameError(f"{path} is not a class image: expected 8- or 16-bit gray, got {_kind(image)}.")
     if count <= 255:
         image[image == 255] = 0
     if (largest := int(image.max())) >= count:
@@ -58,11 +58,11 @@ def read_classes(path: Path, count: int) -> NDArray[np.uint8]:
     return image.astype(np.uint8, copy=False)
 
 
-def convert_to_metres(raw: NDArray[np.uint16], units_per_metre: float, max_depth: float) -> NDArray[np.float32]:
-    """Stored depth to float32 metres; saturated values and those beyond ``max_depth`` metres become 0."""
+def convert_to_meters(raw: NDArray[np.uint16], units_per_meter: float, max_depth: float) -> NDArray[np.float32]:
+    """Stored depth to float32 meters; saturated values and those beyond ``max_depth`` meters become 0."""
     depth_m = raw.astype(np.float32)
-    depth_m *= np.float32(1.0 / units_per_metre)
-    limit = min(max_depth, (SATURATED - 0.5) / units_per_metre)
+    depth_m *= np.float32(1.0 / units_per_meter)
+    limit = min(max_depth, (SATURATED - 0.5) / units_per_meter)
     return cv2.threshold(depth_m, limit, 0.0, cv2.THRESH_TOZERO_INV, dst=depth_m)[1]
 
 

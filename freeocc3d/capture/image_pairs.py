@@ -1,8 +1,8 @@
-"""What the readers of numbered colour and depth files share: pairing them by number, and decoding a pair.
+"""What the readers of numbered color and depth files share: pairing them by number, and decoding a pair.
 
 Where a few frames lack one of their two files (at most ``capture.max_broken`` of them), these frames are broken, and
 reading one raises FrameError; where more do, the capture is not usable and the constructor raises CaptureError. With
-``capture.depth=false`` there are colour files alone, and no depth file is looked at.
+``capture.depth=false`` there are color files alone, and no depth file is looked at.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from ..core.errors import CaptureError, FrameError
 from ..core.types import Frame
 from .base import Capture, Options
 from .depth_registration import PixelGrid
-from .image_decoding import Size, convert_to_metres, image_size, read_classes, read_color, read_depth
+from .image_decoding import Size, convert_to_meters, image_size, read_classes, read_color, read_depth
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Colour and depth files of N frames, ascending by number. A missing file is None; so are all of depth where depth
-    is not to be read, and the depth images' size is colour's then.
+    """Color and depth files of N frames, ascending by number. A missing file is None; so are all of depth where depth
+    is not to be read, and the depth images' size is color's then.
 
     numbers: the frames' numbers in the file names.  color_size, depth_size: of the first readable image of each kind.
     """
@@ -37,28 +37,28 @@ class Pairs:
 
 
 def pair_files(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Path, options: Options) -> Pairs:
-    """Pair the files by their numbers, or take colour's alone if ``options.depth`` is false.
+    """Pair the files by their numbers, or take color's alone if ``options.depth`` is false.
 
-    Raises CaptureError: no colour, no depth, more than ``max_broken`` of the frames lack a file, no readable image.
+    Raises CaptureError: no color, no depth, more than ``max_broken`` of the frames lack a file, no readable image.
     """
     if not color:
-        raise CaptureError(f"{folder} holds no colour images of this format.")
+        raise CaptureError(f"{folder} holds no color images of this format.")
     if not options.depth:
         numbers = sorted(color)
         size = _first_size(color.values(), folder)
         return Pairs(tuple(numbers), tuple(color[n] for n in numbers), (None,) * len(numbers), size, size)
     if not depth:
         raise CaptureError(
-            f"{folder} holds {len(color)} colour images but no depth: add it, or map colour alone with "
+            f"{folder} holds {len(color)} color images but no depth: add it, or map color alone with "
             "capture.depth=false."
         )
     numbers = sorted(color.keys() | depth.keys())
     incomplete = sorted(color.keys() ^ depth.keys())
     if len(incomplete) > options.max_broken * len(numbers):
         alone = color.get(incomplete[0]) or depth[incomplete[0]]
-        missing = "depth" if incomplete[0] in color else "colour"
+        missing = "depth" if incomplete[0] in color else "color"
         raise CaptureError(
-            f"{folder} holds {len(color)} colour and {len(depth)} depth images, and {len(incomplete)} frames lack one "
+            f"{folder} holds {len(color)} color and {len(depth)} depth images, and {len(incomplete)} frames lack one "
             f"of the two, the first being frame {incomplete[0]} ({alone.name} has no {missing} image): complete the "
             "capture, or raise capture.max_broken."
         )
@@ -72,14 +72,14 @@ def pair_files(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Pat
 
 
 class ImagePairs(Capture):
-    """A capture of numbered colour and depth files; a reader finds the files and the cameras."""
+    """A capture of numbered color and depth files; a reader finds the files and the cameras."""
 
-    def __init__(self, path: Path, options: Options, pairs: Pairs, grid: PixelGrid, units_per_metre: float):
-        """units_per_metre: of the stored depth, unless ``options.depth_scale`` says otherwise."""
+    def __init__(self, path: Path, options: Options, pairs: Pairs, grid: PixelGrid, units_per_meter: float):
+        """units_per_meter: of the stored depth, unless ``options.depth_scale`` says otherwise."""
         super().__init__(path, options)
         self._pairs = pairs
         self._grid = grid
-        self._units_per_metre = options.depth_scale or units_per_metre
+        self._units_per_meter = options.depth_scale or units_per_meter
         self.has_depth = options.depth
         self.timestamps = np.arange(len(pairs.numbers), dtype=np.float64)
 
@@ -89,7 +89,7 @@ class ImagePairs(Capture):
         if depth_path is None:
             depth_m = np.zeros(color.shape[:2], np.float32)
         else:
-            stored = convert_to_metres(self._stored_depth(depth_path), self._units_per_metre, self.options.max_depth)
+            stored = convert_to_meters(self._stored_depth(depth_path), self._units_per_meter, self.options.max_depth)
             depth_m = self._grid.depth(stored)
         return Frame(index, float(self.timestamps[index]), color, depth_m, self._grid.intrinsics)
 
@@ -99,7 +99,7 @@ class ImagePairs(Capture):
 
     def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
         path = self._files(index)[1]
-        return None if path is None else (self._stored_depth(path), self._units_per_metre)
+        return None if path is None else (self._stored_depth(path), self._units_per_meter)
 
     def _class_image(self, path: Path | None) -> NDArray[np.uint8] | None:
         """The class image at ``path`` on the frames' pixel grid. Raises FrameError if it is there but not usable."""
@@ -110,12 +110,12 @@ class ImagePairs(Capture):
         return self._grid.classes(image)
 
     def _files(self, index: int) -> tuple[Path, Path | None]:
-        """Colour and, if depth is read, depth file of a frame."""
+        """Color and, if depth is read, depth file of a frame."""
         if not 0 <= index < len(self):
             raise IndexError(f"Frame {index} of a capture of {len(self)} frames.")
         color, depth = self._pairs.color[index], self._pairs.depth[index]
         if color is None or (depth is None and self.has_depth):
-            alone, missing = (color, "depth") if color else (depth, "colour")
+            alone, missing = (color, "depth") if color else (depth, "color")
             raise FrameError(f"Frame {self._pairs.numbers[index]} has no {missing} image beside {alone}.")
         return color, depth
 

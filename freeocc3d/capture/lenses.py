@@ -93,7 +93,7 @@ class Rectified:
         return self._moved(image, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
     def depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) metres of the lens, of any size, to (h, w); each pixel has the depth measured nearest to it."""
+        """(H, W) meters of the lens, of any size, to (h, w); each pixel has the depth measured nearest to it."""
         if depth_m.shape[1::-1] != self.size:
             depth_m = cv2.resize(depth_m, self.size, interpolation=cv2.INTER_NEAREST_EXACT)
         return self._moved(depth_m, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)

@@ -24,7 +24,7 @@ BUILTIN = "builtin:"
 """Paths that start with this name something that is rendered, not a folder."""
 
 USUAL_UNITS = (1.0, 100.0, 1000.0, 5000.0, 6553.5, 10000.0)
-"""Depth units per metre that formats use."""
+"""Depth units per meter that formats use."""
 
 INDOOR_MEDIAN_M = 0.1, 20.0
 """The median depth of an indoor scan lies between these."""
@@ -35,7 +35,7 @@ TYPICAL_MEDIAN_M = 2.0
 def open_capture(
     path: str | Path, options: Options | None = None, backend_options: Mapping[str, Mapping[str, Any]] | None = None
 ) -> Capture:
-    """The capture at ``path``, by the reader that ``options.format`` names or, if that is "auto", that recognises it.
+    """The capture at ``path``, by the reader that ``options.format`` names or, if that is "auto", that recognizes it.
 
     backend_options: reader name -> its own options; readers that are not used are ignored.
     Raises CaptureError (no such folder, unknown layout, what the reader finds missing), ConfigError (unknown format,
@@ -54,7 +54,7 @@ def open_capture(
             f"{'video file' if is_video else 'folder of frames'}."
         )
     try:
-        name = VIDEO if is_video else _recognise(folder) if options.format == "auto" else options.format
+        name = VIDEO if is_video else _recognize(folder) if options.format == "auto" else options.format
         return _construct(name, folder, options, backend_options or {})
     except OSError as error:
         raise CaptureError(f"Cannot read {error.filename or folder}: {error.strerror}.") from error
@@ -78,16 +78,16 @@ def check_depth_scale(capture: Capture, samples: int = 5) -> Notice | None:
     Looks at some frames spread over the capture, before depth is clipped at ``max_depth``, because depth that is read
     1000 times too large would be clipped away entirely.
     """
-    median_units, within, units_per_metre = _sample_depth(capture, samples)
+    median_units, within, units_per_meter = _sample_depth(capture, samples)
     if median_units is None:
         return None
-    median_m = median_units / units_per_metre
+    median_m = median_units / units_per_meter
     nearest, farthest = INDOOR_MEDIAN_M
     if nearest <= median_m <= farthest and within >= 0.05:
         return None
     likely = min(USUAL_UNITS, key=lambda units: abs(math.log(median_units / units / TYPICAL_MEDIAN_M)))
-    advice = f"capture.depth_scale is probably {likely:g} and not {units_per_metre:g}"
-    if likely == units_per_metre:
+    advice = f"capture.depth_scale is probably {likely:g} and not {units_per_meter:g}"
+    if likely == units_per_meter:
         advice = "check capture.depth_scale and capture.max_depth"
     return Notice(
         "depth-scale-doubtful",
@@ -97,21 +97,21 @@ def check_depth_scale(capture: Capture, samples: int = 5) -> Notice | None:
 
 
 def _sample_depth(capture: Capture, samples: int) -> tuple[float | None, float, float]:
-    """Median of the stored depth (None if there is none), the share of it within ``max_depth``, units per metre."""
-    values, units_per_metre = [], 1.0
+    """Median of the stored depth (None if there is none), the share of it within ``max_depth``, units per meter."""
+    values, units_per_meter = [], 1.0
     for index in np.unique(np.linspace(0, len(capture) - 1, samples).astype(int)).tolist():
         try:
             stored = capture.raw_depth(index)
         except FrameError:
             continue
         if stored is not None:
-            raw, units_per_metre = stored
+            raw, units_per_meter = stored
             values.append(raw[(raw > 0) & (raw < np.iinfo(raw.dtype).max)])
     measured = np.concatenate(values) if values else np.zeros(0)
     if not len(measured):
-        return None, 0.0, units_per_metre
-    within = float((measured <= capture.options.max_depth * units_per_metre).mean())
-    return float(np.median(measured)), within, units_per_metre
+        return None, 0.0, units_per_meter
+    within = float((measured <= capture.options.max_depth * units_per_meter).mean())
+    return float(np.median(measured)), within, units_per_meter
 
 
 def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mapping[str, Any]]) -> Capture:
@@ -126,11 +126,11 @@ def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mappin
     return opened
 
 
-def _recognise(folder: Path) -> str:
-    """Name of the one reader that recognises the folder. Raises CaptureError if none does, or several."""
+def _recognize(folder: Path) -> str:
+    """Name of the one reader that recognizes the folder. Raises CaptureError if none does, or several."""
     readers = _readers()
-    found = [name for name, reader in readers.items() if not reader.general and reader.recognises(folder)]
-    found = found or [name for name, reader in readers.items() if reader.general and reader.recognises(folder)]
+    found = [name for name, reader in readers.items() if not reader.general and reader.recognizes(folder)]
+    found = found or [name for name, reader in readers.items() if reader.general and reader.recognizes(folder)]
     if len(found) > 1:
         raise CaptureError(f"{folder} looks like {' and like '.join(found)}: name one with capture.format.")
     if found:
@@ -143,7 +143,7 @@ def _recognise(folder: Path) -> str:
 
 
 def _readers() -> dict[str, type[Capture]]:
-    """Readers by name; those whose packages are not installed cannot recognise anything."""
+    """Readers by name; those whose packages are not installed cannot recognize anything."""
     names = [name for name, backend in registry.backends("capture.readers").items() if not backend.missing]
     return {name: registry.load("capture.readers", name).Reader for name in names}
 
@@ -151,7 +151,7 @@ def _readers() -> dict[str, type[Capture]]:
 def _below(folder: Path, readers: Mapping[str, type[Capture]]) -> str:
     """A hint at the first subfolder that is a capture, for data sets that hold several, or at a video."""
     for child in sorted(folder.iterdir()):
-        if child.is_dir() and any(reader.recognises(child) for reader in readers.values()):
+        if child.is_dir() and any(reader.recognizes(child) for reader in readers.values()):
             return f", but {child} is: give that folder"
         if child.is_file() and child.suffix.lower() in VIDEO_SUFFIXES:
             return f", but {child} may be: give that file"

@@ -16,10 +16,10 @@ from ..core.transforms import invert, project, transform
 from ..core.types import Frame
 from .base import NOMINAL_DEPTH, Capture, Options
 from .camera_files import read_given_calibration, rescale_camera
-from .image_decoding import convert_to_metres, read_color, read_depth
+from .image_decoding import convert_to_meters, read_color, read_depth
 from .lenses import Lens, Rectified
 
-UNITS_PER_METRE = 1000.0
+UNITS_PER_METER = 1000.0
 """Of stored depth, unless ``capture.depth_scale`` says otherwise."""
 
 _SAMPLES = 20_000
@@ -39,14 +39,14 @@ class PosedImages(Capture):
     """Images as those of pinhole cameras: lens distortion is taken out, and they are reduced to ``capture.max_size``.
     Cameras may differ from image to image."""
 
-    def __init__(self, path: Path, options: Options, posed: Sequence[PosedImage], units_in_metres: float | None):
-        """units_in_metres: of the poses; None = unknown, so that they are left as they are."""
+    def __init__(self, path: Path, options: Options, posed: Sequence[PosedImage], units_in_meters: float | None):
+        """units_in_meters: of the poses; None = unknown, so that they are left as they are."""
         super().__init__(path, options)
         if len(posed) < 2:
             raise CaptureError(f"{path} holds {len(posed)} images with poses: a scan needs many.")
         self.has_depth = options.depth and any(view.depth is not None for view in posed)
         self.timestamps = np.arange(len(posed), dtype=np.float64)
-        scale = 1.0 if units_in_metres is None else units_in_metres
+        scale = 1.0 if units_in_meters is None else units_in_meters
         self._posed = [replace(view, T_world_cam=_scaled(view.T_world_cam, scale)) for view in posed]
         self._rectified = functools.lru_cache(maxsize=4)(lambda lens: Rectified(lens, options.max_size))
         if stated := read_given_calibration(options):
@@ -72,15 +72,15 @@ class PosedImages(Capture):
         rectified = self._rectified(lens)
         depth_m = np.zeros(rectified.size[::-1], np.float32)
         if self.has_depth and view.depth is not None:
-            units = self.options.depth_scale or UNITS_PER_METRE
-            depth_m = rectified.depth(convert_to_metres(read_depth(view.depth), units, self.options.max_depth))
+            units = self.options.depth_scale or UNITS_PER_METER
+            depth_m = rectified.depth(convert_to_meters(read_depth(view.depth), units, self.options.max_depth))
         return Frame(index, float(self.timestamps[index]), rectified.color(color), depth_m, rectified.intrinsics)
 
     def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
         path = self._posed[index].depth
         if path is None or not self.has_depth:
             return None
-        return read_depth(path), self.options.depth_scale or UNITS_PER_METRE
+        return read_depth(path), self.options.depth_scale or UNITS_PER_METER
 
     def name(self, index: int) -> str:
         return self._posed[index].image.name

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .types import Frame
 
 AXIAL_NOISE = (0.0012, 0.0019, 0.4)
-"""(a, b, z_0): metres, 1 / metres, metres, as the source measured them."""
+"""(a, b, z_0): meters, 1 / meters, meters, as the source measured them."""
 
 NOT_STATED = np.zeros((0, 0), np.float32)
 """In place of an image of standard deviations: the sensor's usual ones hold."""
@@ -24,7 +24,7 @@ _A, _B, _NEAREST = AXIAL_NOISE
 
 
 def compute_sensor_sigma(depth_m: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Standard deviations, metres, of a sensor's depths of any shape, metres."""
+    """Standard deviations, meters, of a sensor's depths of any shape, meters."""
     return np.asarray(_A + _B * (depth_m - _NEAREST) ** 2, np.float32)
 
 
@@ -35,12 +35,12 @@ def take_stated_sigma(frame: Frame) -> NDArray[np.float32]:
 
 @njit(cache=True, nogil=True, inline="always")
 def look_up_sigma(stated_m: NDArray[np.float32], row: int, column: int, depth: float) -> float:
-    """Standard deviation of a pixel's depth, metres. Inlined, so that its caller's floating-point rules hold."""
+    """Standard deviation of a pixel's depth, meters. Inlined, so that its caller's floating-point rules hold."""
     if len(stated_m):
         return np.float64(stated_m[row, column])
     return _A + _B * (depth - _NEAREST) ** 2
 
 
 def compute_sigma_image(frame: Frame) -> NDArray[np.float32]:
-    """(H, W) standard deviations, metres: ``look_up_sigma`` of all pixels, in plain NumPy."""
+    """(H, W) standard deviations, meters: ``look_up_sigma`` of all pixels, in plain NumPy."""
     return compute_sensor_sigma(frame.depth_m) if frame.depth_sigma_m is None else frame.depth_sigma_m

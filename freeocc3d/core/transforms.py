@@ -107,7 +107,7 @@ def project(points_cam: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
 
 
 def back_project(pixels: Array, depth_m: Array, intrinsics: Intrinsics) -> Array:
-    """Pixels (..., 2) and depths (...,) in metres to camera-frame points (..., 3)."""
+    """Pixels (..., 2) and depths (...,) in meters to camera-frame points (..., 3)."""
     x = (pixels[..., 0] - intrinsics.cx) / intrinsics.fx * depth_m
     y = (pixels[..., 1] - intrinsics.cy) / intrinsics.fy * depth_m
     return np.stack((x, y, depth_m), axis=-1)
@@ -119,7 +119,7 @@ trajectory's jitter, not its shape."""
 
 
 def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Array, Array]:
-    """The similarity (s, R, t) that minimises sum |target - (s R source + t)|^2 over (N, 3) point pairs.
+    """The similarity (s, R, t) that minimizes sum |target - (s R source + t)|^2 over (N, 3) point pairs.
 
     Source: S. Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point Patterns, PAMI 1991;
     equation numbers below are that paper's. Raises FreeOccError for fewer than three pairs or collinear points, for
@@ -128,13 +128,13 @@ def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Arra
     if len(source) < 3:
         raise FreeOccError(f"Alignment needs at least 3 matched poses, got {len(source)}: check that timestamps match.")
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
-    centred_source, centred_target = source - mean_source, target - mean_target
-    variance = (centred_source**2).sum() / len(source)  # eq. 36
-    covariance = centred_target.T @ centred_source / len(source)  # eq. 38
-    for points in (centred_source, centred_target):
+    centered_source, centered_target = source - mean_source, target - mean_target
+    variance = (centered_source**2).sum() / len(source)  # eq. 36
+    covariance = centered_target.T @ centered_source / len(source)  # eq. 38
+    for points in (centered_source, centered_target):
         spread = np.linalg.svd(points, compute_uv=False)
         if spread[1] <= _STRAIGHT * spread[0]:
-            raise FreeOccError("Alignment is not determined: the camera centres are identical or lie on one line.")
+            raise FreeOccError("Alignment is not determined: the camera centers are identical or lie on one line.")
     U, D, Vt = np.linalg.svd(covariance)
     S = np.eye(3)
     if np.linalg.det(U) * np.linalg.det(Vt) < 0:
@@ -145,7 +145,7 @@ def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Arra
 
 
 def measure_pose_difference(T_a: Array, T_b: Array) -> tuple[float, float]:
-    """How far two poses of one thing are from each other: metres and degrees."""
+    """How far two poses of one thing are from each other: meters and degrees."""
     difference = invert(T_a) @ T_b
     cosine = np.clip(0.5 * (np.trace(difference[:3, :3]) - 1.0), -1.0, 1.0)
     return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(np.arccos(cosine)))

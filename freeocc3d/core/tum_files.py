@@ -17,7 +17,7 @@ from .types import Trajectory
 NUMBERS = 8
 """Numbers on a line."""
 
-_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes, metres, seconds)"
+_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes, meters, seconds)"
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:

@@ -1,6 +1,6 @@
-"""What the layers hand to each other: arrays with their shapes, units and frames. No behaviour beyond reading them.
+"""What the layers hand to each other: arrays with their shapes, units and frames. No behavior beyond reading them.
 
-Conventions: camera-to-world poses, OpenCV camera axes (x right, y down, z forward), metres, seconds; ``T_a_b`` maps
+Conventions: camera-to-world poses, OpenCV camera axes (x right, y down, z forward), meters, seconds; ``T_a_b`` maps
 coordinates of frame b to frame a; voxel (i, j, k) covers ``origin + [i, i+1) * voxel_size``.
 """
 
@@ -23,7 +23,7 @@ FREE, OCCUPIED, UNKNOWN = 0, 1, 255
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole camera without distortion: pixel = (fx x/z + cx, fy y/z + cy); integer pixels are pixel centres."""
+    """Pinhole camera without distortion: pixel = (fx x/z + cx, fy y/z + cy); integer pixels are pixel centers."""
 
     width: int
     height: int
@@ -53,9 +53,9 @@ class Frame:
     index: its place in the capture, 0 … len(capture)-1.
     timestamp: seconds; equal to ``index`` where the format has none.
     color: (H, W, 3) uint8 RGB.
-    depth_m: (H, W) float32 metres, registered to ``color``'s pixels; 0 = no measurement.
+    depth_m: (H, W) float32 meters, registered to ``color``'s pixels; 0 = no measurement.
     intrinsics: of ``color`` and ``depth_m``, which have the same size.
-    depth_sigma_m: (H, W) float32 standard deviation of ``depth_m``, metres, more than 0 where that is; None = that of
+    depth_sigma_m: (H, W) float32 standard deviation of ``depth_m``, meters, more than 0 where that is; None = that of
     a sensor (``depth_noise.compute_sensor_sigma``).
     """
 
@@ -83,7 +83,7 @@ class Trajectory:
     timestamps: (N,) float64 seconds.
     T_world_cam: (N, 4, 4) float64; all NaN where the frame has no pose.
     keyframes: (K,) int32, ascending indices of the frames that are keyframes.
-    status: (N,) of "keyframe", "tracked", "relocalised" (lost, and found again), "interpolated" (between neighbours),
+    status: (N,) of "keyframe", "tracked", "relocalised" (lost, and found again), "interpolated" (between neighbors),
     "apart" (in a submap that nothing ties to the mapped one), "lost", "broken" (could not be decoded), "unused" (not
     asked for); the last four have no pose.
     confidence: (N,) float32 in 0…1.
@@ -131,8 +131,8 @@ class Submap:
 
     frames: (F,) int32, ascending indices of its frames.  T_submap_cam: (F, 4, 4) their poses.
     keyframes: (K,) int32, those of the frames that are keyframes.
-    closures: (C, 2) int32, pairs of keyframes' frames that were recognised as one place.  held: (C,) whether the
-    optimised path agrees with that; what does not was wrong.
+    closures: (C, 2) int32, pairs of keyframes' frames that were recognized as one place.  held: (C,) whether the
+    optimized path agrees with that; what does not was wrong.
     """
 
     frames: NDArray[np.int32]
@@ -147,13 +147,13 @@ class Gaussians:
     """N anchored Gaussians G = (mu, s, r, o, c). A mean is never a free parameter: it is ``anchor_cam`` moved by the
     pose of its keyframe (paper, "Geometrically Anchored Gaussian Updates").
 
-    means: (N, 3) float32, world, metres.
-    scales: (N, 3) float32, standard deviations along the principal axes, metres.
+    means: (N, 3) float32, world, meters.
+    scales: (N, 3) float32, standard deviations along the principal axes, meters.
     quats_wxyz: (N, 4) float32, unit, principal axes to world.
     opacities: (N,) float32 in 0…1.
     colors: (N, 3) uint8 RGB.
     anchor_keyframe: (N,) int32, row of ``Trajectory.keyframes``.
-    anchor_cam: (N, 3) float32, the anchored point in that keyframe's camera frame, metres; its pixel and depth are
+    anchor_cam: (N, 3) float32, the anchored point in that keyframe's camera frame, meters; its pixel and depth are
         the projection of this point.
     """
 
@@ -181,13 +181,13 @@ class Gaussians:
 class Occupancy:
     """Occupancy in sparse blocks of 8 x 8 x 8 voxels; what no block covers is unknown.
 
-    voxel_size: edge of a voxel of level 0, metres.  origin: (3,) float64 world position of the lower corner of voxel
+    voxel_size: edge of a voxel of level 0, meters.  origin: (3,) float64 world position of the lower corner of voxel
     (0, 0, 0).
     keys: (B, 3) int32, block index; block b covers voxels ``8 * keys[b] + (0…7)`` of its level; unique within a level,
     in no particular order.  levels: (B,) uint8, how often the edge of a block's voxels is halved; all 0 in a map of one
     size, which is the default. In a map of several sizes no block covers a part of another.
     Per voxel, (B, 512), the local index being (i * 8 + j) * 8 + k:
-    probability: float32 alpha(x) at the voxel's centre (paper, Gaussian-to-Occupancy Projection), in 0…1.
+    probability: float32 alpha(x) at the voxel's center (paper, Gaussian-to-Occupancy Projection), in 0…1.
     free: uint16 number of depth images that saw through the voxel.  hits: uint16 number that ended in it.
     state: uint8 FREE, OCCUPIED or UNKNOWN.
     Per occupied voxel, (V, …), in the order of ``occupied_voxels()``:
@@ -217,7 +217,7 @@ class Occupancy:
 
     @property
     def finest(self) -> float:
-        """Edge of the smallest voxels, metres: the unit of ``voxels`` and ``edges``."""
+        """Edge of the smallest voxels, meters: the unit of ``voxels`` and ``edges``."""
         return float(self.voxel_size / 2**self.deepest)
 
     def voxels(self, state: int) -> NDArray[np.int32]:
@@ -250,7 +250,7 @@ class Occupancy:
         return voxels, edges
 
     def centers(self, voxels: NDArray[np.int32], edges: NDArray[np.int32] | None = None) -> NDArray[np.float64]:
-        """(V, 3) world positions of the centres of voxels, given by corners and edges as above; edges are 1 by
+        """(V, 3) world positions of the centers of voxels, given by corners and edges as above; edges are 1 by
         default."""
         half = 0.5 if edges is None else 0.5 * edges[:, None]
         return self.origin + (voxels + half) * self.finest

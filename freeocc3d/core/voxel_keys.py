@@ -11,8 +11,8 @@ AXIS_BITS = 21
 """Of a key, for each axis."""
 
 KEY_LIMIT = 1 << AXIS_BITS - 1
-"""Indices lie in [-KEY_LIMIT, KEY_LIMIT) along each axis. Single precision of positions ends far earlier: a kilometre
-from the origin it costs tenths of a millimetre."""
+"""Indices lie in [-KEY_LIMIT, KEY_LIMIT) along each axis. Single precision of positions ends far earlier: a kilometer
+from the origin it costs tenths of a millimeter."""
 
 
 def pack_index(i: Any, j: Any, k: Any) -> Any:

@@ -18,7 +18,7 @@ class Plane:
     """The points X of the world with ``normal`` · X = ``offset`` in those squares of the plane where a surface is
     supposed.
 
-    normal: (3,) float64, of length 1.  offset, square: metres.  axes: (2, 3) orthonormal, along the plane.
+    normal: (3,) float64, of length 1.  offset, square: meters.  axes: (2, 3) orthonormal, along the plane.
     support: (U, V) bool of squares of that edge, the lower corner of the first of which has the coordinates ``corner``
     along the axes.  outermost: whether no other in its direction lies farther out; then it goes on wherever it is not
     seen through.

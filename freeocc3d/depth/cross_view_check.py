@@ -17,7 +17,7 @@ from .photo_consistency import compute_rays
 
 @dataclass(frozen=True)
 class DepthImage:
-    """Inverse depths of a posed view: ``inverse`` and its standard deviation ``sigma``, (H, W) float32, 1 / metres;
+    """Inverse depths of a posed view: ``inverse`` and its standard deviation ``sigma``, (H, W) float32, 1 / meters;
     ``inverse`` 0 = none."""
 
     inverse: NDArray[np.float32]
@@ -66,7 +66,7 @@ def confirm_depth(
         weight, total, square = weight + own, total + own * here, square + own * here.square()
     mean = total / weight
     scatter = (square / weight - mean.square()).clamp_min(0.0)
-    # Neighbours share images, and with them their errors: the mean is not surer than a single one.
+    # Neighbors share images, and with them their errors: the mean is not surer than a single one.
     return ConfirmedDepth(agreeing, through, mean, torch.sqrt((agreeing + 1) / weight + scatter))
 
 

@@ -104,12 +104,12 @@ class StereoDepth:
         )
 
     def depth(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """(H, W) depth in metres of a frame, 0 = none, and its standard deviation, at the size of ``prepared`` frames;
+        """(H, W) depth in meters of a frame, 0 = none, and its standard deviation, at the size of ``prepared`` frames;
         None for a frame that has none. Raises MapError for a file that is damaged."""
         if not self._path("depth", index).exists():
             return None
         height, width = self._load("view", index)["size"].tolist()
-        return _metres(*_enlarged(self._depth("depth", index), width, height))
+        return _meters(*_enlarged(self._depth("depth", index), width, height))
 
     def _compute(
         self, stage: str, frames: Sequence[int], step: Callable[[int], DepthImage], progress: Progress
@@ -233,9 +233,9 @@ class StereoDepth:
     def _view(self, frame: int) -> StereoView:
         stored = self._load("view", frame)
         height, width = stored["size"].tolist()
-        grey = stored["grey"].astype(np.float32) / np.float32(65535.0)
-        camera = Intrinsics(width, height, *stored["camera"].tolist()).resized(grey.shape[1], grey.shape[0])
-        return StereoView(grey, camera, stored["T_world_cam"].astype(np.float64))
+        gray = stored["grey"].astype(np.float32) / np.float32(65535.0)
+        camera = Intrinsics(width, height, *stored["camera"].tolist()).resized(gray.shape[1], gray.shape[0])
+        return StereoView(gray, camera, stored["T_world_cam"].astype(np.float64))
 
     def _depth(self, stage: str, frame: int) -> DepthImage:
         stored, view = self._load(stage, frame), self._view(frame)
@@ -275,7 +275,7 @@ def _enlarged(depth: DepthImage, width: int, height: int) -> tuple[NDArray[np.fl
     return np.where(smooth, between, nearest), np.asarray(sigma, np.float32)
 
 
-def _metres(
+def _meters(
     inverse: NDArray[np.float32], sigma: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth and its standard deviation from those of inverse depth."""

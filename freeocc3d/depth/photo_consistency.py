@@ -29,7 +29,7 @@ _AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 24}  # pixels x hypotheses; on a CPU su
 class StereoView:
     """An image whose camera is known.
 
-    color: (H, W, 3) uint8 RGB, or (H, W) float32 grey in 0…1 for ``intrinsics`` of that size.
+    color: (H, W, 3) uint8 RGB, or (H, W) float32 gray in 0…1 for ``intrinsics`` of that size.
     T_world_cam: (4, 4) float64.
     """
 
@@ -38,7 +38,7 @@ class StereoView:
     T_world_cam: NDArray[np.float64]
 
     def shrunk(self, width: int, height: int) -> StereoView:
-        """The same view in grey, of another size."""
+        """The same view in gray, of another size."""
         image = self.color
         if image.ndim == 3:
             image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255.0))
@@ -55,18 +55,18 @@ def compute_rays(camera: Intrinsics, device: str | torch.device = "cpu") -> Tens
 
 
 class Matcher:
-    """A reference view and the V views that it is compared with, all grey and of one size.
+    """A reference view and the V views that it is compared with, all gray and of one size.
 
-    Patches of (2 radius + 1)² pixels are compared by zero-mean normalised cross-correlation, each pixel at the depth
+    Patches of (2 radius + 1)² pixels are compared by zero-mean normalized cross-correlation, each pixel at the depth
     that it has itself: where the hypotheses vary over a patch, it is slanted or curved as they are.
     """
 
     def __init__(self, view: StereoView, others: Sequence[StereoView], radius: int, device: str = "cpu"):
         self.camera, self.radius, self.device = view.intrinsics, radius, torch.device(device)
-        self.grey = self._image(view)
+        self.gray = self._image(view)
         self.rays = compute_rays(view.intrinsics, self.device)
-        self._mean = average_box(self.grey[None], radius)[0]
-        self._variance = average_box(self.grey[None] ** 2, radius)[0] - self._mean**2
+        self._mean = average_box(self.gray[None], radius)[0]
+        self._variance = average_box(self.gray[None] ** 2, radius)[0] - self._mean**2
         self._sources = [(self._image(other), *self._projection(view, other)) for other in others]
         baselines = [np.linalg.norm((invert(o.T_world_cam) @ view.T_world_cam)[:3, 3]) for o in others]
         self.pixel = 1.0 / (self.camera.fx * float(np.median(baselines)))
@@ -78,8 +78,8 @@ class Matcher:
         inverse_depth: (D, H, W) or (D, 1, 1) hypotheses.  Returns (V, D, H, W).
         """
         depths = len(inverse_depth)
-        out = self.grey.new_empty((len(self._sources), depths, *self.grey.shape))
-        chunk = max(1, _AT_ONCE[self.device.type] // self.grey.numel())
+        out = self.gray.new_empty((len(self._sources), depths, *self.gray.shape))
+        chunk = max(1, _AT_ONCE[self.device.type] // self.gray.numel())
         for at in range(0, depths, chunk):
             for row, source in enumerate(self._sources):
                 out[row, at : at + chunk] = self._correlation(*source, inverse_depth[at : at + chunk])
@@ -90,7 +90,7 @@ class Matcher:
 
         Source: S. B. Kang, R. Szeliski, J. Chai, Handling Occlusions in Dense Multi-view Stereo, CVPR 2001.
         """
-        chunk = max(1, _AT_ONCE[self.device.type] // self.grey.numel())
+        chunk = max(1, _AT_ONCE[self.device.type] // self.gray.numel())
         parts = [average_best_half(self.scores(part)) for part in inverse_depth.split(chunk)]
         return torch.cat(parts)
 
@@ -105,7 +105,7 @@ class Matcher:
         warped = warped.view(depths, height, width)
         mean = average_box(warped, self.radius)
         variance = (average_box(warped * warped, self.radius) - mean * mean).clamp_min(0.0)
-        shared = average_box(warped * self.grey, self.radius) - mean * self._mean
+        shared = average_box(warped * self.gray, self.radius) - mean * self._mean
         scores = shared * torch.rsqrt((variance + NOISE**2) * (self._variance.clamp_min(0.0) + NOISE**2))
         return scores * inside
 

@@ -57,16 +57,16 @@ class _Bounded:
     taken: NDArray[np.bool_]
 
 
-def detect_layout(points: ScanPoints, centres: NDArray[np.float64], normals: NDArray[np.float64]) -> Layout:
+def detect_layout(points: ScanPoints, centers: NDArray[np.float64], normals: NDArray[np.float64]) -> Layout:
     """The planes of a scan.
 
-    centres: (C, 3) of the cameras that ``points.ray_camera`` counts.  normals: (N, 3) of surfaces, of length 1 and any
+    centers: (C, 3) of the cameras that ``points.ray_camera`` counts.  normals: (N, 3) of surfaces, of length 1 and any
     sign, one of which at least is that of a wall or floor.
     """
     if len(points.points) < _LEAST_POINTS or not len(normals):
         return Layout(())
     axes = find_directions(points, normals)
-    return Layout(_outermost(points, centres, axes) + _layers(points, centres, axes))
+    return Layout(_outermost(points, centers, axes) + _layers(points, centers, axes))
 
 
 def find_directions(points: ScanPoints, normals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -147,7 +147,7 @@ def _fitted(X: NDArray[np.float64], normal: NDArray[np.float64], offset: float, 
     return normal
 
 
-def _layers(points: ScanPoints, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
+def _layers(points: ScanPoints, centers: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
     """Planes, those that hold most points first; what one holds the next ones do without.
 
     Source: P. Hough, Method and Means for Recognizing Complex Patterns, 1962.
@@ -176,7 +176,7 @@ def _layers(points: ScanPoints, centres: NDArray[np.float64], axes: NDArray[np.f
         plane = _tilted(
             X, points.sigma_m, left, normals[row], lowest + (at + 1) * thickness + mean @ normals[row], cell
         )
-        bounded = None if plane is None else _bounded(points, centres, *plane)
+        bounded = None if plane is None else _bounded(points, centers, *plane)
         alike = group == group[row] if bounded is not None else np.arange(len(group)) == row
         count[alike, max(at - 1, 0) : at + 2] = -np.inf  # never the same again
         if bounded is None:
@@ -213,7 +213,7 @@ def _tilted(
 
 
 def _bounded(
-    points: ScanPoints, centres: NDArray[np.float64], normal: NDArray[np.float64], offset: float
+    points: ScanPoints, centers: NDArray[np.float64], normal: NDArray[np.float64], offset: float
 ) -> _Bounded | None:
     """The plane where its points support it; None if these are few or scattered."""
     X, cell = points.points, points.cell_m
@@ -247,12 +247,12 @@ def _bounded(
     held = _pieces((count >= 1) & ~crossed)
     if np.count_nonzero(held) < _HELD:
         return None
-    from_camera, to_point = centres @ normal - offset, height
+    from_camera, to_point = centers @ normal - offset, height
     a, b = from_camera[points.ray_camera], to_point[points.ray_point]
     beyond = np.maximum(_SEEN_THROUGH * cell, 3.0 * points.sigma_m[points.ray_point])
     through = np.flatnonzero((a * b < 0) & (np.abs(b) > beyond))
     share = (a[through] / (a[through] - b[through]))[:, None]
-    start = centres[points.ray_camera[through]]
+    start = centers[points.ray_camera[through]]
     rays = counted(start + share * (X[points.ray_point[through]] - start))
     held = _pieces(held & (rays <= 2 * count))
     if np.count_nonzero(held) < _HELD:
@@ -293,7 +293,7 @@ def _disc(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
 
 
-def _outermost(points: ScanPoints, centres: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
+def _outermost(points: ScanPoints, centers: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
     """The floor, the ceiling and the walls that have hardly anything behind them: of the layers of which that is true,
     those that hold most. They go on wherever they are not seen through."""
     X, cell = points.points, points.cell_m
@@ -305,10 +305,10 @@ def _outermost(points: ScanPoints, centres: NDArray[np.float64], axes: NDArray[n
         count[:-1] += count[1:]
         offsets = lowest + (np.arange(len(count)) + 1) * _LAYER * cell
         behind = 1.0 - np.searchsorted(np.sort(height), offsets + _SEEN_THROUGH * cell) / len(X)
-        count[(behind > _BEHIND) | (offsets < (centres @ outwards).max())] = 0.0
+        count[(behind > _BEHIND) | (offsets < (centers @ outwards).max())] = 0.0
         best = int(np.argmax(count))
         plane = _tilted(X, points.sigma_m, everything, outwards, offsets[best], cell) if count[best] else None
-        bounded = None if plane is None else _bounded(points, centres, *plane)
+        bounded = None if plane is None else _bounded(points, centers, *plane)
         if bounded is not None and bounded.held >= _OUTERMOST:
             planes.append(replace(bounded.plane, support=bounded.free, outermost=True))
     return planes

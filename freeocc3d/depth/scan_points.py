@@ -23,7 +23,7 @@ _UNCONFIRMED = 4  # times as many are kept until it is known which ones other ca
 
 @dataclass(frozen=True)
 class ScanPoints:
-    """points: (P, 3) float64 world.  sigma_m: (P,) metres.  ray_point, ray_camera: (R,) int32, the rays along which
+    """points: (P, 3) float64 world.  sigma_m: (P,) meters.  ray_point, ray_camera: (R,) int32, the rays along which
     points were measured.  cell_m: edge of the cells that hold one point each."""
 
     points: NDArray[np.float64]
@@ -37,7 +37,7 @@ def confirm_points(
     view: DepthImage, others: Sequence[DepthImage], agreeing: int, device: str = "cpu"
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(N, 3) world points of a view that ``agreeing`` of the ``others`` see at the same depth, and few at a greater
-    one; their (N,) standard deviations in metres."""
+    one; their (N,) standard deviations in meters."""
     found = confirm_depth(view, others, _SAME_DEPTH, device)
     keep = (found.agreeing >= agreeing) & (found.through <= _LOOKING_THROUGH * found.agreeing)
     there = keep.cpu().numpy() & (view.inverse > 0)
@@ -54,7 +54,7 @@ def merge_points(
     variances. Points that one camera alone measured are left out; cells are larger where there would be more than
     ``most``.
 
-    measured: (N, 3) points and (N,) sigma, metres, of each camera.
+    measured: (N, 3) points and (N,) sigma, meters, of each camera.
     """
     cells = _Cells.none(_CELL * depth_m)
     waiting: list[_Cells] = []

@@ -1,4 +1,4 @@
-"""Semi-global aggregation: what each pixel's labels cost once its neighbours have their say along eight directions.
+"""Semi-global aggregation: what each pixel's labels cost once its neighbors have their say along eight directions.
 
 Source: H. Hirschmüller, Stereo Processing by Semiglobal Matching and Mutual Information, PAMI 2008, eq. 13.
 """
@@ -22,11 +22,11 @@ def aggregate_costs(costs: Tensor, step: float, jump_down: Tensor, jump_right: T
     return total + turned.transpose(0, 1)
 
 
-def price_jumps(grey: Tensor, least: float, most: float, contrast: float) -> tuple[Tensor, Tensor]:
-    """(H, W) prices between vertical and between horizontal neighbours: ``most`` where they look alike, down to
+def price_jumps(gray: Tensor, least: float, most: float, contrast: float) -> tuple[Tensor, Tensor]:
+    """(H, W) prices between vertical and between horizontal neighbors: ``most`` where they look alike, down to
     ``least`` where they differ by much more than ``contrast``."""
-    down = F.pad((grey[1:] - grey[:-1]).abs(), (0, 0, 1, 0))
-    right = F.pad((grey[:, 1:] - grey[:, :-1]).abs(), (1, 0))
+    down = F.pad((gray[1:] - gray[:-1]).abs(), (0, 0, 1, 0))
+    right = F.pad((gray[:, 1:] - gray[:, :-1]).abs(), (1, 0))
     return tuple(least + (most - least) * torch.exp(-change / contrast) for change in (down, right))
 
 

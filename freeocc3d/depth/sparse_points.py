@@ -71,18 +71,18 @@ def _pairs(T_world_cam: NDArray[np.float64], frames: list[int]) -> list[tuple[in
 
 
 def _meeting(
-    centre_a: NDArray[np.float64],
+    center_a: NDArray[np.float64],
     rays_a: NDArray[np.float64],
-    centre_b: NDArray[np.float64],
+    center_b: NDArray[np.float64],
     rays_b: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Midpoints between (M, 3) unit rays of two cameras, of those pairs that meet in front of both."""
-    way = centre_b - centre_a
+    way = center_b - center_a
     cosine = np.einsum("mc,mc->m", rays_a, rays_b)
     sine2 = np.maximum(1.0 - cosine**2, 1e-12)
     along_a, along_b = rays_a @ way, rays_b @ way
     a, b = (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
-    on_a, on_b = centre_a + a[:, None] * rays_a, centre_b + b[:, None] * rays_b
+    on_a, on_b = center_a + a[:, None] * rays_a, center_b + b[:, None] * rays_b
     gap = np.linalg.norm(on_a - on_b, axis=1)
     good = (a > 0) & (b > 0) & (sine2 > np.sin(_LEAST_ANGLE) ** 2) & (gap < _AGREES * np.minimum(a, b))
     return np.asarray(0.5 * (on_a + on_b)[good])

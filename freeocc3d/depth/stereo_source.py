@@ -1,4 +1,4 @@
-"""Multi-view stereo as a depth source: depth of colour images whose poses are known."""
+"""Multi-view stereo as a depth source: depth of color images whose poses are known."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def collect_votes(
     """Each ray votes with one for the cell of its camera to be free, for the one ``BEHIND`` its point to be full, and
     against a surface on its way, less so the nearer to its point: 1 - exp(-d² / 2 sigma²) at the distance d.
 
-    ray_point, ray_camera: (R,) vertices.  sigma_m: (V,) metres.
+    ray_point, ray_camera: (R,) vertices.  sigma_m: (V,) meters.
     """
     count = len(space.corners)
     order = np.argsort(space.corners, axis=None, kind="stable")

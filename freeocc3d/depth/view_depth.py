@@ -16,7 +16,7 @@ from .photo_consistency import Matcher, StereoView
 from .semi_global import aggregate_costs, price_jumps
 
 _FEWEST, _MOST_HYPOTHESES = 32, 160
-_CONTRAST = 4.0 / 255.0  # a change of grey beyond this may be the edge of something
+_CONTRAST = 4.0 / 255.0  # a change of gray beyond this may be the edge of something
 _STEP, _JUMPS = 0.05, (0.3, 1.2)  # in units of 1 - correlation
 _RADIUS, _FINE_RADIUS = 2, 3
 _LEAST_SWEPT = 160  # pixels of the longer side: texture is lost in smaller images
@@ -27,13 +27,13 @@ _STEADY = 1.5  # pixels by which refinement may still move
 
 
 def sweep_planes(view: StereoView, others: Sequence[StereoView], near: float, far: float, device: str) -> Tensor:
-    """(H, W) inverse depths of a small view, by plane sweep over near…far metres and semi-global aggregation."""
+    """(H, W) inverse depths of a small view, by plane sweep over near…far meters and semi-global aggregation."""
     matcher = Matcher(view, others, _RADIUS, device)
     least, most = 1.0 / far, 1.0 / near
     count = int(np.clip(np.ceil((most - least) / matcher.pixel), _FEWEST, _MOST_HYPOTHESES))
     hypotheses = torch.linspace(least, most, count, device=matcher.device)
     costs = (1.0 - matcher.agreement(hypotheses[:, None, None])).permute(1, 2, 0).contiguous()
-    totals = aggregate_costs(costs, _STEP, *price_jumps(matcher.grey, *_JUMPS, _CONTRAST))
+    totals = aggregate_costs(costs, _STEP, *price_jumps(matcher.gray, *_JUMPS, _CONTRAST))
     best = totals.argmin(dim=-1, keepdim=True).clamp(1, count - 2)
     shift, _ = _vertex(*(-totals.gather(-1, best + k)[..., 0] for k in (-1, 0, 1)))
     return least + (best[..., 0] + shift.clamp(-0.5, 0.5)) * ((most - least) / (count - 1))
@@ -90,7 +90,7 @@ def _scaled(view: StereoView, by: float) -> StereoView:
 
 def _all_refined(matcher: Matcher, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Inverse depths refined from those of a smaller image; those before the last step; scores; sigmas."""
-    inverse = F.interpolate(filter_median(inverse)[None, None], matcher.grey.shape, mode="bilinear")[0, 0]
+    inverse = F.interpolate(filter_median(inverse)[None, None], matcher.gray.shape, mode="bilinear")[0, 0]
     before = score = sigma = inverse
     for pixels in _REFINED:
         before = filter_median(inverse)
@@ -108,7 +108,7 @@ def _refined(matcher: Matcher, inverse: Tensor, step: float) -> tuple[Tensor, Te
     best = curve.argmax(dim=0, keepdim=True).clamp(1, len(offsets) - 2)
     before, peak, after = (curve.gather(0, best + k)[0] for k in (-1, 0, 1))
     shift, curvature = _vertex(before, peak, after)
-    patch = (2 * matcher.radius + 1) ** 2 * count / 4.0  # neighbouring pixels of a resampled image are not independent
+    patch = (2 * matcher.radius + 1) ** 2 * count / 4.0  # neighboring pixels of a resampled image are not independent
     sigma = step * torch.sqrt((1.0 - peak).clamp_min(1e-3) / (patch * 0.5 * curvature.clamp_min(1e-6)))
     return inverse + (best[0] - 2 + shift.clamp(-1.0, 1.0)) * step, peak, sigma
 

@@ -32,7 +32,7 @@ APART = ViewAngles(14.0, 6.0, 10.0)
 @dataclass(frozen=True)
 class SelectedViews:
     """partners: per frame, indices of the views to compare it with, the best first; empty where it has none.
-    near, far: (N,) metres between which its pixels' depths lie."""
+    near, far: (N,) meters between which its pixels' depths lie."""
 
     partners: list[NDArray[np.int64]]
     near: NDArray[np.float64]
@@ -57,8 +57,8 @@ def select_partners(
     order = np.argsort(seen_point, kind="stable")
     by_point = seen_frame[order]
     starts = np.searchsorted(seen_point[order], np.arange(len(points) + 1))
-    centres, forward = T_world_cam[:, :3, 3], T_world_cam[:, :3, 2]
-    depths = np.einsum("oc,oc->o", points[seen_point] - centres[seen_frame], forward[seen_frame])
+    centers, forward = T_world_cam[:, :3, 3], T_world_cam[:, :3, 2]
+    depths = np.einsum("oc,oc->o", points[seen_point] - centers[seen_frame], forward[seen_frame])
     depths = np.where(np.isfinite(depths) & (depths > 0), depths, np.nan)
     overall = (
         np.nanpercentile(depths, (_OUTLIERS, 100 - _OUTLIERS)) if np.isfinite(depths).any() else np.full(2, np.nan)
@@ -77,7 +77,7 @@ def select_partners(
         point = np.repeat(seen, lengths)
         first = np.repeat(starts[seen], lengths)
         other = by_point[first + np.arange(len(point)) - np.repeat(np.cumsum(lengths) - lengths, lengths)]
-        to_here, to_other = points[point] - centres[frame], points[point] - centres[other]
+        to_here, to_other = points[point] - centers[frame], points[point] - centers[other]
         here, there = np.linalg.norm(to_here, axis=1), np.linalg.norm(to_other, axis=1)
         angle = np.degrees(np.arccos(np.clip(np.einsum("pc,pc->p", to_here, to_other) / (here * there), -1.0, 1.0)))
         width = np.where(angle < angles.best, angles.below, angles.above)

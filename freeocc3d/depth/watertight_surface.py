@@ -32,7 +32,7 @@ _LARGEST = (1 << 30) - 1  # the solver adds two capacities in 32 bits
 @dataclass(frozen=True)
 class RayHits:
     """Per ray: how many times its direction reaches the surface (0 = never); of the triangle that is met there, the
-    longest edge and the median of the corners' standard deviations, metres, and the cosine between normal and ray."""
+    longest edge and the median of the corners' standard deviations, meters, and the cosine between normal and ray."""
 
     times: NDArray[np.float32]
     edge_m: NDArray[np.float32]
@@ -91,15 +91,15 @@ class WatertightSurface:
         return edges, np.median(self.sigma_m[self.triangles], axis=1)
 
 
-def build_surface(points: ScanPoints, centres: NDArray[np.float64]) -> WatertightSurface:
-    """The surface of points that cameras at (C, 3) ``centres`` measured; its triangles turn counterclockwise seen from
-    the free side. There must be five points and centres that do not lie in a plane."""
+def build_surface(points: ScanPoints, centers: NDArray[np.float64]) -> WatertightSurface:
+    """The surface of points that cameras at (C, 3) ``centers`` measured; its triangles turn counterclockwise seen from
+    the free side. There must be five points and centers that do not lie in a plane."""
     count = len(points.points)
-    space = tetrahedralize(np.concatenate((points.points, centres)))
+    space = tetrahedralize(np.concatenate((points.points, centers)))
     soft = np.maximum(_SOFT * points.sigma_m, 0.5 * points.cell_m)
     seen = collect_votes(space, points.ray_point, (points.ray_camera + count).astype(np.int32), soft)
     free = cut_cells(space, seen)
-    sigma_m = np.concatenate((points.sigma_m, np.zeros(len(centres))))
+    sigma_m = np.concatenate((points.sigma_m, np.zeros(len(centers))))
     return WatertightSurface(
         space.vertices.astype(np.float32), sigma_m.astype(np.float32), extract_boundary(space, free), points.cell_m
     )
@@ -159,13 +159,13 @@ def measure_roundness(vertices, corners):  # type: ignore[no-untyped-def]
         if volume == 0.0:
             out[cell] = -1.0
             continue
-        to_centre = ((u * u).sum() * vw + (v * v).sum() * wu + (w * w).sum() * uv) / volume
-        radius = np.sqrt((to_centre * to_centre).sum())
+        to_center = ((u * u).sum() * vw + (v * v).sum() * wu + (w * w).sum() * uv) / volume
+        radius = np.sqrt((to_center * to_center).sum())
         for facet in range(4):
             p = vertices[corners[cell, (facet + 1) & 3]]
             across = vertices[corners[cell, (facet + 2) & 3]] - p
             normal = np.cross(across, vertices[corners[cell, (facet + 3) & 3]] - p)
-            height = (normal * (a + to_centre - p)).sum() / np.sqrt((normal * normal).sum())
+            height = (normal * (a + to_center - p)).sum() / np.sqrt((normal * normal).sum())
             if (normal * (vertices[corners[cell, facet]] - p)).sum() < 0.0:
                 height = -height
             out[cell, facet] = min(max(height / radius, -1.0), 1.0)

@@ -36,7 +36,7 @@ class Tracked:
     """What became of one frame.
 
     status: "keyframe", "tracked", "relocalised" or "lost".
-    T_world_cam: (4, 4) the current estimate, None if lost; a later optimisation may still move it.
+    T_world_cam: (4, 4) the current estimate, None if lost; a later optimization may still move it.
     confidence: 0…1.
     """
 
@@ -62,14 +62,14 @@ class PosedPoints:
 class Tracker(ABC):
     """Follows the camera through a capture. Frames must come in ascending order; some may be left out."""
 
-    world: ClassVar[str] = "OpenCV camera axes of the first keyframe, metres"
+    world: ClassVar[str] = "OpenCV camera axes of the first keyframe, meters"
     """The frame that poses and maps are in, for the map's manifest."""
     needs_depth: ClassVar[bool] = False
     """Whether it cannot work on a capture without depth."""
     estimates_camera: ClassVar[bool] = False
     """Whether it finds out what the camera is where the capture does not know."""
     metric: bool = True
-    """Whether its poses are in metres; where not, their unit is unknown, and so is the scale of what is mapped."""
+    """Whether its poses are in meters; where not, their unit is unknown, and so is the scale of what is mapped."""
     offline: bool = False
     """Whether ``prepare`` works through the whole scan before the first frame is tracked."""
     warnings: tuple[Notice, ...] = ()

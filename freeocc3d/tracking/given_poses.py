@@ -40,7 +40,7 @@ class GivenTracker(Tracker):
         if np.abs(T_world_cam[:3, 3]).max() > _FARTHEST:
             raise TrackingError(
                 f"The pose of frame {frame.index} lies more than {_FARTHEST:g} m from the origin, where positions lose "
-                "their millimetres: subtract a common offset from the poses."
+                "their millimeters: subtract a common offset from the poses."
             )
         view = self._view(frame)
         nothing_seen = np.count_nonzero(frame.depth_m) < _LEAST_COVERED * frame.depth_m.size

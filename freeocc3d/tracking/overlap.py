@@ -22,7 +22,7 @@ def sample_points(depth_m: NDArray[np.float32], intrinsics: Intrinsics, step: in
 
 @dataclass(frozen=True)
 class DepthView:
-    """A depth image (H, W) in metres, its camera, and a sample of its points (P, 3) in the camera's frame."""
+    """A depth image (H, W) in meters, its camera, and a sample of its points (P, 3) in the camera's frame."""
 
     depth_m: NDArray[np.float32]
     intrinsics: Intrinsics

@@ -24,7 +24,7 @@ class Edge:
     """A measured relative pose of two keyframes.
 
     T_target_source: (4, 4); ``information`` (6, 6), rotation before translation as Open3D has it.
-    uncertain: the line process may switch the edge off; odometry between neighbours is certain.
+    uncertain: the line process may switch the edge off; odometry between neighbors is certain.
     """
 
     source: int
@@ -49,8 +49,8 @@ def drop_unsupported_closures(
         T_a_b = poses[e.target] @ e.T_target_source @ invert(poses[e.source])
         ends, T = ((a, b), T_a_b) if a < b else ((b, a), invert(T_a_b))
         for other, T_other in between.setdefault(ends, []):
-            metres, degrees = measure_pose_difference(T_other, T)
-            if metres <= _AGREE_M and degrees <= _AGREE_DEG:
+            meters, degrees = measure_pose_difference(T_other, T)
+            if meters <= _AGREE_M and degrees <= _AGREE_DEG:
                 kept |= {n, other}
         between[ends].append((n, T))
     return [edge for n, edge in enumerate(edges) if n in kept]
@@ -104,7 +104,7 @@ def optimize(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArra
     """Keyframe poses T_world_keyframe that agree best with the edges; the first keeps its pose.
 
     A closure that the line process switches off may have bent the path before: what does not hold is left out, and the
-    path is optimised from its start again, until the closures that hold are those that were used.
+    path is optimized from its start again, until the closures that hold are those that were used.
     """
     used = edges
     for _ in range(_SWEEPS):
@@ -118,8 +118,8 @@ def optimize(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArra
 
 def agrees_with_edge(poses: Sequence[NDArray[np.float64]], edge: Edge) -> bool:
     """Whether poses T_world_keyframe agree with a measurement."""
-    metres, degrees = measure_pose_difference(invert(poses[edge.target]) @ poses[edge.source], edge.T_target_source)
-    return metres <= _HELD_M and degrees <= _HELD_DEG
+    meters, degrees = measure_pose_difference(invert(poses[edge.target]) @ poses[edge.source], edge.T_target_source)
+    return meters <= _HELD_M and degrees <= _HELD_DEG
 
 
 def _optimized(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArray[np.float64]]:

@@ -1,6 +1,6 @@
 """The estimated trajectory against the true one: which poses belong together, and the best alignment of the two worlds.
 
-Sources: S. Umeyama, PAMI 1991 (``core.transforms.umeyama``) on the camera centres of the frames that have a pose in
+Sources: S. Umeyama, PAMI 1991 (``core.transforms.umeyama``) on the camera centers of the frames that have a pose in
 both (paper, "Coordinate System Alignment"); J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS
 2012, for the association by time.
 """
@@ -42,7 +42,7 @@ class Poses:
 
     @property
     def centers(self) -> NDArray[np.float64]:
-        """(M, 3) camera centres."""
+        """(M, 3) camera centers."""
         return self.T_world_cam[:, :3, 3]
 
 
@@ -50,7 +50,7 @@ class Poses:
 class TrajectoryAlignment:
     """The similarity that takes the estimate's world to the true one: x_true = scale * rotation @ x_est + translation.
 
-    scale: 1 unless it was asked for.  rotation: (3, 3).  translation: (3,) metres.
+    scale: 1 unless it was asked for.  rotation: (3, 3).  translation: (3,) meters.
     """
 
     scale: float
@@ -87,9 +87,9 @@ class TrajectoryAlignment:
 
 
 def align_trajectories(estimated: Poses, true: Poses, how: str = "se3") -> TrajectoryAlignment:
-    """The alignment of the camera centres of the frames that have a pose in both.
+    """The alignment of the camera centers of the frames that have a pose in both.
 
-    Raises FreeOccError: fewer than three frames match, their centres lie on one line, unknown ``how``.
+    Raises FreeOccError: fewer than three frames match, their centers lie on one line, unknown ``how``.
     """
     if how not in ALIGNMENTS:
         raise FreeOccError(f"Trajectories are aligned by {', '.join(ALIGNMENTS)}, not by '{how}'.")

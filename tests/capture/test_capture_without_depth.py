@@ -1,4 +1,4 @@
-"""``capture.depth=false``: every reader gives colour alone, and no depth file is looked at."""
+"""``capture.depth=false``: every reader gives color alone, and no depth file is looked at."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from freeocc3d.capture.camera_files import USUAL_FOCAL
 from freeocc3d.core.errors import CaptureError, ConfigError, TrackingError
 from freeocc3d.pipeline import run
 
-COLOUR_ALONE = Options(depth=False)
+COLOR_ALONE = Options(depth=False)
 
 
 def remove_depth(folder: Path) -> None:
@@ -26,7 +26,7 @@ def test_depth_is_neither_needed_nor_read(tmp_path: Path, write) -> None:
     with_depth = open_capture(write(tmp_path, 3))
     expected = with_depth[1]
     remove_depth(tmp_path)
-    capture = open_capture(tmp_path, COLOUR_ALONE)
+    capture = open_capture(tmp_path, COLOR_ALONE)
     assert with_depth.has_depth
     assert not capture.has_depth
     frame = capture[1]
@@ -47,22 +47,22 @@ def test_broken_depth_does_no_harm(tmp_path: Path, write) -> None:
         path.write_bytes(b"no image")
     for path in tmp_path.rglob("*depth*.png"):
         path.write_bytes(b"no image")
-    assert not open_capture(tmp_path, COLOUR_ALONE)[0].depth_m.any()
+    assert not open_capture(tmp_path, COLOR_ALONE)[0].depth_m.any()
 
 
 @pytest.mark.parametrize("write", [write_seven_scenes, write_replica, write_scannet])
 def test_a_folder_without_depth_names_the_option(tmp_path: Path, write) -> None:
     write(tmp_path, 2)
     remove_depth(tmp_path)
-    with pytest.raises(CaptureError, match=r"2 colour images but no depth: .*capture\.depth=false"):
+    with pytest.raises(CaptureError, match=r"2 color images but no depth: .*capture\.depth=false"):
         open_capture(tmp_path)
 
 
-def test_the_pixel_grid_is_the_colour_cameras_own(tmp_path: Path) -> None:
+def test_the_pixel_grid_is_the_color_cameras_own(tmp_path: Path) -> None:
     size = 2 * SIZE[0], 2 * SIZE[1]
     write_scannet(tmp_path, 1, color_size=size)
     assert open_capture(tmp_path)[0].color.shape == (SIZE[1], SIZE[0], 3)
-    frame = open_capture(tmp_path, COLOUR_ALONE)[0]
+    frame = open_capture(tmp_path, COLOR_ALONE)[0]
     np.testing.assert_array_equal(frame.color, color_image(0, size))
     np.testing.assert_allclose(frame.intrinsics.matrix, camera_matrix(size))
 
@@ -72,10 +72,10 @@ def test_the_pixel_grid_is_the_colour_cameras_own(tmp_path: Path) -> None:
 )
 def test_an_unknown_camera_is_guessed_and_said_to_be(tmp_path: Path, write, files: list[str]) -> None:
     write(tmp_path, 1)
-    assert open_capture(tmp_path, COLOUR_ALONE).intrinsics_known
+    assert open_capture(tmp_path, COLOR_ALONE).intrinsics_known
     for file in files:
         (tmp_path / file).unlink()
-    capture = open_capture(tmp_path, COLOUR_ALONE)
+    capture = open_capture(tmp_path, COLOR_ALONE)
     assert not capture.intrinsics_known
     assert capture[0].intrinsics.fx == pytest.approx(USUAL_FOCAL * SIZE[0])
     given = open_capture(tmp_path, Options(depth=False, intrinsics=(30.0, 31.0, 16.0, 12.0)))
@@ -86,12 +86,12 @@ def test_an_unknown_camera_is_guessed_and_said_to_be(tmp_path: Path, write, file
 def test_what_seven_scenes_states_is_the_depth_camera(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path, 1)
     assert open_capture(tmp_path).intrinsics_known
-    assert not open_capture(tmp_path, COLOUR_ALONE).intrinsics_known
+    assert not open_capture(tmp_path, COLOR_ALONE).intrinsics_known
 
 
-def test_the_built_in_room_has_the_same_colour() -> None:
+def test_the_built_in_room_has_the_same_color() -> None:
     small = {"synthetic": {"width": 32, "height": 24}}
-    frame = open_capture("builtin:room", COLOUR_ALONE, small)[3]
+    frame = open_capture("builtin:room", COLOR_ALONE, small)[3]
     assert not frame.depth_m.any()
     np.testing.assert_array_equal(frame.color, open_capture("builtin:room", Options(), small)[3].color)
 

@@ -19,7 +19,7 @@ from freeocc3d.settings import config, registry
     ("write", "name"),
     [(write_seven_scenes, "seven_scenes"), (write_replica, "replica"), (write_scannet, "scannet")],
 )
-def test_a_layout_is_recognised(tmp_path: Path, write, name: str) -> None:
+def test_a_layout_is_recognized(tmp_path: Path, write, name: str) -> None:
     write(tmp_path, 2)
     capture = open_capture(str(tmp_path))
     assert capture.format == name
@@ -35,7 +35,7 @@ def test_no_folder_and_no_directory(tmp_path: Path) -> None:
         open_capture(tmp_path / "scan.zip")
 
 
-def test_an_unrecognised_folder_says_what_was_looked_for(tmp_path: Path) -> None:
+def test_an_unrecognized_folder_says_what_was_looked_for(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("")
     with pytest.raises(CaptureError, match="not a capture of a known format") as caught:
         open_capture(tmp_path)
@@ -64,7 +64,7 @@ def test_an_unknown_format_names_the_nearest(tmp_path: Path) -> None:
 
 def test_a_format_that_does_not_fit_says_what_is_missing(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path, 1)
-    with pytest.raises(CaptureError, match="results holds no colour images"):
+    with pytest.raises(CaptureError, match="results holds no color images"):
         open_capture(tmp_path, Options(format="replica"))
 
 

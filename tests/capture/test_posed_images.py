@@ -49,7 +49,7 @@ def write_colmap(
     folder: Path, count: int, camera: str = "", place: str = "sparse/0", depth: float = 5.0, scale: float = 1.0
 ) -> Path:
     """camera: the line after the number, by default helpers' pinhole.  depth: of points before the first camera.
-    scale: of the model's unit, units per metre."""
+    scale: of the model's unit, units per meter."""
     model = folder / place
     model.mkdir(parents=True, exist_ok=True)
     K = camera_matrix()
@@ -134,7 +134,7 @@ def test_nerfstudio_cameras_may_be_given_by_the_angle_and_by_frame(tmp_path: Pat
     assert capture[1].intrinsics.fx == 40.0
 
 
-def test_depth_of_another_size_is_brought_to_the_colours_pixels(tmp_path: Path) -> None:
+def test_depth_of_another_size_is_brought_to_the_colors_pixels(tmp_path: Path) -> None:
     write_nerfstudio(tmp_path, 2)
     small = np.array([[1000, 2000], [3000, 0]], np.uint16)
     write_image(tmp_path / "depth" / "frame_0.png", small)
@@ -222,7 +222,7 @@ def test_damaged_models_and_cameras_that_are_not_read_are_told(tmp_path: Path) -
 
 
 def rays(camera: pycolmap.Camera) -> NDArray[np.float64]:
-    """(H, W, 2) x/z and y/z that each pixel's centre sees, by COLMAP."""
+    """(H, W, 2) x/z and y/z that each pixel's center sees, by COLMAP."""
     v, u = np.mgrid[: camera.height, : camera.width]
     pixels = np.stack((u, v), axis=-1).reshape(-1, 2) + 0.5
     return np.asarray(camera.cam_from_img(pixels)).reshape(camera.height, camera.width, 2)
@@ -233,13 +233,13 @@ def rays(camera: pycolmap.Camera) -> NDArray[np.float64]:
 def test_distortion_is_taken_out_as_colmap_states_it(
     tmp_path: Path, model: str, params: list[float], max_size: int | None
 ) -> None:
-    scale = 10  # a larger image, so that resampling is exact to a fraction of a grey level
+    scale = 10  # a larger image, so that resampling is exact to a fraction of a gray level
     values = [scale * v if n < len(params) and abs(v) > 1 else v for n, v in enumerate(params)]
     camera = pycolmap.Camera(model=model, width=64 * scale, height=48 * scale, params=values)
     write_colmap(tmp_path, 2, camera=f"{model} {camera.width} {camera.height} {' '.join(map(str, values))}")
     seen = rays(camera)
-    grey = np.clip(128 + 100 * seen, 0, 255)
-    image = np.concatenate((grey, np.zeros((*grey.shape[:2], 1))), axis=-1).round().astype(np.uint8)
+    gray = np.clip(128 + 100 * seen, 0, 255)
+    image = np.concatenate((gray, np.zeros((*gray.shape[:2], 1))), axis=-1).round().astype(np.uint8)
     write_image(tmp_path / "images" / "view0.png", image)
     frame = open_capture(tmp_path, Options(max_size=max_size))[0]
     camera_out = frame.intrinsics

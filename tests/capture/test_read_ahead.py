@@ -25,7 +25,7 @@ class Numbers(Capture):
         self.threads: set[int] = set()
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return False
 
     def __getitem__(self, index: int) -> Frame:

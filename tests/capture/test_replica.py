@@ -14,7 +14,7 @@ from freeocc3d.core.types import Intrinsics
 
 
 @pytest.mark.parametrize("beside", [False, True])
-def test_a_frame_has_rgb_metres_and_intrinsics(tmp_path: Path, beside: bool) -> None:
+def test_a_frame_has_rgb_meters_and_intrinsics(tmp_path: Path, beside: bool) -> None:
     capture = Reader(write_replica(tmp_path / "office0", 3, beside=beside), Options())
     frame = capture[1]
     np.testing.assert_array_equal(frame.color, color_image(1))
@@ -143,7 +143,7 @@ def test_class_names_of_another_kind_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("room", ["living", "bedroom"])
-def test_the_house_has_colour_depth_poses_and_classes(room: str) -> None:
+def test_the_house_has_color_depth_poses_and_classes(room: str) -> None:
     capture = Reader(data_folder() / "house" / room, Options())
     frame, labels = capture[100], capture.labels(100)
     assert frame.color.shape == (480, 640, 3)

@@ -77,7 +77,7 @@ def test_the_camera_file_of_open3ds_recorder(tmp_path: Path) -> None:
     np.testing.assert_allclose(intrinsics.matrix, camera_matrix(), atol=1e-12)
 
 
-def test_a_larger_colour_image_comes_down_to_the_depths_size(tmp_path: Path) -> None:
+def test_a_larger_color_image_comes_down_to_the_depths_size(tmp_path: Path) -> None:
     capture = Reader(write_scannet(tmp_path, 1, color_size=(96, 72)), Options())
     frame = capture[0]
     assert frame.color.shape == (24, 32, 3)
@@ -87,8 +87,8 @@ def test_a_larger_colour_image_comes_down_to_the_depths_size(tmp_path: Path) -> 
     np.testing.assert_allclose(frame.depth_m[:, 1:], 2.0)
 
 
-def test_colour_is_resampled_through_both_cameras() -> None:
-    """The colour camera sees less than the depth camera and off its centre; what a ray sees is known analytically."""
+def test_color_is_resampled_through_both_cameras() -> None:
+    """The color camera sees less than the depth camera and off its center; what a ray sees is known analytically."""
     depth_camera = Intrinsics(64, 48, 50.0, 52.0, 31.0, 23.0)
     color_camera = Intrinsics(128, 96, 130.0, 126.0, 65.0, 45.0)
     grid = PixelGrid(color_camera, depth_camera)
@@ -103,7 +103,7 @@ def test_colour_is_resampled_through_both_cameras() -> None:
     v, u = v[interior], u[interior]
     expected = np.stack((128 + 200 * (u - 31.0) / 50.0, 128 + 200 * (v - 23.0) / 52.0), axis=-1)
     np.testing.assert_allclose(color[v, u, :2], expected, atol=1.5)
-    # The first ray that colour sees, x = -65.5 / 130, is depth column 31 - 50 * 65.5 / 130 = 5.8.
+    # The first ray that color sees, x = -65.5 / 130, is depth column 31 - 50 * 65.5 / 130 = 5.8.
     assert np.nonzero(depth_m.any(axis=0))[0][0] == 6
 
 
@@ -142,7 +142,7 @@ def test_a_plane_registered_to_a_shifted_narrower_camera_is_whole_and_in_place(s
     moved = DepthPatches(depth_camera, target, T_target_depth).move(measured.astype(np.float32))
     expected = plane_depth(target, T_plane_depth @ invert(T_target_depth))
     assert (moved > 0).all()
-    # A patch has one depth: at its edge, half a depth pixel and the overlap from its centre, it is off by the slope.
+    # A patch has one depth: at its edge, half a depth pixel and the overlap from its center, it is off by the slope.
     slope_m = np.abs(np.diff(expected, axis=1)).max()
     assert np.abs(moved - expected).max() < (0.5 * 70 / 40 + OVERLAP_PX) * slope_m + 1e-5
 
@@ -164,7 +164,7 @@ def test_the_nearer_surface_wins() -> None:
     np.testing.assert_allclose(moved[12:28, 37:], 3.0)
 
 
-def test_depth_is_moved_to_the_colour_camera_by_the_extrinsics(tmp_path: Path) -> None:
+def test_depth_is_moved_to_the_color_camera_by_the_extrinsics(tmp_path: Path) -> None:
     write_scannet(tmp_path, 1, color_size=(64, 48))
     T_rig_depth = np.eye(4)
     T_rig_depth[0, 3] = -0.5

@@ -13,7 +13,7 @@ from freeocc3d.core.errors import CaptureError, FrameError
 from freeocc3d.core.types import Intrinsics
 
 
-def test_a_frame_has_rgb_metres_and_intrinsics(tmp_path: Path) -> None:
+def test_a_frame_has_rgb_meters_and_intrinsics(tmp_path: Path) -> None:
     capture = Reader(write_seven_scenes(tmp_path, 3), Options())
     frame = capture[2]
     assert len(capture) == 3
@@ -60,7 +60,7 @@ def test_poses_are_optional_and_must_be_rigid(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
-def test_a_cut_off_colour_image_is_a_frame_error(tmp_path: Path, suffix: str) -> None:
+def test_a_cut_off_color_image_is_a_frame_error(tmp_path: Path, suffix: str) -> None:
     capture = Reader(write_seven_scenes(tmp_path, 2, suffix=suffix), Options())
     truncate(tmp_path / f"frame-000001.color.{suffix}", 0.9)
     with pytest.raises(FrameError, match=rf"frame-000001\.color\.{suffix} is cut off"):
@@ -90,8 +90,8 @@ def test_an_exif_orientation_is_not_applied(tmp_path: Path) -> None:
         (lambda path: truncate(path, 0.9), "cut off"),
         (lambda path: path.write_bytes(b""), "not a readable image"),
         (lambda path: path.unlink(), "Cannot read"),
-        (lambda path: write_image(path, np.zeros((24, 32), np.uint8)), "16-bit grey, got 8-bit with 1 channel"),
-        (lambda path: write_image(path, np.zeros((24, 32, 3), np.uint16)), "16-bit grey, got 16-bit with 3 channels"),
+        (lambda path: write_image(path, np.zeros((24, 32), np.uint8)), "16-bit gray, got 8-bit with 1 channel"),
+        (lambda path: write_image(path, np.zeros((24, 32, 3), np.uint16)), "16-bit gray, got 16-bit with 3 channels"),
         (lambda path: write_image(path, np.ones((12, 16), np.uint16)), "16 x 12 pixels, other frames have 32 x 24"),
     ],
 )
@@ -135,7 +135,7 @@ def test_many_missing_files_are_a_capture_error(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path, 20)
     for i in (7, 8, 9):
         (tmp_path / f"frame-{i:06d}.color.png").unlink()
-    with pytest.raises(CaptureError, match=r"17 colour and 20 depth .* frame 7 \(frame-000007\.depth\.png has no col"):
+    with pytest.raises(CaptureError, match=r"17 color and 20 depth .* frame 7 \(frame-000007\.depth\.png has no col"):
         Reader(tmp_path, Options())
     assert len(Reader(tmp_path, Options(max_broken=0.2))) == 20
 
@@ -144,11 +144,11 @@ def test_no_depth_has_its_own_sentence(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path, 2)
     for path in tmp_path.glob("*.depth.png"):
         path.unlink()
-    with pytest.raises(CaptureError, match="holds 2 colour images but no depth"):
+    with pytest.raises(CaptureError, match="holds 2 color images but no depth"):
         Reader(tmp_path, Options())
 
 
-def test_two_colour_images_of_one_frame_are_refused(tmp_path: Path) -> None:
+def test_two_color_images_of_one_frame_are_refused(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path, 2)
     write_image(tmp_path / "frame-000001.color.jpg", color_image(1))
     with pytest.raises(

@@ -72,7 +72,7 @@ def test_it_is_opened_by_its_name() -> None:
     capture = open_capture("builtin:room", base.Options(), {"synthetic": {"frames": 5, "width": 16, "height": 12}})
     assert isinstance(capture, synthetic.Reader)
     assert len(capture) == 5
-    assert not synthetic.Reader.recognises(Path("builtin:room"))
+    assert not synthetic.Reader.recognizes(Path("builtin:room"))
 
 
 def test_what_is_not_there_is_refused() -> None:

@@ -26,7 +26,7 @@ def test_voxels_are_numbered_across_blocks() -> None:
     assert occupancy().voxels(FREE).tolist() == [[-8, 16, 0]]
 
 
-def test_voxel_centres_lie_half_an_edge_from_the_corner() -> None:
+def test_voxel_centers_lie_half_an_edge_from_the_corner() -> None:
     grid = occupancy()
     np.testing.assert_allclose(
         grid.centers(np.array([[0, 0, 0], [-1, 2, 3]], np.int32)), [[1.05, 0.05, -0.95], [0.95, 0.25, -0.65]]

@@ -12,7 +12,7 @@ from freeocc3d.depth import depth_network
 
 
 def _write(path: Path, size=("height", "width"), channels: int = 3, output: str | None = None) -> Path:
-    """The image's red, unnormalised, as its (inverse) depth: (1, 1, H, W)."""
+    """The image's red, unnormalized, as its (inverse) depth: (1, 1, H, W)."""
     weight = np.zeros((1, channels, 1, 1), np.float32)
     weight[0, 0] = 0.229
     node = helper.make_node("Conv", ["image", "weight", "bias"], ["depth"])

@@ -23,10 +23,10 @@ from freeocc3d.tracking.trackers import known
 FRAMES = range(24)
 
 
-class Colour(Capture):
+class Color(Capture):
     """The room in 24 frames of 320 x 240 pixels, part of a walk, without depth."""
 
-    format, layout, has_depth = "colour", "", False
+    format, layout, has_depth = "color", "", False
 
     def __init__(self) -> None:
         self.room = open_capture("builtin:room", Options(), {"synthetic": {"frames": 96, "width": 320, "height": 240}})
@@ -36,7 +36,7 @@ class Colour(Capture):
         self.broken: set[int] = set()
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return False
 
     def __getitem__(self, index: int) -> Frame:
@@ -61,7 +61,7 @@ def _source(capture: Capture, folder: Path, frames=FRAMES, change: Callable = la
 
 @pytest.fixture(scope="module")
 def computed(tmp_path_factory):
-    capture, folder = Colour(), tmp_path_factory.mktemp("stereo")
+    capture, folder = Color(), tmp_path_factory.mktemp("stereo")
     return capture, folder, _source(capture, folder)
 
 
@@ -146,12 +146,12 @@ def test_a_damaged_layout_is_told(computed, tmp_path: Path) -> None:
 
 
 def test_images_that_show_nothing_are_told(tmp_path: Path) -> None:
-    class Blank(Colour):
+    class Blank(Color):
         def __getitem__(self, index: int) -> Frame:
             frame = super().__getitem__(index)
             return replace(frame, color=np.full_like(frame.color, 128))
 
-    capture, tracker = Colour(), known.load(known.Options(), Colour())
+    capture, tracker = Color(), known.load(known.Options(), Color())
     scan = triangulate(capture, tracker.T_world_cam, range(6), Progress())
     depth = multi_view_stereo.StereoDepth(tmp_path, multi_view_stereo.Options(size=64))
     with pytest.raises(TrackingError, match="bare surfaces"):
@@ -175,7 +175,7 @@ def test_points_are_where_surfaces_are(computed) -> None:
 
 
 def test_broken_frames_are_done_without(tmp_path: Path) -> None:
-    capture = Colour()
+    capture = Color()
     capture.broken = {5}
     source = _source(capture, tmp_path, range(10))
     assert source._depth.depth(5) is None
@@ -184,7 +184,7 @@ def test_broken_frames_are_done_without(tmp_path: Path) -> None:
 
 def test_a_network_fills_what_stereo_leaves_empty(tmp_path: Path) -> None:
     network = write_network(tmp_path / "n.onnx")
-    capture = Colour()
+    capture = Color()
     plain = _source(capture, tmp_path / "a", range(8))
     fused = _source(capture, tmp_path / "b", range(8), network=str(network))
     counts = [[np.count_nonzero(t._depth.depth(i)[0]) for i in range(2, 6)] for t in (plain, fused)]
@@ -198,7 +198,7 @@ def test_a_camera_that_only_turns_measures_nothing(tmp_path: Path) -> None:
         return T
 
     with pytest.raises(TrackingError, match="sideways"):
-        _source(Colour(), tmp_path, range(8), turned)
+        _source(Color(), tmp_path, range(8), turned)
 
 
 @pytest.mark.parametrize("given", [{"size": 10}, {"neighbors": 0}, {"agreeing": 0}])

@@ -21,13 +21,13 @@ _FURNITURE = (  # lower and upper corners
     ((0.5, 3.0, 0.0), (1.1, 3.6, 1.9)),
 )
 _DOOR = ((3.0, -0.01, 0.0), (4.0, 0.01, 2.0))  # in the wall at y = 0
-_BEHIND = 2.5  # metres: the wall that is seen through it
+_BEHIND = 2.5  # meters: the wall that is seen through it
 
 
 @dataclass(frozen=True)
 class _Room:
     points: ScanPoints
-    centres: np.ndarray
+    centers: np.ndarray
     normals: np.ndarray
     planes: Layout
 
@@ -91,11 +91,11 @@ def _room(behind: int = 0) -> _Room:
         parts = [part[_through_door(cameras[0], part)][: behind // 2] for part in (wall, floor)]
         points = np.concatenate((points, *jambs, *parts))
     rays = []
-    for camera, centre in enumerate(cameras):
+    for camera, center in enumerate(cameras):
         hidden = np.zeros(len(points), bool)
         for lower, upper in _FURNITURE:
-            hidden |= _crosses(centre, points, lower, upper)
-        hidden |= (points[:, 1] < -0.05) & ~_through_door(centre, points)
+            hidden |= _crosses(center, points, lower, upper)
+        hidden |= (points[:, 1] < -0.05) & ~_through_door(center, points)
         rays.append(np.stack((np.flatnonzero(~hidden), np.full(np.count_nonzero(~hidden), camera)), axis=1))
     ray_point, ray_camera = np.concatenate(rays).T.astype(np.int32)
     measured = points + _NOISE * rng.normal(size=points.shape)
@@ -103,8 +103,8 @@ def _room(behind: int = 0) -> _Room:
     normals = np.repeat(np.eye(3)[[2, 0, 1]], (1500, 500, 400), axis=0) + 0.04 * rng.normal(size=(2400, 3))
     normals *= rng.choice((-1.0, 1.0), (2400, 1)) / np.linalg.norm(normals, axis=1, keepdims=True)
     found = ScanPoints(_world(measured), sigma_m, ray_point, ray_camera, _CELL)
-    centres = _world(cameras)
-    return _Room(found, centres, normals @ _WORLD.T, detect_layout(found, centres, normals @ _WORLD.T))
+    centers = _world(cameras)
+    return _Room(found, centers, normals @ _WORLD.T, detect_layout(found, centers, normals @ _WORLD.T))
 
 
 def _world(points: np.ndarray) -> np.ndarray:
@@ -117,7 +117,7 @@ def room() -> _Room:
 
 
 def _towards(room: _Room, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    origin = room.centres[0]
+    origin = room.centers[0]
     return origin, _world(targets) - origin
 
 
@@ -277,20 +277,20 @@ def test_damaged_arrays_are_refused(damage) -> None:
         Layout.from_arrays({**arrays, **damage(arrays)})
 
 
-def _measured(points: np.ndarray, centres: np.ndarray) -> ScanPoints:
-    ray_point, ray_camera = np.indices((len(points), len(centres))).reshape(2, -1).astype(np.int32)
+def _measured(points: np.ndarray, centers: np.ndarray) -> ScanPoints:
+    ray_point, ray_camera = np.indices((len(points), len(centers))).reshape(2, -1).astype(np.int32)
     return ScanPoints(points, np.full(len(points), _NOISE), ray_point, ray_camera, _CELL)
 
 
 @pytest.mark.parametrize("count", [0, 4, 59])
 def test_few_points_make_no_planes(count: int) -> None:
-    points, centres = np.random.default_rng(7).random((count, 3)), np.ones((2, 3))
-    assert detect_layout(_measured(points, centres), centres, np.eye(3)).planes == ()
+    points, centers = np.random.default_rng(7).random((count, 3)), np.ones((2, 3))
+    assert detect_layout(_measured(points, centers), centers, np.eye(3)).planes == ()
 
 
 def test_points_without_surfaces_make_no_planes() -> None:
-    points, centres = np.random.default_rng(7).random((500, 3)), np.ones((2, 3))
-    assert detect_layout(_measured(points, centres), centres, np.zeros((0, 3))).planes == ()
+    points, centers = np.random.default_rng(7).random((500, 3)), np.ones((2, 3))
+    assert detect_layout(_measured(points, centers), centers, np.zeros((0, 3))).planes == ()
 
 
 @pytest.mark.filterwarnings("error")
@@ -299,9 +299,9 @@ def test_points_without_surfaces_make_no_planes() -> None:
 def test_points_of_one_plane_alone_do_no_harm(extent, spread: float) -> None:
     rng = np.random.default_rng(8)
     points = rng.random((8000, 3)) * extent + spread * rng.normal(size=(8000, 3))
-    centres = np.array([(2.5, 2.0, 1.5)] * 4)  # all cameras at one place
-    detect_layout(_measured(points, centres), centres, np.eye(3)[2:])  # along the axes, all numbers are exact
-    found = detect_layout(_measured(_world(points), _world(centres)), _world(centres), _WORLD.T[2:])
+    centers = np.array([(2.5, 2.0, 1.5)] * 4)  # all cameras at one place
+    detect_layout(_measured(points, centers), centers, np.eye(3)[2:])  # along the axes, all numbers are exact
+    found = detect_layout(_measured(_world(points), _world(centers)), _world(centers), _WORLD.T[2:])
     for plane in found.planes:
         assert all(np.isfinite(getattr(plane, field.name)).all() for field in fields(Plane))
     if min(extent[:2]) > 0:
@@ -311,17 +311,17 @@ def test_points_of_one_plane_alone_do_no_harm(extent, spread: float) -> None:
 
 @pytest.mark.parametrize("far", [100.0, 0.45e4])
 def test_one_point_far_away_changes_little(room, far: float) -> None:
-    given, centres = room.points, room.centres
+    given, centers = room.points, room.centers
     points = np.concatenate((given.points, _world(np.array([[far, -2.0 * far, 0.7 * far]]))))
     more = ScanPoints(points, np.append(given.sigma_m, _NOISE), np.append(given.ray_point, np.int32(len(points) - 1)),
                   np.append(given.ray_camera, np.int32(0)), _CELL)  # fmt: skip
-    planes = detect_layout(more, centres, room.normals).planes
+    planes = detect_layout(more, centers, room.normals).planes
     assert sum(plane.outermost for plane in planes) == 6
 
 
 def test_planes_of_pieces_far_apart_take_no_memory() -> None:
     points = np.random.default_rng(9).random((16000, 3)) * (5.0, 4.0, 0.0)
     points[8000:] += 3000.0, 2000.0, 0.0
-    centres = np.array([(2.5, 2.0, 1.5), (2.0, 2.0, 1.5)])
-    for plane in detect_layout(_measured(points, centres), centres, np.eye(3)[2:]).planes:
+    centers = np.array([(2.5, 2.0, 1.5), (2.0, 2.0, 1.5)])
+    for plane in detect_layout(_measured(points, centers), centers, np.eye(3)[2:]).planes:
         assert plane.support.size <= 1 << 24

@@ -41,9 +41,9 @@ def test_sum_of_the_least_paths() -> None:
 
 
 def test_edges_make_jumps_cheap() -> None:
-    grey = torch.zeros(4, 6)
-    grey[:, 3:] = 1.0
-    down, right = price_jumps(grey, 0.2, 2.0, 0.05)
+    gray = torch.zeros(4, 6)
+    gray[:, 3:] = 1.0
+    down, right = price_jumps(gray, 0.2, 2.0, 0.05)
     assert (down == 2.0).all()
     assert right[0, 3] == pytest.approx(0.2, abs=1e-3)
     assert right[0, 2] == 2.0

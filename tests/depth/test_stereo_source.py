@@ -36,7 +36,7 @@ class FrameByFrame(GivenTracker):
 
 
 class StereoStub:
-    """Two metres for frame 0, nothing for the others."""
+    """Two meters for frame 0, nothing for the others."""
 
     taken: PosedPoints
 

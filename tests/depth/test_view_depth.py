@@ -1,4 +1,4 @@
-"""Depth of one view by its neighbours, against analytic depth."""
+"""Depth of one view by its neighbors, against analytic depth."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_depth_maps_have_the_size_asked_for(size: int) -> None:
         [multi_view_stereo._shrunk(other, size) for other in others],
     )
     measured = measure_depth(small, sources, sources, 1.0, 6.0)
-    found, sigma = multi_view_stereo._metres(measured.inverse, measured.sigma)
+    found, sigma = multi_view_stereo._meters(measured.inverse, measured.sigma)
     assert found.shape == sigma.shape == (round(size * 0.75), size)
     there = found > 0
     assert (sigma[there] > 0).all()

@@ -107,7 +107,7 @@ def test_facets_are_as_round_as_the_angle_to_their_sphere_is() -> None:
     np.testing.assert_allclose(measure_roundness(regular, corners), 1.0 / 3.0)
     flat = np.array([[0, 0, 0.01], [1, 0, 0], [-0.5, 0.8, 0], [-0.5, -0.8, 0]], float)
     found = measure_roundness(flat, corners[:1])[0]
-    assert found[0] < -0.99  # the centre of its sphere lies far on the other side
+    assert found[0] < -0.99  # the center of its sphere lies far on the other side
 
 
 def _sphere(count: int) -> np.ndarray:
@@ -130,18 +130,18 @@ def _volume(surface: WatertightSurface) -> float:
 
 def test_a_sphere_seen_from_outside_is_closed() -> None:
     rng = np.random.default_rng(0)
-    ball, centres = _sphere(2000), 3.0 * _sphere(12)
-    sees = np.argwhere(np.einsum("pc,kc->pk", ball, centres) > 1.2)
+    ball, centers = _sphere(2000), 3.0 * _sphere(12)
+    sees = np.argwhere(np.einsum("pc,kc->pk", ball, centers) > 1.2)
     noisy = ball * (1.0 + 0.005 * rng.normal(size=(len(ball), 1)))
     points = ScanPoints(noisy, np.full(len(ball), 0.005), *sees.T.astype(np.int32), cell_m=0.02)
-    surface = build_surface(points, centres)
+    surface = build_surface(points, centers)
     assert _closed(surface)
     assert _volume(surface) == pytest.approx(4.0 / 3.0 * np.pi, rel=0.02)
-    met = surface.met(centres[0], -centres[:1][None] / 3.0)
+    met = surface.met(centers[0], -centers[:1][None] / 3.0)
     assert met.times[0, 0] == pytest.approx(2.0, abs=0.03)
     assert 0.02 < met.edge_m[0, 0] < 0.4
     assert met.sigma_m[0, 0] == pytest.approx(0.005)
-    assert surface.met(centres[0], centres[:1][None]).times[0, 0] == 0.0
+    assert surface.met(centers[0], centers[:1][None]).times[0, 0] == 0.0
 
 
 def test_a_blank_wall_of_a_room_is_closed_between_its_edges() -> None:
@@ -158,17 +158,17 @@ def test_a_blank_wall_of_a_room_is_closed_between_its_edges() -> None:
             walls.append(wall[rim < 0.3] if axis == 0 and at > 0 else wall)
     measured = np.concatenate(walls) + 0.004 * rng.normal(size=(sum(map(len, walls)), 3))
     wrong = rng.uniform(0.2, size - 0.2, (60, 3))
-    centres = rng.uniform(1.0, size - 1.0, (20, 3))
+    centers = rng.uniform(1.0, size - 1.0, (20, 3))
     point = np.repeat(np.arange(len(measured)), 5)
     rays = np.concatenate((point, len(measured) + np.arange(60))), rng.integers(0, 20, len(point) + 60)
     points = np.concatenate((measured, wrong))
     rays = (rays[0].astype(np.int32), rays[1].astype(np.int32))
-    surface = build_surface(ScanPoints(points, np.full(len(points), 0.004), *rays, cell_m=0.02), centres)
+    surface = build_surface(ScanPoints(points, np.full(len(points), 0.004), *rays, cell_m=0.02), centers)
     assert _closed(surface)
     assert -_volume(surface) == pytest.approx(size.prod(), rel=0.02)  # seen from inside
     across, up = np.meshgrid(np.linspace(0.4, 2.6, 23), np.linspace(0.4, 2.1, 18))
-    ways = np.stack((np.full(across.shape, 4.0), across, up), axis=-1) - centres[0]
-    met = surface.met(centres[0], ways)
+    ways = np.stack((np.full(across.shape, 4.0), across, up), axis=-1) - centers[0]
+    met = surface.met(centers[0], ways)
     assert np.median(np.abs(met.times - 1.0)) < 0.01
     assert (np.abs(met.times - 1.0) < 0.03).mean() > 0.95
     assert np.median(met.edge_m) > 0.5  # and known by its triangles to be a guess
@@ -187,9 +187,9 @@ def test_many_rays_do_not_overflow_the_solver() -> None:
 def test_points_of_a_grid_make_a_surface_too() -> None:
     """Flat tetrahedra, ways within planes of facets, and a camera at a point: divisions by zero."""
     grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    for centres in ([(2, 2, 9), (9, 3, 3), (3, 3, -4)], [(2.5, 2.5, 2.5), (1.5, 1, 2.5)], [(2, 2, 2), (1.5, 1, 2.5)]):
-        sees = np.indices((len(grid), len(centres))).reshape(2, -1).astype(np.int32)
-        surface = build_surface(ScanPoints(grid, np.full(len(grid), 0.01), *sees, cell_m=0.1), np.array(centres, float))
+    for centers in ([(2, 2, 9), (9, 3, 3), (3, 3, -4)], [(2.5, 2.5, 2.5), (1.5, 1, 2.5)], [(2, 2, 2), (1.5, 1, 2.5)]):
+        sees = np.indices((len(grid), len(centers))).reshape(2, -1).astype(np.int32)
+        surface = build_surface(ScanPoints(grid, np.full(len(grid), 0.01), *sees, cell_m=0.1), np.array(centers, float))
         edges = np.sort(np.concatenate([surface.triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
         assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()  # flat ones have no orientation
         assert len(edges) > 100
@@ -198,9 +198,9 @@ def test_points_of_a_grid_make_a_surface_too() -> None:
 
 def test_all_cameras_at_one_place_and_a_point_far_away_do_no_harm() -> None:
     ball = np.concatenate((_sphere(1000), [(1e4, -1e4, 1e4)]))
-    centres = np.array([(0.1, 0.0, 0.2)] * 4)
-    sees = np.indices((len(ball), len(centres))).reshape(2, -1).astype(np.int32)
-    surface = build_surface(ScanPoints(ball, np.full(len(ball), 0.005), *sees, cell_m=0.1), centres)
+    centers = np.array([(0.1, 0.0, 0.2)] * 4)
+    sees = np.indices((len(ball), len(centers))).reshape(2, -1).astype(np.int32)
+    surface = build_surface(ScanPoints(ball, np.full(len(ball), 0.005), *sees, cell_m=0.1), centers)
     assert _closed(surface)
-    met = surface.met(centres[0], _sphere(50)[None] - centres[0])
+    met = surface.met(centers[0], _sphere(50)[None] - centers[0])
     assert np.median(np.abs(met.times - 1.0)) < 0.01

@@ -30,7 +30,7 @@ class Corner(Capture):
         self.timestamps = np.arange(len(places), dtype=float)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return False
 
     def _rendered(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

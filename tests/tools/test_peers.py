@@ -41,7 +41,7 @@ class Wall(Capture):
         self.asked: list[int] = []
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return False
 
     def __getitem__(self, index: int) -> Frame:

@@ -23,13 +23,13 @@ def room():
     return open_capture("builtin:room", None, own)
 
 
-def small_pose(degrees: float = 1.0, metres: float = 0.02, seed: int = 0) -> np.ndarray:
+def small_pose(degrees: float = 1.0, meters: float = 0.02, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     axis *= np.deg2rad(degrees) / np.linalg.norm(axis)
     T = np.eye(4)
     T[:3, :3] = quats_to_rotations(np.array([1.0, *(0.5 * axis)]) / np.linalg.norm([1.0, *(0.5 * axis)]))
-    T[:3, 3] = rng.normal(size=3) * metres / np.sqrt(3)
+    T[:3, 3] = rng.normal(size=3) * meters / np.sqrt(3)
     return T
 
 
@@ -88,8 +88,8 @@ def test_the_pose_of_a_view_in_another_is_found(room, source, target) -> None:
     true = relative(room, source, target)
     a, b = prepare_alignment_view(room[source]), prepare_alignment_view(room[target])
     aligned = dense_alignment.align_views(a, b, small_pose() @ true)
-    metres, degrees = measure_pose_difference(true, aligned.T_target_source)
-    assert metres < 0.003
+    meters, degrees = measure_pose_difference(true, aligned.T_target_source)
+    assert meters < 0.003
     assert degrees < 0.1
     assert aligned.determined
     assert aligned.inliers > 0.9
@@ -102,8 +102,8 @@ def test_another_exposure_moves_nothing(room) -> None:
     b = prepare_alignment_view(room[12])
     plain = dense_alignment.align_views(prepare_alignment_view(room[13]), b, true)
     dark = dense_alignment.align_views(prepare_alignment_view(darker), b, true)
-    metres, degrees = measure_pose_difference(plain.T_target_source, dark.T_target_source)
-    assert metres < 5e-4
+    meters, degrees = measure_pose_difference(plain.T_target_source, dark.T_target_source)
+    assert meters < 5e-4
     assert degrees < 0.02
 
 
@@ -292,8 +292,8 @@ def test_features_find_a_pose_that_is_far_away(room) -> None:
     known = points[:, 2] > 0
     found = orb_features.estimate_pose(points[known], fb.rays(b.intrinsics)[rows[known, 1]], 1.0 / b.intrinsics.fx)
     assert found is not None
-    metres, degrees = measure_pose_difference(relative(room, 17, 12), found[0])
-    assert metres < 0.08
+    meters, degrees = measure_pose_difference(relative(room, 17, 12), found[0])
+    assert meters < 0.08
     assert degrees < 2
     aligned = dense_alignment.align_views(view_a, view_b, found[0])
     assert measure_pose_difference(relative(room, 17, 12), aligned.T_target_source)[0] < 0.005

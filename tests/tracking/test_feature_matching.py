@@ -101,8 +101,8 @@ def write_detector(path: Path, size: tuple[int, int] = (120, 160), described: st
         helper.make_node("Reshape", ["patches", "rows"], ["columns"]),
         helper.make_node("Gather", ["columns", "at"], ["gathered"], axis=1),
         helper.make_node("ReduceMean", ["gathered"], ["mean"], axes=[0], keepdims=1),
-        helper.make_node("Sub", ["gathered", "mean"], ["centred"]),
-        helper.make_node("Transpose", ["centred"], [described], perm=[1, 0]),
+        helper.make_node("Sub", ["gathered", "mean"], ["centered"]),
+        helper.make_node("Transpose", ["centered"], [described], perm=[1, 0]),
     ]
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 1, height, width])
     outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in ("keypoints", described)]

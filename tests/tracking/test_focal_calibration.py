@@ -1,4 +1,4 @@
-"""Whether colour and depth fit each other, asked of scans: one that is rendered right, one made wrong, real ones."""
+"""Whether color and depth fit each other, asked of scans: one that is rendered right, one made wrong, real ones."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def test_a_capture_that_fits_is_left_alone(room) -> None:
 
 @pytest.mark.parametrize("ratio", [0.9, 1.1])
 def test_a_wrong_focal_length_is_found(room, ratio) -> None:
-    """Colour seen as by a camera with 1 / ratio of the focal length has to be brought back by ratio."""
+    """Color seen as by a camera with 1 / ratio of the focal length has to be brought back by ratio."""
     wrong = Reregistered(room, 1 / ratio)
     found = estimate_color_focal(wrong, range(len(room)))
     assert found == pytest.approx(ratio, abs=0.015)
@@ -41,7 +41,7 @@ def test_too_little_to_tell_changes_nothing(tmp_path) -> None:
     assert estimate_color_focal(capture, range(5)) == 1.0
 
 
-def test_depth_poses_and_names_stay_and_colour_moves(room) -> None:
+def test_depth_poses_and_names_stay_and_color_moves(room) -> None:
     changed = Reregistered(room, 0.9)
     plain, moved = room[3], changed[3]
     np.testing.assert_array_equal(plain.depth_m, moved.depth_m)

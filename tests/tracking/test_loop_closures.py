@@ -31,7 +31,7 @@ def true(room) -> list:
     return [first @ room.pose(i) for i in FRAMES]
 
 
-def disturbed(poses, degrees: float, metres: float, seed: int = 0) -> list:
+def disturbed(poses, degrees: float, meters: float, seed: int = 0) -> list:
     """All but the first."""
     rng = np.random.default_rng(seed)
     out = [poses[0].copy()]
@@ -39,7 +39,7 @@ def disturbed(poses, degrees: float, metres: float, seed: int = 0) -> list:
         quat = np.array([1.0, *(0.5 * np.deg2rad(degrees) * rng.normal(size=3) / np.sqrt(3))])
         D = np.eye(4)
         D[:3, :3] = quats_to_rotations(quat / np.linalg.norm(quat))
-        D[:3, 3] = metres * rng.normal(size=3) / np.sqrt(3)
+        D[:3, 3] = meters * rng.normal(size=3) / np.sqrt(3)
         out.append(pose @ D)
     return out
 
@@ -60,9 +60,9 @@ def test_similar_places_are_told_from_others(views) -> None:
     alike = place_recognition.compare_histograms(histograms)
     np.testing.assert_allclose(np.diag(alike), 1.0, atol=1e-5)
     np.testing.assert_allclose(alike, alike.T, atol=1e-6)
-    neighbours = np.diag(alike, 1)
+    neighbors = np.diag(alike, 1)
     far = [alike[n, (n + len(views) // 2) % len(views)] for n in range(len(views))]
-    assert np.median(neighbours) > np.median(far) + 0.1
+    assert np.median(neighbors) > np.median(far) + 0.1
 
 
 def test_a_frame_without_features_is_like_none() -> None:
@@ -87,8 +87,8 @@ def test_the_way_round_a_room_is_closed(views, true) -> None:
     spans = {(edge.source, edge.target) for edge in found}
     assert any(a - b > count // 2 for a, b in spans), "the end sees the start again"
     for edge in found:
-        metres, degrees = measure_pose_difference(invert(true[edge.target]) @ true[edge.source], edge.T_target_source)
-        assert metres < 0.03
+        meters, degrees = measure_pose_difference(invert(true[edge.target]) @ true[edge.source], edge.T_target_source)
+        assert meters < 0.03
         assert degrees < 1.0
         assert edge.uncertain
 
@@ -110,8 +110,8 @@ def test_disturbed_poses_fall_into_place_together(views, true) -> None:
     start = disturbed(true, 1.0, 0.03)
     assert worst(start, true)[0] > 0.03
     refined = joint_refinement.refine_poses(views, start)
-    metres, degrees = worst(refined, true)
-    assert metres < 0.01
+    meters, degrees = worst(refined, true)
+    assert meters < 0.01
     assert degrees < 0.25
     np.testing.assert_allclose(refined[0], true[0], atol=1e-6)
     assert worst(start, true)[0] > 0.03, "the poses that were given are left alone"
@@ -122,7 +122,7 @@ def test_one_keyframe_needs_no_refinement(views, true) -> None:
 
 
 def test_each_keyframe_is_paired_with_a_bounded_number_of_others(views, true) -> None:
-    pairs = joint_refinement.find_overlapping_pairs(views, true, neighbours=3, least=0.35)
+    pairs = joint_refinement.find_overlapping_pairs(views, true, neighbors=3, least=0.35)
     assert {(n, n - 1) for n in range(1, len(views))} <= set(pairs)
     counts = np.bincount([source for source, _ in pairs])
     assert counts.max() <= 4
@@ -141,7 +141,7 @@ def motion(angle_deg: float, x: float) -> np.ndarray:
 
 
 def ring(count: int = 10) -> tuple[list, list]:
-    """Keyframes on a circle, and the odometry between neighbours, without error."""
+    """Keyframes on a circle, and the odometry between neighbors, without error."""
     true = [motion(36 * k, 0.0) @ motion(0, 1.0) for k in range(count)]
     information = np.diag([1e4] * 6)
     edges = [Edge(k, k - 1, invert(true[k - 1]) @ true[k], information, uncertain=False) for k in range(1, count)]

@@ -16,11 +16,11 @@ def tracker(**options) -> odometry.OdometryTracker:
 
 
 @pytest.mark.parametrize(
-    ("capture", "step", "centimetres", "degrees"),
-    # The kitchen's colour and depth are only roughly registered, and its own poses uncertain by a centimetre.
+    ("capture", "step", "centimeters", "degrees"),
+    # The kitchen's color and depth are only roughly registered, and its own poses uncertain by a centimeter.
     [("7scenes-kitchen", 3, 10.0, 3.0), ("house/bedroom", 2, 2.0, 0.7)],
 )
-def test_a_scan_is_followed_without_its_poses(capture, step, centimetres, degrees) -> None:
+def test_a_scan_is_followed_without_its_poses(capture, step, centimeters, degrees) -> None:
     scan = open_capture(data_folder() / capture)
     indices = range(0, 30 * step, step)
     t = tracker()
@@ -34,7 +34,7 @@ def test_a_scan_is_followed_without_its_poses(capture, step, centimetres, degree
     first = np.linalg.inv(scan.pose(0))
     for i in indices:
         error = invert(first @ scan.pose(i)) @ trajectory.T_world_cam[i]
-        assert 100 * np.linalg.norm(error[:3, 3]) < centimetres
+        assert 100 * np.linalg.norm(error[:3, 3]) < centimeters
         assert np.degrees(np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))) < degrees
 
 

@@ -32,7 +32,7 @@ def follow(frames, t: rgbd.RgbdTracker | None = None) -> tuple[rgbd.RgbdTracker,
 
 
 def worst(trajectory: Trajectory, capture, indices, gaps: bool = True) -> tuple[float, float]:
-    """Largest error in metres and degrees of the frames with a pose, relative to the first of them.
+    """Largest error in meters and degrees of the frames with a pose, relative to the first of them.
 
     gaps: those that were interpolated as well."""
     rows = np.flatnonzero(trajectory.has_pose if gaps else trajectory.has_pose & (trajectory.status != "interpolated"))
@@ -54,11 +54,11 @@ def kitchen():
 
 
 @pytest.mark.parametrize(
-    ("name", "step", "centimetres", "degrees"),
-    # The kitchen's colour and depth are only roughly registered, and its own poses uncertain by a centimetre.
+    ("name", "step", "centimeters", "degrees"),
+    # The kitchen's color and depth are only roughly registered, and its own poses uncertain by a centimeter.
     [("7scenes-kitchen", 3, 8.0, 3.0), ("house/bedroom", 2, 0.5, 0.2)],
 )
-def test_a_scan_is_followed_without_its_poses(name, step, centimetres, degrees) -> None:
+def test_a_scan_is_followed_without_its_poses(name, step, centimeters, degrees) -> None:
     capture = open_capture(data_folder() / name)
     indices = range(0, 30 * step, step)
     t, trajectory = follow(capture[i] for i in indices)
@@ -67,8 +67,8 @@ def test_a_scan_is_followed_without_its_poses(name, step, centimetres, degrees) 
     assert len(trajectory.keyframes) >= 2
     assert len(t.submaps()) == 1
     np.testing.assert_allclose(trajectory.T_world_cam[0], np.eye(4), atol=1e-6)
-    metres, turned = worst(trajectory, capture, indices)
-    assert 100 * metres < centimetres
+    meters, turned = worst(trajectory, capture, indices)
+    assert 100 * meters < centimeters
     assert turned < degrees
     assert (trajectory.confidence > 0.3).all()
 
@@ -98,8 +98,8 @@ def test_altered_captures_are_followed_too(bedroom, name) -> None:
     indices, change = ALTERED[name]
     _, trajectory = follow(change(n, bedroom[i]) for n, i in enumerate(indices))
     assert trajectory.has_pose.all()
-    metres, degrees = worst(trajectory, bedroom, indices)
-    assert metres < 0.012
+    meters, degrees = worst(trajectory, bedroom, indices)
+    assert meters < 0.012
     assert degrees < 0.3
 
 
@@ -221,7 +221,7 @@ def test_a_restored_tracker_goes_on_as_if_nothing_had_happened(kitchen) -> None:
     assert len(rest.edges) == len(whole.edges)
 
 
-def test_optimising_twice_moves_nothing(bedroom) -> None:
+def test_optimizing_twice_moves_nothing(bedroom) -> None:
     t, once = follow(bedroom[i] for i in range(0, 90, 6))
     t.optimize()
     again = t.trajectory(np.arange(15.0))

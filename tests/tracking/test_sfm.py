@@ -28,12 +28,12 @@ def reconstruction() -> Reconstruction:
 def test_the_median_depth_is_two_unless_the_scale_is_known() -> None:
     found = reconstruction()
     np.testing.assert_allclose(found.depths(), [5, 5, 5, 7])
-    normal = found.normalised()
+    normal = found.normalized()
     assert np.median(normal.depths()) == pytest.approx(2.0)
     np.testing.assert_allclose(normal.T_world_cam[2, :3, 3], [0.4, 0, 0])
     np.testing.assert_array_equal(normal.has_pose, [True, False, True])
     metric = replace(found, metric=True)
-    assert metric.normalised() is metric
+    assert metric.normalized() is metric
 
 
 def test_a_file_gives_back_what_was_saved(tmp_path: Path) -> None:

@@ -190,7 +190,7 @@ def tracked(found: Reconstruction, folder: Path, **options: Any) -> ColmapTracke
     return tracker
 
 
-def two_metres_deep(tracker: ColmapTracker, index: int) -> Frame:
+def two_meters_deep(tracker: ColmapTracker, index: int) -> Frame:
     """The frame as it is tracked, with the depth that a depth source may have given it."""
     frame = tracker.prepare_frame(tracker._capture[index])
     depth = 2.0 if np.isfinite(tracker.T_world_cam[index]).all() else 0.0
@@ -208,14 +208,14 @@ def test_the_tracker_gives_poses_points_and_what_became_of_frames(
     altered = replace(found, T_world_cam=T, apart=apart, chosen=chosen)
     tracker = tracked(altered, tmp_path)
     for index in range(8):
-        frame = two_metres_deep(tracker, index)
+        frame = two_meters_deep(tracker, index)
         assert frame.intrinsics == found.rectified.intrinsics
         tracker.track(frame)
     state = tracker.state()
     later = tracked(altered, tmp_path)
-    later.restore(state, [two_metres_deep(later, int(i)) for i in state["keyframe_index"]])
+    later.restore(state, [two_meters_deep(later, int(i)) for i in state["keyframe_index"]])
     for index in range(8, 16):
-        later.track(two_metres_deep(later, index))
+        later.track(two_meters_deep(later, index))
     trajectory = later.trajectory(later._capture.timestamps)
     assert trajectory.status[0] == "keyframe"
     assert trajectory.status[3] == "unused"

@@ -19,7 +19,7 @@ REQUIRES: tuple[str, ...] = ("pycolmap",)
 class Reader(PosedImages):
     """The registered images, in the natural order of their names. There is no depth.
 
-    The model's unit is arbitrary: ``capture.scale`` says how many metres it is; without it, the model is scaled such
+    The model's unit is arbitrary: ``capture.scale`` says how many meters it is; without it, the model is scaled such
     that the sparse points have a median depth of ``NOMINAL_DEPTH``. Raises CaptureError: a damaged model, a camera that
     cannot be undistorted.
     """
@@ -46,6 +46,6 @@ class Reader(PosedImages):
         self.metric_poses = options.scale is not None
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         names_images = colmap_folder(path) is not None and (path / "images").is_dir()
         return names_images and not (path / "transforms.json").is_file()

@@ -33,10 +33,10 @@ _WITH_ALL_COEFFICIENTS = (*PINHOLE_MODELS, *BROWN_MODELS)
 
 class Reader(PosedImages):
     """Frames are in the natural order of their files' names. Intrinsics stand in the file or in each frame, with the
-    origin at the corner of the first pixel; poses are of OpenGL cameras; depth is 16-bit millimetres, of any size.
+    origin at the corner of the first pixel; poses are of OpenGL cameras; depth is 16-bit millimeters, of any size.
 
-    Poses that come with depth are in metres, whether it is read or not; others are in the file's unit, of which
-    ``capture.scale`` says how many metres it is; without it, the file's points, if it has any, are scaled to a median
+    Poses that come with depth are in meters, whether it is read or not; others are in the file's unit, of which
+    ``capture.scale`` says how many meters it is; without it, the file's points, if it has any, are scaled to a median
     depth of ``NOMINAL_DEPTH``. Raises CaptureError, naming the file, for what it lacks.
     """
 
@@ -64,7 +64,7 @@ class Reader(PosedImages):
         self.metric_poses = comes_with_depth or options.scale is not None
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return (path / TRANSFORMS).is_file()
 
 

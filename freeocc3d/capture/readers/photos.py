@@ -86,7 +86,7 @@ class Reader(Capture):
         self.timestamps = _times(headers)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         found = list_images(path)
         return bool(found or _unreadable(path)) and not any("depth" in image.name.lower() for image in found)
 

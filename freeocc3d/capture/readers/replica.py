@@ -31,12 +31,12 @@ COLOR = r"frame(\d+)\.(?:png|jpe?g)"
 DEPTH = r"depth(\d+)\.png"
 CLASSES = r"semantic_class_(\d+)\.png"
 
-UNITS_PER_METRE = 6553.5
+UNITS_PER_METER = 6553.5
 """Of the published Replica renderings; where cam_params.json states ``scale``, that is used."""
 
 
 class Reader(ImagePairs):
-    """Depth is stored / ``scale`` metres. ``cam_params.json`` lies in the folder or, as in NICE-SLAM's package, beside
+    """Depth is stored / ``scale`` meters. ``cam_params.json`` lies in the folder or, as in NICE-SLAM's package, beside
     it. Poses are the lines of ``traj.txt``, row-major camera-to-world in OpenCV axes; it is optional and not opened
     before a pose is asked for. Class images are optional: ``semantic_class/semantic_class_N.png`` hold indices into the
     names of ``classes.json``."""
@@ -47,15 +47,15 @@ class Reader(ImagePairs):
     def __init__(self, path: Path, options: Options):
         results = path / "results"
         pairs = pair_files(list_numbered(results, COLOR), list_numbered(results, DEPTH), results, options)
-        calibration, units_per_metre = _parameters(path, options)
+        calibration, units_per_meter = _parameters(path, options)
         camera = calibration.camera(pairs.color_size) if calibration else guess_camera(pairs.color_size)
         grid = PixelGrid(camera, rescale_camera(camera, pairs.depth_size))
-        super().__init__(path, options, pairs, grid, units_per_metre)
+        super().__init__(path, options, pairs, grid, units_per_meter)
         self.intrinsics_known = self.focal_stated = calibration is not None
         self.classes = capture_class_names(path)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return has_file(path / "results", COLOR)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
@@ -91,7 +91,7 @@ class Reader(ImagePairs):
 
 
 def _parameters(path: Path, options: Options) -> tuple[Calibration | None, float]:
-    """Colour camera, None if it is unknown and depth is not read, and depth units per metre. Raises CaptureError."""
+    """Color camera, None if it is unknown and depth is not read, and depth units per meter. Raises CaptureError."""
     override = read_given_calibration(options)
     file = next((f for f in (path / "cam_params.json", path.parent / "cam_params.json") if f.is_file()), None)
     if file is None:
@@ -100,15 +100,15 @@ def _parameters(path: Path, options: Options) -> tuple[Calibration | None, float
                 f"There is no cam_params.json in {path} or beside it: add it, or give capture.intrinsics "
                 "(and capture.depth_scale)."
             )
-        return override, UNITS_PER_METRE
+        return override, UNITS_PER_METER
     camera = read_json(file).get("camera", {})
     try:
         fx, fy, cx, cy, width, height = (float(camera[key]) for key in ("fx", "fy", "cx", "cy", "w", "h"))
-        units_per_metre = float(camera.get("scale", UNITS_PER_METRE))
+        units_per_meter = float(camera.get("scale", UNITS_PER_METER))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CaptureError(f'{file} must hold {{"camera": {{w, h, fx, fy, cx, cy, scale}}}}, all numbers.') from error
-    if not (math.isfinite(units_per_metre) and units_per_metre > 0):
-        raise CaptureError(f"{file}: scale must be a positive number of depth units per metre, not {units_per_metre}.")
+    if not (math.isfinite(units_per_meter) and units_per_meter > 0):
+        raise CaptureError(f"{file}: scale must be a positive number of depth units per meter, not {units_per_meter}.")
     if not (math.isfinite(width) and math.isfinite(height)):
         raise CaptureError(f"{file}: w and h must be numbers of pixels.")
-    return override or Calibration((fx, fy, cx, cy), (int(width), int(height)), str(file)), units_per_metre
+    return override or Calibration((fx, fy, cx, cy), (int(width), int(height)), str(file)), units_per_meter

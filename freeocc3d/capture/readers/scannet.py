@@ -37,18 +37,18 @@ POSE = rf"{NUMBER}\.txt"
 COLOR_CAMERA = ("intrinsic/intrinsic_color.txt", "intrinsic_color.txt")
 DEPTH_CAMERA = ("intrinsic/intrinsic_depth.txt", "intrinsic_depth.txt")
 ONE_CAMERA = ("intrinsic/intrinsic.txt", "intrinsic.txt", "intrinsic.json", "camera_intrinsic.json")
-"""Where recorders put the camera if colour and depth share it; the JSON files are Open3D's."""
+"""Where recorders put the camera if color and depth share it; the JSON files are Open3D's."""
 
 
 class Reader(ImagePairs):
-    """Depth is uint16 millimetres. Numbers are not zero-padded and sort as numbers. ``pose/`` is optional, camera-to-
+    """Depth is uint16 millimeters. Numbers are not zero-padded and sort as numbers. ``pose/`` is optional, camera-to-
     world; a pose of -inf is none.
 
-    The colour and depth cameras are in ``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` (4 x 4 or 3 x 3);
+    The color and depth cameras are in ``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` (4 x 4 or 3 x 3);
     a file that is missing is derived from the other where both images have the same aspect ratio.
     ``extrinsic_color.txt`` and ``extrinsic_depth.txt`` beside them map a camera to the rig; where they differ, depth is
-    moved to the colour camera, otherwise colour is resampled to the depth's pixels (see ``registration``). With
-    ``capture.depth=false`` colour is left as it is.
+    moved to the color camera, otherwise color is resampled to the depth's pixels (see ``registration``). With
+    ``capture.depth=false`` color is left as it is.
 
     With a ``classes.json`` in the folder, ``label-filt/N.png`` are class images that hold indices into its names.
     """
@@ -60,11 +60,11 @@ class Reader(ImagePairs):
         pairs = pair_files(list_numbered(path / "color", COLOR), list_numbered(path / "depth", IMAGE), path, options)
         grid, self.intrinsics_known = _grid(path, options, pairs)
         self.focal_stated = self.intrinsics_known
-        super().__init__(path, options, pairs, grid, units_per_metre=1000.0)
+        super().__init__(path, options, pairs, grid, units_per_meter=1000.0)
         self.classes = capture_class_names(path)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return has_file(path / "color", COLOR)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
@@ -84,7 +84,7 @@ class Reader(ImagePairs):
 
 
 def _grid(path: Path, options: Options, pairs: Pairs) -> tuple[PixelGrid, bool]:
-    """The frames' pixel grid, and whether anything says what the colour camera is. Raises CaptureError."""
+    """The frames' pixel grid, and whether anything says what the color camera is. Raises CaptureError."""
     if options.depth:
         color, depth = _cameras(path, options, pairs)
         return PixelGrid(color, depth, _T_color_depth(path)), True
@@ -95,7 +95,7 @@ def _grid(path: Path, options: Options, pairs: Pairs) -> tuple[PixelGrid, bool]:
 
 
 def _cameras(path: Path, options: Options, pairs: Pairs) -> tuple[Intrinsics, Intrinsics]:
-    """The colour and the depth camera. Raises CaptureError if nothing states either."""
+    """The color and the depth camera. Raises CaptureError if nothing states either."""
     color_file, depth_file = _first(path, (*COLOR_CAMERA, *ONE_CAMERA)), _first(path, DEPTH_CAMERA)
     color = read_given_calibration(options) or (read_intrinsics(color_file) if color_file else None)
     depth = read_intrinsics(depth_file) if depth_file else None
@@ -110,7 +110,7 @@ def _cameras(path: Path, options: Options, pairs: Pairs) -> tuple[Intrinsics, In
 
 
 def _T_color_depth(path: Path) -> NDArray[np.float64] | None:
-    """Depth to colour camera frame, or None where no extrinsics are given and the two coincide."""
+    """Depth to color camera frame, or None where no extrinsics are given and the two coincide."""
     color, depth = (
         _first(path, (f"intrinsic/extrinsic_{camera}.txt", f"extrinsic_{camera}.txt")) for camera in ("color", "depth")
     )

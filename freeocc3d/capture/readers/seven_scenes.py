@@ -23,7 +23,7 @@ KINECT = Calibration((585.0, 585.0, 320.0, 240.0), (640, 480), "the Kinect calib
 
 
 class Reader(ImagePairs):
-    """Depth is uint16 millimetres, 0 and 65535 invalid, and as large as colour. Both have the same intrinsics: the data
+    """Depth is uint16 millimeters, 0 and 65535 invalid, and as large as color. Both have the same intrinsics: the data
     set registers them only roughly and says no more: they are the depth camera's, so that without depth they are only
     a guess. Poses are camera-to-world and optional."""
 
@@ -36,11 +36,11 @@ class Reader(ImagePairs):
         calibration = read_given_calibration(options) or (read_intrinsics(stated) if stated.is_file() else KINECT)
         camera = calibration.camera(pairs.color_size)
         grid = PixelGrid(camera, rescale_camera(camera, pairs.depth_size))
-        super().__init__(path, options, pairs, grid, units_per_metre=1000.0)
+        super().__init__(path, options, pairs, grid, units_per_meter=1000.0)
         self.intrinsics_known = options.depth or options.intrinsics is not None
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return has_file(path, COLOR)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:

@@ -53,7 +53,7 @@ class _View:
     """What each pixel of a frame sees, exactly.
 
     depth_m: (H, W), 0 = nothing.  triangle: (H, W) row in the room's arrays, -1 = nothing.
-    points: (H, W, 3) world, metres.  cosine: (H, W) of the angle of incidence, 0…1.
+    points: (H, W, 3) world, meters.  cosine: (H, W) of the angle of incidence, 0…1.
     """
 
     depth_m: NDArray[np.float32]
@@ -87,7 +87,7 @@ class Reader(base.Capture):
         self._lock = threading.Lock()
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return False  # it is named, never found
 
     def __getitem__(self, index: int) -> Frame:
@@ -113,7 +113,7 @@ class Reader(base.Capture):
         return np.where(triangle >= 0, self._room.object_ids[triangle], np.int32(-1))
 
     def exact_depth(self, index: int) -> NDArray[np.float32]:
-        """(H, W) metres, without noise or limit of range; 0 where nothing is hit."""
+        """(H, W) meters, without noise or limit of range; 0 where nothing is hit."""
         return self._view(index).depth_m
 
     @property
@@ -126,13 +126,13 @@ class Reader(base.Capture):
         supplement, "Benchmark Details": every second frame, majority vote per voxel).
 
         A voxel is occupied if seen surface lies in it, with the class of most of that; free if no surface lies in it
-        and its centre is seen before what the depth images end at; all else, such as the inside of a cupboard, is
+        and its center is seen before what the depth images end at; all else, such as the inside of a cupboard, is
         unknown. Returns labels (X, Y, Z) uint8 (0 free, k class, 255 unknown), origin (3,) lower corner of voxel
-        (0, 0, 0) in metres, voxel_size, classes: the keys of the captures' ``ground_truth.npz``. Memory grows with
+        (0, 0, 0) in meters, voxel_size, classes: the keys of the captures' ``ground_truth.npz``. Memory grows with
         1 / voxel_size³: 2 cm takes about a gigabyte.
         """
         points, normals, classes = self._surface(voxel_size / 6)
-        # Walls and furniture stand on whole centimetres: shifted like this, none lies on a face between two voxels.
+        # Walls and furniture stand on whole centimeters: shifted like this, none lies on a face between two voxels.
         origin = points.min(axis=0).astype(np.float64) - 0.37 * voxel_size
         voxels = np.floor((points - origin) / voxel_size).astype(np.int32)
         shape = tuple(int(n) for n in voxels.max(axis=0) + 1)
@@ -250,7 +250,7 @@ def camera_on_the_walk(phase: float) -> NDArray[np.float64]:
 def disturbed_depth(
     depth_m: NDArray[np.float32], cosine: NDArray[np.float32], rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """(H, W) exact depth as a sensor gives it: jagged at edges, with axial noise, whole millimetres, and holes (0) at
+    """(H, W) exact depth as a sensor gives it: jagged at edges, with axial noise, whole millimeters, and holes (0) at
     edges, at grazing incidence and nearer than 0.3 m. cosine: (H, W) of the angle of incidence."""
     height, width = depth_m.shape
     shift = rng.integers(-1, 2, (2, height, width)) * (rng.random((2, height, width), np.float32) < 0.2)
@@ -265,7 +265,7 @@ def disturbed_depth(
 
 
 def _disturbed_color(color: NDArray[np.uint8], index: int, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Noise of two grey levels, and an exposure that changes slowly by 4 %."""
+    """Noise of two gray levels, and an exposure that changes slowly by 4 %."""
     exposure = np.float32(1.0 + 0.04 * math.sin(0.05 * index))
     noisy = color * exposure + 2.0 * rng.standard_normal(color.shape, np.float32)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)

@@ -57,7 +57,7 @@ class Reader(Capture):
         self.intrinsics: Intrinsics = reduce_camera(camera, options.max_size)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def recognizes(cls, path: Path) -> bool:
         return path.is_file()
 
     def __getitem__(self, index: int) -> Frame:
@@ -98,7 +98,7 @@ class _Decoder:
 
     @property
     def focal_35mm(self) -> float:
-        """Focal length in millimetres of a 35 mm camera with the same view; 0 where nothing states it."""
+        """Focal length in millimeters of a 35 mm camera with the same view; 0 where nothing states it."""
         tags = {**self._container.metadata, **self._stream.metadata}
         stated = (value for name, value in tags.items() if name.lower().endswith(FOCAL_35MM))
         try:

@@ -23,15 +23,15 @@ WIDTH = 160
 """Views are about this wide."""
 
 _LEVELS = 3
-_WINDOW = 6  # full-size pixels on each side of a pixel's centre in which its plane is fitted, at 640 pixels' width
+_WINDOW = 6  # full-size pixels on each side of a pixel's center in which its plane is fitted, at 640 pixels' width
 
 
 @dataclass(frozen=True)
 class AlignmentView:
     """A frame as the alignment needs it.
 
-    intrinsics: of the (h, w) images.  points: (h, w, 3) float32, camera frame, metres; 0 where there is no surface.
-    normals: (h, w, 3) float32 unit.  sigma_m: (h, w) float32 standard deviations of the depth, metres, or
+    intrinsics: of the (h, w) images.  points: (h, w, 3) float32, camera frame, meters; 0 where there is no surface.
+    normals: (h, w, 3) float32 unit.  sigma_m: (h, w) float32 standard deviations of the depth, meters, or
     ``NOT_STATED``.  gray: intensities 0…1, float32, at full, half and quarter size.
     """
 
@@ -93,7 +93,7 @@ def fit_planes(
     depth_m: NDArray[np.float32], step: int, window: int, fx: float, fy: float, cx: float, cy: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Points and normals (h, w, 3) of planes 1/z = a + b (u - u0) + c (v - v0) fitted around every ``step``-th pixel's
-    centre (u0, v0) to the depths within ``window`` pixels that belong to one surface; 0 where there are too few."""
+    center (u0, v0) to the depths within ``window`` pixels that belong to one surface; 0 where there are too few."""
     H, W = depth_m.shape
     h, w = H // step, W // step
     points = np.zeros((h, w, 3), np.float32)

@@ -25,7 +25,7 @@ from .alignment_views import AlignmentView
 from .dense_residuals import NormalEquations, Surface, Weighting, linearize, make_equations
 
 PHOTOMETRIC = 0.2
-"""Weight of the intensities: neighbouring ones are far from independent."""
+"""Weight of the intensities: neighboring ones are far from independent."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ViewAlignment:
 
 
 ARM_M = 2.0
-"""A turn by one radian moves what is seen by this many metres: compares turns with shifts."""
+"""A turn by one radian moves what is seen by this many meters: compares turns with shifts."""
 
 NORMALS_NOISE = 1e-3
 """Share of the largest eigenvalue that noisy normals contribute to any: normals off by 0.03 do, squared."""
@@ -59,20 +59,20 @@ COMPARED = 0.15
 """Share of what is in view that must meet a surface, not a hole."""
 
 FIRST_SPREADS = (6.0, 10.0)
-"""s of depth and of intensities before any residual is known: a guess is off by a few centimetres."""
+"""s of depth and of intensities before any residual is known: a guess is off by a few centimeters."""
 
 LEAST_MET = 30
 """Source pixels that must meet the target's surface for a step, five for each unknown of the pose."""
 
 DAMPING = (1e-6, 1.0)
-"""What is added to the diagonal of the normal equations: this share of it and this much, in 1 / m^2 a metre's
+"""What is added to the diagonal of the normal equations: this share of it and this much, in 1 / m^2 a meter's
 information. It only keeps what is not determined from moving."""
 
 BRIGHTNESS_DAMPING = 1e-9
 """What is added to the information of gain and offset: they stay where no intensity was compared."""
 
 STILL = 2e-4
-"""Radians and metres: a step that is smaller ends a level."""
+"""Radians and meters: a step that is smaller ends a level."""
 
 _SMALL_ANGLE = 1e-7  # radians: below it sin(x) / x and its like are their limits, to rounding
 _TINY = 1e-12  # keeps eigenvalues of exactly 0 from dividing

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ...core.depth_noise import look_up_sigma
 
 NEAREST_M = 0.1
-"""Metres in front of the target's camera that a point must at least be: below it projection is unstable."""
+"""Meters in front of the target's camera that a point must at least be: below it projection is unstable."""
 
 GEMAN_MCCLURE = 2.4
 """Spreads at which a residual's weight has fallen to a quarter. Near the 2.385 at which Cauchy's weight, whose square
@@ -61,8 +61,8 @@ _POSE = 6
 class Surface(NamedTuple):
     """What the residuals see of a view.
 
-    points: (h, w, 3) camera frame, metres; z = 0 where there is none.  normals: (h, w, 3) unit.  sigma_m: (h, w)
-    standard deviations of the points' depth, metres, or ``depth_noise.NOT_STATED``.  gray: intensities 0…1 of the same
+    points: (h, w, 3) camera frame, meters; z = 0 where there is none.  normals: (h, w, 3) unit.  sigma_m: (h, w)
+    standard deviations of the points' depth, meters, or ``depth_noise.NOT_STATED``.  gray: intensities 0…1 of the same
     view, its size times a power of two smaller.
     """
 

@@ -1,8 +1,8 @@
-"""Whether colour and depth have the same focal length, asked of the scan itself.
+"""Whether color and depth have the same focal length, asked of the scan itself.
 
-Some sensors are calibrated only roughly: the depth image lies on the colour image, but one is larger than the other.
+Some sensors are calibrated only roughly: the depth image lies on the color image, but one is larger than the other.
 Depth alone gives the motion between two frames; features lifted by depth and moved by it land where they are matched
-only if the colour camera's focal length is right. Of a scan of focal lengths the one with the least reprojection error
+only if the color camera's focal length is right. Of a scan of focal lengths the one with the least reprojection error
 is taken, if it stands out; else nothing is changed.
 """
 
@@ -32,7 +32,7 @@ _FAR_PX = 3.0  # an error from which on a match counts as wrong
 
 
 def estimate_color_focal(capture: Capture, frames: range) -> float:
-    """Focal length of the colour camera over that of the depth camera; 1 where the scan does not clearly say otherwise.
+    """Focal length of the color camera over that of the depth camera; 1 where the scan does not clearly say otherwise.
 
     frames: those of the capture that are used. No poses are read.
     """
@@ -78,7 +78,7 @@ def _pair(capture: Capture, frames: range) -> _Pair | None:
 
 
 def _error(pairs: list[_Pair], ratio: float) -> float:
-    """Mean of a saturating reprojection error, 0…1, at a focal length of the colour camera."""
+    """Mean of a saturating reprojection error, 0…1, at a focal length of the color camera."""
     total, count = 0.0, 0
     for source, target, T, rows in pairs:
         camera = replace(source.camera, fx=source.camera.fx * ratio, fy=source.camera.fy * ratio)

@@ -28,7 +28,7 @@ from . import dense_alignment, orb_features
 from .dense_residuals import Weighting, linearize, make_equations
 from .keyframe_registration import FeatureMatches, KeyframeView, match_keyframes
 
-_STRIDE = 2  # source pixels that are skipped: neighbouring ones say nearly the same
+_STRIDE = 2  # source pixels that are skipped: neighboring ones say nearly the same
 _LEAST_SHARE, _LEAST_CORRELATION = 0.5, 0.5
 _STILL, _FAR_M = 5e-5, 0.02  # a step that moves nothing any more, and one after which other pairs may overlap
 _PRIOR = 1.0  # information that holds a keyframe which no pair holds
@@ -52,14 +52,14 @@ class _Pair:
 def refine_poses(
     keyframes: Sequence[KeyframeView],
     poses: Sequence[NDArray[np.float64]],
-    neighbours: int = 10,
+    neighbors: int = 10,
     least_overlap: float = 0.35,
     rounds: int = 2,
     iterations: int = 5,
 ) -> list[NDArray[np.float64]]:
     """T_world_keyframe of K keyframes, refined; the first keeps its pose.
 
-    neighbours: earlier keyframes that each is paired with, those that share most of its view.  rounds: how often pairs
+    neighbors: earlier keyframes that each is paired with, those that share most of its view.  rounds: how often pairs
     are chosen at most; anew only if keyframes moved far since.
     """
     T = [np.array(pose) for pose in poses]
@@ -69,7 +69,7 @@ def refine_poses(
     with ThreadPoolExecutor(count_threads()) as pool:
         for _ in range(rounds):
             before = np.stack(T)
-            chosen = find_overlapping_pairs(keyframes, T, neighbours, least_overlap)
+            chosen = find_overlapping_pairs(keyframes, T, neighbors, least_overlap)
             new = [pair for pair in chosen if pair not in made]
             matches = pool.map(lambda pair: match_keyframes(keyframes[pair[0]], keyframes[pair[1]]), new)
             made.update({pair: _Pair(*pair, found) for pair, found in zip(new, matches, strict=True)})
@@ -88,19 +88,19 @@ def refine_poses(
 
 
 def find_overlapping_pairs(
-    keyframes: Sequence[KeyframeView], T: Sequence[NDArray[np.float64]], neighbours: int, least: float
+    keyframes: Sequence[KeyframeView], T: Sequence[NDArray[np.float64]], neighbors: int, least: float
 ) -> list[tuple[int, int]]:
     """(source, target) of the keyframes that share most of their views; each is paired with the one before it."""
     pairs = set()
     centers = np.stack([_seen(keyframe, pose) for keyframe, pose in zip(keyframes, T, strict=True)])
     for n in range(1, len(T)):
         # The middles of what two cameras see are near where their views overlap: measure only these.
-        near = np.argsort(np.linalg.norm(centers[:n] - centers[n], axis=1), kind="stable")[: 4 * neighbours]
+        near = np.argsort(np.linalg.norm(centers[:n] - centers[n], axis=1), kind="stable")[: 4 * neighbors]
         T_n_world = invert(T[n])
         shared = [
             (measure_mutual_overlap(keyframes[m].overlap, keyframes[n].overlap, T_n_world @ T[m]), int(m)) for m in near
         ]
-        pairs |= {(n, m) for share, m in sorted(shared, reverse=True)[:neighbours] if share >= least}
+        pairs |= {(n, m) for share, m in sorted(shared, reverse=True)[:neighbors] if share >= least}
         pairs.add((n, n - 1))
     return sorted(pairs)
 
@@ -127,7 +127,7 @@ def _terms(
     correlation = dense_alignment.compute_correlation(stats)
     if few or dense_alignment.compute_inlier_share(stats) < _LEAST_SHARE or correlation < _LEAST_CORRELATION:
         return None
-    # Intensities that agree less well (colour that lies beside its depth, reflections) say less of the pose.
+    # Intensities that agree less well (color that lies beside its depth, reflections) say less of the pose.
     if not np.isnan(correlation):  # flat ones say nothing, at any weight
         agreement = (correlation - _LEAST_CORRELATION) / (1 - _LEAST_CORRELATION)
         pair.weighting = pair.weighting._replace(photometric=dense_alignment.PHOTOMETRIC * agreement**_AGREEMENT_POWER)

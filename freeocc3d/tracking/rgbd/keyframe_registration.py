@@ -20,7 +20,7 @@ _OVERLAP_STEP = 5
 @dataclass(frozen=True)
 class KeyframeView:
     """view: for dense alignment.  overlap: its surface, sparsely.  features: ORB.  rays: (N, 2) of the features.
-    points: (N, 3) where they meet the surface, z = 0 where there is none.  camera: of the colour image."""
+    points: (N, 3) where they meet the surface, z = 0 where there is none.  camera: of the color image."""
 
     view: AlignmentView
     overlap: DepthView

@@ -2,7 +2,7 @@
 
 A closure has to pass four tests, for one wrong closure can bend a whole map: enough features agree on one pose; dense
 alignment from there finds the surfaces on each other and the intensities alike; it stays where the features were; and a
-neighbour of one of the two, moved along, falls into place on the other as well.
+neighbor of one of the two, moved along, falls into place on the other as well.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def find_closures(
 def _candidates(
     keyframes: Sequence[KeyframeView], submap: Sequence[int], pool: ThreadPoolExecutor
 ) -> list[tuple[int, int]]:
-    """(later, earlier) rows that look alike and are not neighbours on the path anyway."""
+    """(later, earlier) rows that look alike and are not neighbors on the path anyway."""
     described = [keyframe.features.descriptors for keyframe in keyframes]
     if sum(map(len, described)) < _FEATURES * 2:
         return []
@@ -92,7 +92,7 @@ def verify_closure(
         return _falls_into_place(aligned) and _near(guess, aligned.T_target_source)
 
     def beside(row: int) -> list[int]:
-        """Its neighbours on the path."""
+        """Its neighbors on the path."""
         return [n for n in (row - 1, row + 1) if 0 <= n < len(keyframes) and submap[n] == submap[row]]
 
     pairs = [*((n, target) for n in beside(source)), *((source, n) for n in beside(target))]
@@ -111,5 +111,5 @@ def _falls_into_place(aligned: dense_alignment.ViewAlignment) -> bool:
 
 
 def _near(T_a: NDArray[np.float64], T_b: NDArray[np.float64]) -> bool:
-    metres, degrees = measure_pose_difference(T_a, T_b)
-    return metres <= _NEAR_M and degrees <= _NEAR_DEG
+    meters, degrees = measure_pose_difference(T_a, T_b)
+    return meters <= _NEAR_M and degrees <= _NEAR_DEG

@@ -24,13 +24,13 @@ _FARTHEST_PX, _AGREES_PX = 12.0, 4.0
 
 @dataclass(frozen=True)
 class OrbFeatures:
-    """pixels: (N, 2) float32 of the colour image.  descriptors: (N, 32) uint8."""
+    """pixels: (N, 2) float32 of the color image.  descriptors: (N, 32) uint8."""
 
     pixels: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
 
     def rays(self, camera: Intrinsics) -> NDArray[np.float32]:
-        """(N, 2) x/z and y/z of the pixels for a colour camera."""
+        """(N, 2) x/z and y/z of the pixels for a color camera."""
         center = np.array((camera.cx, camera.cy), np.float32)
         return np.asarray((self.pixels - center) / np.array((camera.fx, camera.fy), np.float32), np.float32)
 

@@ -1,6 +1,6 @@
 """COLMAP's database of a scan: cameras, features, matches and verified pairs, each of which is there once.
 
-Frame n of the capture is image n + 1, called as ``image_name(n)``. COLMAP's pixels have their centres at halves.
+Frame n of the capture is image n + 1, called as ``image_name(n)``. COLMAP's pixels have their centers at halves.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ def check_count(count: int, what: str) -> None:
 
 
 def check_features(counts: list[int], what: str) -> None:
-    """Raises TrackingError if most images show nothing that could be recognised."""
+    """Raises TrackingError if most images show nothing that could be recognized."""
     if np.median(counts) < _FEW_FEATURES:
         raise TrackingError(
             f"The images of {what} are blurred or show bare surfaces: half of them have at most "

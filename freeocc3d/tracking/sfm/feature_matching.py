@@ -1,4 +1,4 @@
-"""Matches of local features between two images: mutual nearest neighbours that no second neighbour rivals."""
+"""Matches of local features between two images: mutual nearest neighbors that no second neighbor rivals."""
 
 from __future__ import annotations
 

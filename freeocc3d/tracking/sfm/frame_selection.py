@@ -55,7 +55,7 @@ def measure_sharpness(gray: NDArray[np.uint8]) -> float:
 
 
 def measure_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
-    """Median way of corners from one (H, W) grey image to the next, over the width."""
+    """Median way of corners from one (H, W) gray image to the next, over the width."""
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 8)
     if corners is None or len(corners) < _LEAST_FOLLOWED:
         return _LOST

@@ -22,12 +22,12 @@ SIFT = "sift"
 
 _COUNT = 6000
 _SHRINK_TO = 1600  # pixels of the longer side: what a larger image has more, costs more than it tells
-_GREY, _COLOUR = 1, 3
+_GRAY, _COLOR = 1, 3
 
 
 @dataclass(frozen=True)
 class LocalFeatures:
-    """pixels: (N, 2) float32, integer pixels being pixel centres.  descriptors: (N, D), uint8 of length 512 (SIFT) or
+    """pixels: (N, 2) float32, integer pixels being pixel centers.  descriptors: (N, D), uint8 of length 512 (SIFT) or
     float32 of length 1."""
 
     pixels: NDArray[np.float32]
@@ -39,7 +39,7 @@ class LocalFeatures:
 
 class Detector(Protocol):
     """Finds features in (H, W, 3) uint8 RGB. ``ratio``: a match is unambiguous if its distance is less than this of the
-    second nearest's; 1 = mutual nearest neighbours are enough."""
+    second nearest's; 1 = mutual nearest neighbors are enough."""
 
     ratio: float
 
@@ -106,7 +106,7 @@ class KeypointNetwork:
         inputs, outputs = self._session.get_inputs(), [output.name for output in self._session.get_outputs()]
         self._named = [next((n for n in outputs if kind in n.lower()), None) for kind in ("keypoint", "descriptor")]
         shape = inputs[0].shape if len(inputs) == 1 else []
-        if len(shape) != 4 or shape[1] not in (_GREY, _COLOUR) or None in self._named:
+        if len(shape) != 4 or shape[1] not in (_GRAY, _COLOR) or None in self._named:
             raise ModelError(
                 f"{path} finds no local features: it must take one image (1, 1 or 3, H, W) and give keypoints and "
                 f"descriptors, but takes {[i.name for i in inputs]} and gives {outputs}."
@@ -115,7 +115,7 @@ class KeypointNetwork:
         self._size = tuple(side if isinstance(side, int) else None for side in shape[2:])
 
     def __call__(self, color: NDArray[np.uint8]) -> LocalFeatures:
-        image = color if self._channels == _COLOUR else cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[:, :, None]
+        image = color if self._channels == _COLOR else cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[:, :, None]
         height, width = (own or given for own, given in zip(self._size, image.shape[:2], strict=True))
         shrunk = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).reshape(height, width, -1)
         tensor = np.ascontiguousarray(shrunk.transpose(2, 0, 1)[None], np.float32) / np.float32(255)

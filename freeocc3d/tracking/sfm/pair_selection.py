@@ -31,7 +31,7 @@ def compare_images(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.flo
 
 
 def _words(sample: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """(W, D) centres of clusters."""
+    """(W, D) centers of clusters."""
     start = sample[rng.permutation(len(sample))[:_WORDS]]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "One of the clusters is empty")  # it keeps its center

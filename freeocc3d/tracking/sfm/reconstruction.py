@@ -31,7 +31,7 @@ class Reconstruction:
     T_world_cam: (N, 4, 4) float64, row n = frame n of the capture, NaN where it has no pose.
     lens: of all frames.  points: (P, 3) float32 world.
     seen_frame, seen_point: (O,) int32, point ``seen_point[i]`` is seen in frame ``seen_frame[i]``.
-    metric: whether the world's unit is the metre.
+    metric: whether the world's unit is the meter.
     apart: (N,) whether the frame is in another model than this, which nothing ties to it.
     chosen: (N,) whether the frame was used at all.  warnings: what the user should know.
     """
@@ -68,7 +68,7 @@ class Reconstruction:
         T_world_cam[:, :3, 3] *= scale
         return replace(self, T_world_cam=T_world_cam, points=self.points * np.float32(scale))
 
-    def normalised(self) -> Reconstruction:
+    def normalized(self) -> Reconstruction:
         """With the median depth ``NOMINAL_DEPTH``, unless the scale is known."""
         return self if self.metric else self.scaled(NOMINAL_DEPTH / float(np.median(self.depths())))
 

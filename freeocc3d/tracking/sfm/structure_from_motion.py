@@ -82,7 +82,7 @@ def reconstruct_poses(
     progress.stage("adjustment")
     model = mapping.adjust_model(models[0], recipe.intrinsics == "fixed", distorts=not capture.intrinsics_known)
     frame_of = {image_name(index): index for index in found}
-    result = convert_model(model, len(capture), frame_of.get, what).normalised()
+    result = convert_model(model, len(capture), frame_of.get, what).normalized()
     apart, pieces = _apart(models, result.has_pose)
     if pieces:
         text = (

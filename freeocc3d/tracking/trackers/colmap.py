@@ -1,4 +1,4 @@
-"""Estimates poses from colour alone: structure from motion over the whole scan, or an existing COLMAP model."""
+"""Estimates poses from color alone: structure from motion over the whole scan, or an existing COLMAP model."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class ColmapTracker(GivenTracker):
     def _reconstruct(self, folder: Path, frames: range, progress: Progress) -> Reconstruction:
         options, scale = self.options, self._capture.options.scale
         if options.model is not None:
-            found = read_model(Path(options.model).expanduser(), self._capture).normalised()
+            found = read_model(Path(options.model).expanduser(), self._capture).normalized()
         else:
             recipe = Recipe(options.frames, options.order, options.features, options.mapping, options.intrinsics)
             found = reconstruct_poses(self._capture, frames, folder, recipe, progress)

@@ -38,7 +38,7 @@ class Options(KeyframeOptions, frozen=True):
     max_time_difference: Positive = 0.02
     """Seconds by which a pose and its frame may differ, for files that state times."""
     scale: Positive | None = 1.0
-    """Metres per unit of the file; null = as the capture's depth says, for monocular systems, and without depth as
+    """Meters per unit of the file; null = as the capture's depth says, for monocular systems, and without depth as
     capture.scale says, else unknown."""
     points: str | None = None
     """Point cloud (PLY, PCD, XYZ) in the file's world: where a frame has no depth, its points are the anchors."""
@@ -64,10 +64,10 @@ def load(options: Options, capture: Capture) -> FileTracker:
 
 
 class FileTracker(GivenTracker):
-    """The world frame is the file's, in metres. With a point cloud, (P, 3) world, frames get its depth where they have
+    """The world frame is the file's, in meters. With a point cloud, (P, 3) world, frames get its depth where they have
     none of their own."""
 
-    world: ClassVar[str] = "world frame of the trajectory file, scaled to metres"
+    world: ClassVar[str] = "world frame of the trajectory file, scaled to meters"
 
     def __init__(
         self,
@@ -88,8 +88,8 @@ class FileTracker(GivenTracker):
 
 
 def project_depth(points_cam: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:
-    """(H, W) metres: (P, 3) camera-frame points at the pixels where they fall, the nearest first; 0 elsewhere. A cloud
-    has gaps, so points far behind others in a neighbourhood of pixels count as hidden."""
+    """(H, W) meters: (P, 3) camera-frame points at the pixels where they fall, the nearest first; 0 elsewhere. A cloud
+    has gaps, so points far behind others in a neighborhood of pixels count as hidden."""
     camera = frame.intrinsics
     front = points_cam[points_cam[:, 2] > 0.05]
     pixels, z = project(front, camera)
@@ -112,7 +112,7 @@ def _beside(path: str, capture: Capture) -> Path:
 
 
 def _scale(T_world_cam: NDArray[np.float64], capture: Capture, options: Options) -> float:
-    """Metres per unit, from the options, checked against what depth says, or from depth; 1 where nothing says it."""
+    """Meters per unit, from the options, checked against what depth says, or from depth; 1 where nothing says it."""
     if not capture.has_depth:
         return capture.options.scale or options.scale or 1.0
     measured = estimate_depth_scale(T_world_cam, capture)
@@ -133,7 +133,7 @@ def _scale(T_world_cam: NDArray[np.float64], capture: Capture, options: Options)
 
 
 def estimate_depth_scale(T_world_cam: NDArray[np.float64], capture: Capture) -> float | None:
-    """Metres per unit of (N, 4, 4) poses by the capture's depth; None where too little tells.
+    """Meters per unit of (N, 4, 4) poses by the capture's depth; None where too little tells.
 
     Where two frames match features with depths p_s, p_t, p_t = R p_s + scale t: each match gives a scale along t, and
     the median over a pair, then over pairs, is taken.

@@ -33,4 +33,4 @@ def load(options: Options, capture: Capture) -> KnownTracker:
 class KnownTracker(GivenTracker):
     """The world frame is that of the capture's poses; a frame without a pose is lost."""
 
-    world: ClassVar[str] = "world frame of the capture's poses, metres"
+    world: ClassVar[str] = "world frame of the capture's poses, meters"

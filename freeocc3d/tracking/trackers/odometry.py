@@ -34,11 +34,11 @@ class Options(KeyframeOptions, frozen=True):
     iterations: Advanced[tuple[NotNegativeInt, NotNegativeInt, NotNegativeInt]] = (10, 6, 4)
     """Gauss–Newton iterations per pyramid level, coarse to fine."""
     depth_difference: Advanced[Positive] = 0.07
-    """Pixels whose depths differ by more than this many metres are no correspondence."""
+    """Pixels whose depths differ by more than this many meters are no correspondence."""
     min_fitness: Advanced[Positive] = 0.3
     """Share of pixels that must find a correspondence."""
     max_residual: Advanced[Positive] = 0.03
-    """Largest root mean square of the odometry's residual (metres and gray levels, 0…1, mixed)."""
+    """Largest root mean square of the odometry's residual (meters and gray levels, 0…1, mixed)."""
     min_information: Advanced[Finite] = 1e-3
     """Smallest eigenvalue of the information matrix, per correspondence, that still counts as constrained."""
     overlap_edges: Advanced[NotNegativeInt] = 6
@@ -202,7 +202,7 @@ class OdometryTracker(Tracker):
         camera, color, depth = frame.intrinsics, frame.color, frame.depth_m
         step = max(1, round(camera.width / self.options.width))
         if step > 1:
-            # Depth is picked, never averaged across an edge; colour is averaged around the same pixels, by a window of
+            # Depth is picked, never averaged across an edge; color is averaged around the same pixels, by a window of
             # odd size, so that both stay registered and the principal point moves with them exactly.
             first = step // 2
             color = cv2.blur(color, (step | 1, step | 1))[first::step, first::step]

@@ -1,4 +1,4 @@
-"""Estimates poses from colour and depth: dense tracking, relocalisation, loop closures, a joint refinement."""
+"""Estimates poses from color and depth: dense tracking, relocalization, loop closures, a joint refinement."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REQUIRES: tuple[str, ...] = ("open3d",)
 _LEAST_COVERED = 0.05  # share of the pixels that show a surface, or there is nothing to track
 _LEAST_OVERLAP, _LEAST_INLIERS, _LEAST_CORRELATION = 0.3, 0.6, 0.5  # or the frame is lost
 _CONFIRMED_OVERLAP, _CONFIRMED_M, _CONFIRMED_DEG = 0.15, 0.15, 8.0  # features and surfaces say the same
-_RECOGNISED_OVERLAP = 0.5
+_RECOGNIZED_OVERLAP = 0.5
 _SURE_INLIERS, _SURE_CORRELATION = 0.75, 0.96  # or features are asked
 _LIKELY_CORRELATION = 0.8
 _JUMP_M, _JUMP_DEG = 0.10, 6.0  # from where the camera was going; or features are asked
@@ -105,7 +105,7 @@ class RgbdTracker(Tracker):
             return self._begin_submap(seen)
         aligned = self._follow(seen)
         if aligned is None:
-            return self._relocalise(seen) or self._begin_submap(seen)
+            return self._relocalize(seen) or self._begin_submap(seen)
         T = aligned.T_target_source
         self._velocity = invert(self._T_keyframe_last) @ T if self._frames_lost == 0 else np.eye(4)
         return self._place(seen, aligned, "tracked")
@@ -132,29 +132,29 @@ class RgbdTracker(Tracker):
         target = self.keyframes[self._current]
         guess = self._T_keyframe_last @ self._velocity
         aligned = dense_alignment.align_views(seen.view, target.view, guess)
-        metres, degrees = measure_pose_difference(guess, aligned.T_target_source)
-        if _sure(aligned) and metres <= _JUMP_M and degrees <= _JUMP_DEG and self._frames_lost == 0:
+        meters, degrees = measure_pose_difference(guess, aligned.T_target_source)
+        if _sure(aligned) and meters <= _JUMP_M and degrees <= _JUMP_DEG and self._frames_lost == 0:
             return aligned
         found = register_by_features(seen.full, target)
         if found is not None and _confirmed(found) and _score(found.aligned) >= _score(aligned):
             return found.aligned
-        steady = metres <= _JUMP_M and degrees <= _JUMP_DEG and self._frames_lost == 0
+        steady = meters <= _JUMP_M and degrees <= _JUMP_DEG and self._frames_lost == 0
         alike = not aligned.correlation < _LIKELY_CORRELATION  # where nothing varies, nothing disagrees
         good = alike and aligned.overlap >= _LEAST_OVERLAP and aligned.inliers >= _SURE_INLIERS
         return aligned if good and (steady or aligned.correlation >= _SURE_CORRELATION) else None
 
-    def _relocalise(self, seen: _Seen) -> Tracked | None:
+    def _relocalize(self, seen: _Seen) -> Tracked | None:
         """Place a frame that the current keyframe does not show, by the last frame or by the other keyframes."""
         self._velocity = np.eye(4)
         if self._last is not None:
             found = register_by_features(seen.full, self._last.full, _DRAWS)
-            if found is not None and _recognised(found):
+            if found is not None and _recognized(found):
                 T = self._T_keyframe_last @ found.aligned.T_target_source
                 return self._place(seen, replace(found.aligned, T_target_source=T), "relocalised")
         best: tuple[dense_alignment.ViewAlignment, int] | None = None
         for row in self._alike(seen):
             found = register_by_features(seen.full, self.keyframes[row], _DRAWS)
-            if found is None or not _recognised(found):
+            if found is None or not _recognized(found):
                 continue
             if best is None or _score(found.aligned) > _score(best[0]):
                 best = found.aligned, row
@@ -228,16 +228,16 @@ class RgbdTracker(Tracker):
 def _confirmed(found: FeatureRegistration) -> bool:
     """Whether enough features agree, dense alignment stays where they say, and what is seen there agrees."""
     aligned = found.aligned
-    metres, degrees = measure_pose_difference(found.by_features, aligned.T_target_source)
+    meters, degrees = measure_pose_difference(found.by_features, aligned.T_target_source)
     alike = not aligned.correlation < _LEAST_CORRELATION  # where nothing varies, nothing disagrees
     seen = aligned.overlap >= _CONFIRMED_OVERLAP and aligned.inliers >= _LEAST_INLIERS
-    return found.agreeing >= _FEATURES and alike and seen and metres <= _CONFIRMED_M and degrees <= _CONFIRMED_DEG
+    return found.agreeing >= _FEATURES and alike and seen and meters <= _CONFIRMED_M and degrees <= _CONFIRMED_DEG
 
 
-def _recognised(found: FeatureRegistration) -> bool:
+def _recognized(found: FeatureRegistration) -> bool:
     """Whether a frame of which nothing was known is where it was found: by features and surfaces, or, where these saw
     the way from afar only, by surfaces that share much and look the same."""
-    seen_again = _sure(found.aligned) and found.aligned.overlap >= _RECOGNISED_OVERLAP
+    seen_again = _sure(found.aligned) and found.aligned.overlap >= _RECOGNIZED_OVERLAP
     return seen_again or (_confirmed(found) and _likely(found.aligned))
 
 
