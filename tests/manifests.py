@@ -15,7 +15,7 @@ def tiny_manifest(**changes: Any) -> Manifest:
         capture=CaptureRecord(path="builtin:room", format="synthetic", frames=240),
         up=(0.0, 0.0, 1.0),
         T_world_map=matrix(np.eye(4)),
-        encoder=EncoderRecord(name="colour", state={}),
+        encoder=EncoderRecord(name="color", state={}),
         freeocc3d="0.1.0",
         voxel_size_m=0.1,
         origin=(0.0, 0.0, 0.0),

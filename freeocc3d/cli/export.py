@@ -44,6 +44,6 @@ def export(
     for note in export_map(loaded, format_name, output, options, overwrite=overwrite):
         progress.warn(note)
     if not loaded.metric:
-        print("note: the map's scale is unknown, so lengths are not metres (see freeocc3d scale).", file=sys.stderr)
+        print("note: the map's scale is unknown, so lengths are not meters (see freeocc3d scale).", file=sys.stderr)
     files = [path for path in output.rglob("*") if path.is_file()] if output.is_dir() else [output]
     print(f"{output}: {sum(path.stat().st_size for path in files):,} bytes")

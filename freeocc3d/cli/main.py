@@ -17,7 +17,7 @@ from .console import flag
 from .demo import demo
 from .evaluate import evaluate
 from .export import export
-from .ground_truth import ground_truth
+from .ground_truth_command import ground_truth
 from .info import info
 from .list import list_backends
 from .query import query

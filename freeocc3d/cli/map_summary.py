@@ -100,10 +100,10 @@ def _voxels_text(said: dict[str, Any]) -> str:
 
 def _scale_text(scale: dict[str, Any]) -> str:
     if not scale["metric"]:
-        return "scale      unknown: lengths are not metres"
+        return "scale      unknown: lengths are not meters"
     told = {"given": "as given", "length": "by a known length", "camera height": "by the cameras' height"}
     times = "" if scale["factor"] == 1 else f", {scale['factor']:.4g} of them per unit of what was tracked"
-    return f"scale      metres, {told.get(scale['by'], 'by the poses')}{times}"
+    return f"scale      meters, {told.get(scale['by'], 'by the poses')}{times}"
 
 
 def _vocabulary_text(vocabulary: dict[str, Any]) -> str:

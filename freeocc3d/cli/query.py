@@ -64,12 +64,12 @@ class Place:
 
     near: Annotated[
         str | None,
-        typer.Option("--near", metavar="WORD[:METRES]", help="At most METRES away from WORD, 0.5 if not given."),
+        typer.Option("--near", metavar="WORD[:METERS]", help="At most METERS away from WORD, 0.5 if not given."),
     ] = None
     on: Annotated[str | None, typer.Option("--on", metavar="WORD", help="On top of WORD.")] = None
     within: Annotated[
         tuple[float, float, float, float, float, float] | None,
-        typer.Option("--within", metavar="X0 Y0 Z0 X1 Y1 Z1", help="With the centroid in a box, map frame, metres."),
+        typer.Option("--within", metavar="X0 Y0 Z0 X1 Y1 Z1", help="With the centroid in a box, map frame, meters."),
     ] = None
     pick: Annotated[
         str | None, typer.Option("--pick", metavar="WHICH", help="Only the largest, highest, lowest or best region.")
@@ -123,7 +123,7 @@ class Closer:
 
     refine_to: Annotated[
         float | None,
-        typer.Option("--refine", metavar="METRES", help="Ask again with finer voxels around the best match."),
+        typer.Option("--refine", metavar="METERS", help="Ask again with finer voxels around the best match."),
     ] = None
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="MAP", help="Keep the map that --refine makes.")
@@ -176,7 +176,7 @@ def _refuse_what_does_not_go_together(asked: Asked, answer: Answer, closer: Clos
     if asked.negative and asked.questions > len(asked.words or ()):
         raise typer.BadParameter("--not narrows what words mean: leave it out with --class and --image.")
     if closer.output is not None and closer.refine_to is None:
-        raise typer.BadParameter("-o keeps the map that --refine makes: give --refine METRES.")
+        raise typer.BadParameter("-o keeps the map that --refine makes: give --refine METERS.")
     if answer.views and not answer.as_json:
         raise typer.BadParameter("--views adds to the document of --json: give both.")
     if closer.refine_to is not None and asked.questions > 1:
@@ -191,8 +191,8 @@ def _question(asked: Asked, place: Place, ranking: Ranking) -> Question:
 
     where = None
     if any(condition is not None for condition in vars(place).values()):
-        word, metres = (None, Where.near_m) if place.near is None else near_word(place.near)
-        where = Where(place.within, word, metres, place.on, place.pick)
+        word, meters = (None, Where.near_m) if place.near is None else near_word(place.near)
+        where = Where(place.within, word, meters, place.on, place.pick)
     options = {"top_k": ranking.top, "threshold": ranking.threshold, "scores": ranking.scores}
     return Question(
         words=tuple(asked.words or ()),
@@ -228,7 +228,7 @@ def _answer(map_path: Path, loaded: Map, results: Sequence[QueryResult], answer:
 
         more = describe_regions(loaded, results, answer.views)
         return json.dumps(answers_document(map_path, results, more, loaded.metric))
-    unit = "" if loaded.metric else "\nThe map's scale is unknown, so lengths are not metres (see freeocc3d scale)."
+    unit = "" if loaded.metric else "\nThe map's scale is unknown, so lengths are not meters (see freeocc3d scale)."
     return answers_text(results, loaded.metric) + unit
 
 

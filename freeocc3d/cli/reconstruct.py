@@ -34,7 +34,7 @@ def reconstruct(
     ] = None,
     scale: Annotated[
         float | None,
-        typer.Option("--scale", metavar="S", help="Metres per unit of the poses, for scans without depth."),
+        typer.Option("--scale", metavar="S", help="Meters per unit of the poses, for scans without depth."),
     ] = None,
 ) -> None:
     """Turn a captured scan into a map."""

@@ -12,14 +12,14 @@ from .map_summary import summary_text
 
 def refine(
     map_path: MapPath,
-    voxel: Annotated[float, typer.Option("--voxel", metavar="METRES", help="Edge of the finest voxels.")],
+    voxel: Annotated[float, typer.Option("--voxel", metavar="METERS", help="Edge of the finest voxels.")],
     output: NewMap,
     box: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(
             "--box",
             metavar="X0 Y0 Z0 X1 Y1 Z1",
-            help="Make a map of this box only, and all its voxels fine: lower and upper corner, map frame, metres.",
+            help="Make a map of this box only, and all its voxels fine: lower and upper corner, map frame, meters.",
             show_default="the whole map, with finer voxels only where they show more",
         ),
     ] = None,

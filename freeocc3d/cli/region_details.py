@@ -19,10 +19,10 @@ def describe_regions(
 ) -> Callable[[Region], dict[str, Any]]:
     """What gives further keys of a region, for ``answers_document``.
 
-    oriented_box: extent (metres along its own axes), yaw (radians, gravity frame), T_map_box (4 x 4).
+    oriented_box: extent (meters along its own axes), yaw (radians, gravity frame), T_map_box (4 x 4).
     views: also keyframes and stand. keyframes: frame, pixel box x0 y0 x1 y1 and visible share of those that show the
     region best. stand: the nearest place x y z on the floor where a robot could stand and see it; null where there is
-    none, or where lengths are not metres.
+    none, or where lengths are not meters.
     """
     regions = [region for result in results for region in result.regions]
     if not regions:

@@ -1,4 +1,4 @@
-"""``freeocc3d scale``: metres for a map whose scale is unknown."""
+"""``freeocc3d scale``: meters for a map whose scale is unknown."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from .map_summary import summary_text
 def scale(
     map_path: MapPath,
     output: NewMap,
-    factor: Annotated[float | None, typer.Option("--factor", metavar="S", help="Metres per unit of the map.")] = None,
+    factor: Annotated[float | None, typer.Option("--factor", metavar="S", help="Meters per unit of the map.")] = None,
     length: Annotated[
         tuple[str, str, float] | None,
         typer.Option(
             "--length",
-            metavar="POINT POINT METRES",
+            metavar="POINT POINT METERS",
             help="The distance between two points. A point is a pixel of a keyframe, FRAME:X,Y, or a word.",
         ),
     ] = None,
     camera_height: Annotated[
         float | None,
-        typer.Option("--camera-height", metavar="METRES", help="The height of the cameras above the floor."),
+        typer.Option("--camera-height", metavar="METERS", help="The height of the cameras above the floor."),
     ] = None,
     poses: Annotated[
-        str | None, typer.Option("--poses", metavar="FILE|CAPTURE", help="Poses of the same frames in metres.")
+        str | None, typer.Option("--poses", metavar="FILE|CAPTURE", help="Poses of the same frames in meters.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Make a map in metres from a map whose scale is unknown.
+    """Make a map in meters from a map whose scale is unknown.
 
     Give one of --factor, --length, --camera-height and --poses.
     """

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def scores_document(evaluation: Evaluation) -> dict[str, Any]:
-    """Plain values: fractions 0 to 1, metres, seconds. Of several scenes ``scenes`` holds the document of each."""
+    """Plain values: fractions 0 to 1, meters, seconds. Of several scenes ``scenes`` holds the document of each."""
     alone = evaluation.scenes[0] if len(evaluation.scenes) == 1 else None
     document: dict[str, Any] = {
         "version": __version__,
@@ -71,7 +71,7 @@ def _figures(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def scores_text(evaluation: Evaluation) -> str:
-    """Tables for people; per cent and centimetres."""
+    """Tables for people; percent and centimeters."""
     scores = evaluation.scores
     lines = [
         f"IoU        {_percent(scores.iou)}  precision {_percent(scores.precision)}, recall {_percent(scores.recall)}",

@@ -1,7 +1,7 @@
 """One map of several voxel sizes: coarse where the surface is flat and of one kind, fine where it is not.
 
 A block of 8 x 8 x 8 voxels is cut into eight of half its voxels' size where one voxel would hide something: where the
-surface leaves its plane by a tenth of a voxel, and by more than the depth's noise, or where the meaning of neighbouring
+surface leaves its plane by a tenth of a voxel, and by more than the depth's noise, or where the meaning of neighboring
 Gaussians differs; but never to voxels smaller than that noise. What lies in such blocks is lifted again from the
 keyframes, in cells half as large, and looked at again, until the smallest size is reached. Every block is projected
 from the Gaussians of its own size.
@@ -41,13 +41,13 @@ _FEWEST = 5  # Gaussians in a cube that tell whether they lie in a plane
 _UNEVEN = 0.1
 """Root mean square distance to the plane, in voxels, from which a surface is not flat: a step of a quarter of a voxel,
 a corner of a room, or a ball of five voxels' radius."""
-_NEIGHBOURS, _ALIKE = 6, 0.8
+_NEIGHBORS, _ALIKE = 6, 0.8
 """Gaussians around each whose features are compared with its own, and the cosine below which both are not alike."""
 _ROWS = 16384
 
 
 def count_halvings(voxel_size: float, finest: float) -> int:
-    """How often ``voxel_size`` is halved to reach ``finest``, metres. Raises MapError if it never is."""
+    """How often ``voxel_size`` is halved to reach ``finest``, meters. Raises MapError if it never is."""
     count = round(math.log2(voxel_size / finest)) if 0 < finest <= voxel_size else -1
     if count < 0 or finest < SMALLEST_VOXEL_M or abs(voxel_size / 2**count / finest - 1) > 1e-6:
         sizes = [voxel_size / 2**n for n in range(1, 9) if voxel_size / 2**n >= SMALLEST_VOXEL_M]
@@ -70,7 +70,7 @@ def build_adaptive(
     finest: float,
     progress: Progress,
 ) -> Occupancy:
-    """The map ``base`` of one voxel size, with smaller voxels down to ``finest`` metres where they show more.
+    """The map ``base`` of one voxel size, with smaller voxels down to ``finest`` meters where they show more.
 
     gaussians, features: the N Gaussians that it was made of, and what they mean, (N, D).  posed: gives the keyframes,
     each time that it is called.  T_world_keyframe: (K, 4, 4).  encode: layer 3 for further Gaussians.  settings: the
@@ -122,7 +122,7 @@ def build_adaptive(
 def refine_where_needed(
     scan_map: Map, finest: float, output: str | Path, *, overwrite: bool = False, progress: Progress | None = None
 ) -> Map:
-    """Write the whole of a map, with smaller voxels down to ``finest`` metres where they show more, to the folder
+    """Write the whole of a map, with smaller voxels down to ``finest`` meters where they show more, to the folder
     ``output``. Raises FreeOccError: a size that halving does not reach, a map that has several already, a folder that
     exists."""
     progress = progress or Progress()
@@ -195,7 +195,7 @@ def _detailed(
 def _changing(means: NDArray[np.float32], features: NDArray[np.float16]) -> NDArray[np.bool_]:
     """(N,) whether one of the nearest Gaussians means something else; what nothing is known of means nothing else."""
     changing = np.zeros(len(means), bool)
-    count = min(_NEIGHBOURS, len(means) - 1)
+    count = min(_NEIGHBORS, len(means) - 1)
     if count < 1 or not features.shape[1]:
         return changing
     nearest = cKDTree(means).query(means, k=count + 1, workers=-1)[1][:, 1:]
@@ -212,7 +212,7 @@ def _changing(means: NDArray[np.float32], features: NDArray[np.float16]) -> NDAr
 class Blocks:
     """A set of cubes of one lattice, given by packed keys: a region, as a ``refine.Box`` is one.
 
-    edge: of a cube, metres.
+    edge: of a cube, meters.
     """
 
     def __init__(self, packed: NDArray[np.int64], origin: NDArray[np.float64], edge: float):

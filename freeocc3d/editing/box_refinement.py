@@ -42,7 +42,7 @@ AROUND = 3.0
 
 @dataclass(frozen=True)
 class Box:
-    """low, high: (3,) opposite corners in the map's frame, metres."""
+    """low, high: (3,) opposite corners in the map's frame, meters."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -50,7 +50,7 @@ class Box:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.low).all() and np.isfinite(self.high).all() and (self.low < self.high).all()):
             raise MapError(
-                "A box has a lower and an upper corner, x0 y0 z0 x1 y1 z1 in metres, each of the first three less than "
+                "A box has a lower and an upper corner, x0 y0 z0 x1 y1 z1 in meters, each of the first three less than "
                 f"its counterpart; got {' '.join(f'{value:g}' for value in (*self.low, *self.high))}."
             )
 
@@ -73,7 +73,7 @@ def refine_box(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Map:
-    """Write a map of a box of another map, with voxels of ``voxel_size`` metres, to the folder ``output``.
+    """Write a map of a box of another map, with voxels of ``voxel_size`` meters, to the folder ``output``.
 
     The box is widened to whole blocks of 8 voxels. Raises FreeOccError: the box is empty, or holds more than can be
     kept, no keyframe sees a surface in it, or the folder exists.

@@ -35,13 +35,13 @@ from ..tracking.trajectory_alignment import Poses, align_trajectories, read_pose
 from ..viewer import render_pictures, trajectory_picture
 
 _NEAR_PX = 6
-_MOST_DEPTH_M = 65.535  # what 16 bits of millimetres hold
+_MOST_DEPTH_M = 65.535  # what 16 bits of millimeters hold
 _LEAST_VOXEL_M = 0.001
 _FITS = 0.1  # of the spread of the cameras: poses that are farther off are another scan's
 
 
 def scale_map(scan_map: Map, factor: float, by: str, output: str | Path, *, overwrite: bool = False) -> Map:
-    """Write the map with every length times ``factor``, after which lengths are metres, to the folder ``output``.
+    """Write the map with every length times ``factor``, after which lengths are meters, to the folder ``output``.
 
     by: where the factor is from, for the manifest. Raises MapError: no usable factor, or the folder exists.
     """
@@ -72,29 +72,29 @@ def scale_map(scan_map: Map, factor: float, by: str, output: str | Path, *, over
     return load_map(output)
 
 
-def scale_by_length(scan_map: Map, ends: Sequence[str], metres: float) -> float:
-    """The factor by which two points are ``metres`` apart.
+def scale_by_length(scan_map: Map, ends: Sequence[str], meters: float) -> float:
+    """The factor by which two points are ``meters`` apart.
 
     ends: two of ``FRAME:X,Y``, a pixel of a keyframe, or of a word, for the middle of the best region that it matches.
     Raises MapError: no such keyframe, no depth near the pixel, nothing matched, one and the same point.
     """
-    _require_metres(metres, "length")
+    _require_meters(meters, "length")
     first, second = (_point(scan_map, end) for end in ends)
     length = float(np.linalg.norm(first - second))
     if length < 1e-6:
         raise MapError(f"{ends[0]} and {ends[1]} are one point of the map: name two that are apart.")
-    return metres / length
+    return meters / length
 
 
-def scale_by_camera_height(scan_map: Map, metres: float) -> float:
-    """The factor by which the keyframes are ``metres`` above the floor, half of them more. Raises MapError where the
+def scale_by_camera_height(scan_map: Map, meters: float) -> float:
+    """The factor by which the keyframes are ``meters`` above the floor, half of them more. Raises MapError where the
     map shows no floor below them."""
-    _require_metres(metres, "camera height")
+    _require_meters(meters, "camera height")
     T_gravity_map, poses = scan_map.T_gravity_map, scan_map.trajectory.T_world_keyframe
     if not is_floor_seen(T_gravity_map, poses, scan_map.gaussians):
         raise MapError(f"{scan_map.path} shows no floor below the cameras: give a known length instead (--length).")
     height = float(np.median(transform(T_gravity_map, poses[:, :3, 3])[:, 2]))
-    return metres / height
+    return meters / height
 
 
 def scale_by_poses(scan_map: Map, path: str) -> float:
@@ -158,9 +158,9 @@ def _point(scan_map: Map, end: str) -> NDArray[np.float64]:
     return np.asarray(transform(trajectory.T_world_keyframe[rows[0]], point))
 
 
-def _require_metres(value: float, what: str) -> None:
+def _require_meters(value: float, what: str) -> None:
     if not (math.isfinite(value) and value > 0):
-        raise MapError(f"A {what} is a positive number of metres, got {value:g}.")
+        raise MapError(f"A {what} is a positive number of meters, got {value:g}.")
 
 
 def _rows(scan_map: Map) -> range:

@@ -47,17 +47,17 @@ def warn_of_color_focal(capture: Capture, ratio: float) -> Notice:
     """That the color camera's focal length is ``ratio`` times what the capture says."""
     return Notice(
         "color-focal-corrected",
-        f"Colour and depth of {capture.path} fit each other only if the colour camera's focal length is "
-        f"{ratio:.3f} of what its files say: colour is resampled so (capture.color_focal=1 leaves it as it is).",
+        f"Color and depth of {capture.path} fit each other only if the color camera's focal length is "
+        f"{ratio:.3f} of what its files say: color is resampled so (capture.color_focal=1 leaves it as it is).",
     )
 
 
 def warn_of_scale() -> Notice:
-    """That lengths are not in metres."""
+    """That lengths are not in meters."""
     return Notice(
         "scale-unknown",
         "The scale of this map is unknown: its lengths, also the edge of its voxels, are in a unit in which the scene "
-        "is about 2 deep. Give metres per unit with --scale, or scale the map by a known length: freeocc3d scale.",
+        "is about 2 deep. Give meters per unit with --scale, or scale the map by a known length: freeocc3d scale.",
     )
 
 

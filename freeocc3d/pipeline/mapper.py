@@ -43,7 +43,7 @@ class Mapper:
         if self.tracker.needs_depth and not capture.has_depth:
             raise TrackingError(
                 f"tracking.backend={settings.tracking.backend} needs depth, which {capture.path} has none of (or "
-                "capture.depth=false): estimate poses from colour with tracking.backend=colmap, or give them (known, "
+                "capture.depth=false): estimate poses from color with tracking.backend=colmap, or give them (known, "
                 "file)."
             )
         self.depth: DepthSource = MeasuredDepth()
@@ -127,7 +127,7 @@ class Mapper:
             stream.close()
 
     def anchor_gaussians(self, progress: Progress | None = None) -> Gaussians:
-        """Layer 2 as it is initialised: Gaussians anchored at the surface that the mapped frames so far show."""
+        """Layer 2 as it is initialized: Gaussians anchored at the surface that the mapped frames so far show."""
         progress = progress or Progress()
         trajectory = self.trajectory()
         options = self.settings.gaussians
@@ -156,9 +156,9 @@ class Mapper:
 
     @property
     def cell_size(self) -> float:
-        """Edge in metres of the cells that hold one Gaussian each."""
+        """Edge in meters of the cells that hold one Gaussian each."""
         usual = 0.5 * self.settings.occupancy.voxel_size
-        if not self.tracker.metric:  # half a voxel may turn out to be much in metres
+        if not self.tracker.metric:  # half a voxel may turn out to be much in meters
             usual = min(usual, _FINE * capture_base.NOMINAL_DEPTH)
         return float(self.settings.gaussians.cell_size or usual)
 
@@ -180,7 +180,7 @@ class Mapper:
     def build_occupancy(
         self, gaussians: Gaussians, features: NDArray[np.float16], progress: Progress | None = None
     ) -> Occupancy:
-        """Layer 4: voxels with probabilities, evidence, features and colours."""
+        """Layer 4: voxels with probabilities, evidence, features and colors."""
         progress = progress or Progress()
         trajectory = self.trajectory()
         carving = self.settings.carving

@@ -21,7 +21,7 @@ from ..tracking.rgbd import focal_calibration
 from .checks import check, warn_of_color_focal
 from .mapper import Mapper
 from .saving import absolute
-from .stages import STAGES, Run
+from .run_stages import STAGES, Run
 
 
 def reconstruct(
@@ -93,7 +93,7 @@ def _open(capture: str | Path, settings: Settings, progress: Progress, work: Wor
 
 
 def _register_color(capture: Capture, settings: Settings, progress: Progress, work: WorkFolder) -> Capture:
-    """The capture with colour brought to the depth's pixels, if its cameras' focal lengths differ."""
+    """The capture with color brought to the depth's pixels, if its cameras' focal lengths differ."""
     ratio = settings.capture.color_focal
     if not capture.has_depth:
         return capture

@@ -89,7 +89,7 @@ def _facts(
 
 
 def _scale(mapper: Mapper) -> MapScale:
-    """Whether lengths are metres, what says so, and how many a unit of what the tracker gives is."""
+    """Whether lengths are meters, what says so, and how many a unit of what the tracker gives is."""
     capture, given = mapper.capture, mapper.capture.options.scale
     if not mapper.tracker.metric:
         return MapScale(metric=False, by="none", factor=1.0)

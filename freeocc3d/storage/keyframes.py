@@ -1,4 +1,4 @@
-"""Keyframes on disk: colour (JPEG), depth (16-bit PNG, millimetres), its standard deviation where it has one of its own
+"""Keyframes on disk: color (JPEG), depth (16-bit PNG, millimeters), its standard deviation where it has one of its own
 (16-bit PNG, halves of them) and intrinsics, enough to build every later layer without the capture. They are written
 while the camera is tracked, and read one at a time."""
 
@@ -19,7 +19,7 @@ from ..core.errors import MapError
 from ..core.types import Frame, Intrinsics
 
 INDEX = "keyframes.json"
-_UNITS_PER_METRE, _SIGMA_UNITS_PER_METRE = 1000.0, 2000.0
+_UNITS_PER_METER, _SIGMA_UNITS_PER_METER = 1000.0, 2000.0
 _SIGMA = "sigma"
 """Key of the entries that have a third image."""
 _JPEG_QUALITY = 95
@@ -111,20 +111,20 @@ class Keyframes(Sequence[Frame]):
         return map(self._read, list(self._entries))
 
     def views(self) -> list[tuple[Path, Intrinsics]]:
-        """The colour image's file and the camera of each, without decoding anything."""
+        """The color image's file and the camera of each, without decoding anything."""
         return [(self._paths(int(entry["frame"]))[0], _camera(entry)) for entry in self._entries]
 
     def depth_m(self, row: int) -> NDArray[np.float32]:
-        """(H, W) depth of one, whose colour is not decoded; 0 = no measurement."""
-        return self._read_units(self._entries[row], 1) / np.float32(_UNITS_PER_METRE)
+        """(H, W) depth of one, whose color is not decoded; 0 = no measurement."""
+        return self._read_units(self._entries[row], 1) / np.float32(_UNITS_PER_METER)
 
     def _read(self, entry: dict[str, float]) -> Frame:
         index = int(entry["frame"])
         camera = _camera(entry)
         color_path = self._paths(index)[0]
         color = _decode(color_path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        depth_m = self._read_units(entry, 1) / np.float32(_UNITS_PER_METRE)
-        sigma_m = self._read_units(entry, 2) / np.float32(_SIGMA_UNITS_PER_METRE) if _SIGMA in entry else None
+        depth_m = self._read_units(entry, 1) / np.float32(_UNITS_PER_METER)
+        sigma_m = self._read_units(entry, 2) / np.float32(_SIGMA_UNITS_PER_METER) if _SIGMA in entry else None
         if color.shape != (*depth_m.shape, 3):
             raise MapError(f"{color_path} does not have the size that {INDEX} states.")
         return Frame(index, entry["timestamp"], cv2.cvtColor(color, cv2.COLOR_BGR2RGB), depth_m, camera, sigma_m)
@@ -138,13 +138,13 @@ class Keyframes(Sequence[Frame]):
 
     def _write_depth(self, frame: Frame) -> None:
         _, depth_path, sigma_path = self._paths(frame.index)
-        depth_path.write_bytes(_encoded(frame.depth_m * _UNITS_PER_METRE))
+        depth_path.write_bytes(_encoded(frame.depth_m * _UNITS_PER_METER))
         if frame.depth_sigma_m is not None:
-            sigma = np.maximum(frame.depth_sigma_m * np.float32(_SIGMA_UNITS_PER_METRE), 1)  # 0 would weigh infinitely
+            sigma = np.maximum(frame.depth_sigma_m * np.float32(_SIGMA_UNITS_PER_METER), 1)  # 0 would weigh infinitely
             sigma_path.write_bytes(_encoded(np.where(frame.depth_m > 0, sigma, 0)))
 
     def _paths(self, index: int) -> tuple[Path, Path, Path]:
-        """Colour and depth image of a frame, and that of the depth's standard deviation."""
+        """Color and depth image of a frame, and that of the depth's standard deviation."""
         name = self.folder / f"{index:06d}"
         return name.with_suffix(".color.jpg"), name.with_suffix(".depth.png"), name.with_suffix(".depth_sigma.png")
 

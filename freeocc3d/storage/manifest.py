@@ -68,7 +68,7 @@ class EncoderRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapScale(msgspec.Struct, frozen=True, kw_only=True):
-    """The unit of length. metric: whether it is the metre.  by: what says so.  factor: metres in a unit of what the
+    """The unit of length. metric: whether it is the meter.  by: what says so.  factor: meters in a unit of what the
     tracker gave."""
 
     metric: bool
@@ -110,7 +110,7 @@ class SceneWords(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Refined(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The map of larger voxels that this one was made of. box: x0 y0 z0 x1 y1 z1 of the part of it, metres; None for
+    """The map of larger voxels that this one was made of. box: x0 y0 z0 x1 y1 z1 of the part of it, meters; None for
     the whole."""
 
     map: str
@@ -137,16 +137,16 @@ class Manifest(MapFacts, frozen=True, kw_only=True):
     """What map.yaml says: the facts, and what it repeats of the other files, so that they can be checked."""
 
     freeocc3d: Annotated[str, _key("version of the package that wrote the map")]
-    voxel_size_m: Annotated[float, _key("edge of the largest voxels, metres", gt=0)]
-    finest_voxel_m: Annotated[float | None, _key("edge of the smallest, if sizes differ, metres", since=3)] = None
-    origin: Annotated[Vector, _key("x y z of the lower corner of voxel (0, 0, 0), map's frame, metres")]
+    voxel_size_m: Annotated[float, _key("edge of the largest voxels, meters", gt=0)]
+    finest_voxel_m: Annotated[float | None, _key("edge of the smallest, if sizes differ, meters", since=3)] = None
+    origin: Annotated[Vector, _key("x y z of the lower corner of voxel (0, 0, 0), map's frame, meters")]
     counts: Annotated[MapCounts, _key("numbers of Gaussians, voxels, frames and submaps")]
     keyframes: Annotated[tuple[Count, ...], _key("the capture's frames that are keyframes, ascending")]
     files: Annotated[dict[str, Count], _key("files of the folder with their sizes, bytes")]
 
     @property
     def finest_m(self) -> float:
-        """Edge of the smallest voxels, metres."""
+        """Edge of the smallest voxels, meters."""
         return self.finest_voxel_m or self.voxel_size_m
 
     @property

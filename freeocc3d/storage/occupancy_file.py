@@ -16,7 +16,7 @@ from .manifest import Manifest
 from .map_files import FEATURES, OCCUPANCY
 
 _DEEPEST = 12
-"""Level of the smallest voxels of any map: from 4 m down to a millimetre."""
+"""Level of the smallest voxels of any map: from 4 m down to a millimeter."""
 _OCCUPANCY_ARRAYS = {
     "keys": ("i", 2), "probability": ("f", 2), "free": ("u", 2), "hits": ("u", 2), "state": ("u", 2),
     "colors": ("u", 2), "feature_codes": ("u", 2),

@@ -58,7 +58,7 @@ class SavedMap:
 
     @property
     def metric(self) -> bool:
-        """Whether lengths are metres; where not, their unit is unknown."""
+        """Whether lengths are meters; where not, their unit is unknown."""
         return self.manifest.scale.metric
 
     @functools.cached_property
@@ -93,7 +93,7 @@ class SavedMap:
 
     @functools.cached_property
     def occupancy(self) -> Occupancy:
-        """The voxels with probabilities, evidence, features and colours."""
+        """The voxels with probabilities, evidence, features and colors."""
         return read_occupancy(self.path, self.manifest, self._codec)
 
     @functools.cached_property

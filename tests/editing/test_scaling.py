@@ -1,4 +1,4 @@
-"""The scale of maps: the built-in room, which is in metres, made half as large and said to be in no unit."""
+"""The scale of maps: the built-in room, which is in meters, made half as large and said to be in no unit."""
 
 import dataclasses
 import json
@@ -127,7 +127,7 @@ def test_points_that_are_none_are_told(half: Map) -> None:
         scaling.scale_by_length(half, ["xylophone", "red cup"], 1.0)
     with pytest.raises(MapError, match="are one point of the map"):
         scaling.scale_by_length(half, ["red cup", "red cup"], 1.0)
-    with pytest.raises(MapError, match="A length is a positive number of metres"):
+    with pytest.raises(MapError, match="A length is a positive number of meters"):
         scaling.scale_by_length(half, ["red cup", "blue chair"], -1.0)
 
 
@@ -185,15 +185,15 @@ def test_factors_that_no_map_can_have_are_refused(half: Map, tmp_path: Path, fac
 
 
 def test_the_commands_say_what_the_unit_is(room: Map, half: Map, tmp_path: Path) -> None:
-    assert "scale      unknown: lengths are not metres" in run("info", half.path).stdout
+    assert "scale      unknown: lengths are not meters" in run("info", half.path).stdout
     facts = json.loads(run("info", half.path, "--json").stdout)
     assert facts["metric"] is False
     assert json.loads(run("info", room.path, "--json").stdout)["scale"]["by"] == "sensor"
     assert "edge 0.04 units\n" in run("info", half.path).stdout
     assert "edge 0.08 m\n" in run("info", room.path).stdout
     unknown, known = (run("query", scan_map.path, "red cup").stdout for scan_map in (half, room))
-    assert "lengths are not metres" in unknown
-    assert "lengths are not metres" not in known
+    assert "lengths are not meters" in unknown
+    assert "lengths are not meters" not in known
     assert "(m)" not in unknown
     assert "(l)" not in unknown
     (header, row), (header_m, row_l) = (text.splitlines()[1:3] for text in (unknown, known))
@@ -207,12 +207,12 @@ def test_the_commands_say_what_the_unit_is(room: Map, half: Map, tmp_path: Path)
     assert "voxels of 8 cm," in map_pictures._title(room)
     assert json.loads(run("query", half.path, "red cup", "--json").stdout)["metric"] is False
     exported = run("export", half.path, "--format", "octomap", "-o", tmp_path / "half.bt")
-    assert "lengths are not metres" in exported.stderr
+    assert "lengths are not meters" in exported.stderr
     described = json.loads((tmp_path / "half.bt.json").read_text())
     assert (described["metric"], described["unit"]) == (False, "unknown")
-    shown = run("scale", half.path, "-o", tmp_path / "metres", "--camera-height", "1.5").stdout
-    assert "scale      metres, by the cameras' height, 2" in shown
-    assert "exists" in refused("scale", half.path, "-o", tmp_path / "metres", "--factor", "2")
+    shown = run("scale", half.path, "-o", tmp_path / "meters", "--camera-height", "1.5").stdout
+    assert "scale      meters, by the cameras' height, 2" in shown
+    assert "exists" in refused("scale", half.path, "-o", tmp_path / "meters", "--factor", "2")
     assert "own place" in refused("scale", half.path, "-o", half.path, "--factor", "2", "--overwrite")
     wrong = run("scale", half.path, "-o", tmp_path / "two", "--factor", "2", "--camera-height", "1.5", code=2)
     assert "give one of --factor" in wrong.stderr
@@ -228,8 +228,8 @@ def test_given_trackers_know_whether_their_poses_are_metric(tmp_path: Path, room
 
     assert metric(write_nerfstudio(tmp_path / "depth", 3))
     assert metric(tmp_path / "depth", depth=False)
-    assert not metric(write_nerfstudio(tmp_path / "colour", 3, depth=False))
-    assert metric(tmp_path / "colour", scale=2.0)
+    assert not metric(write_nerfstudio(tmp_path / "color", 3, depth=False))
+    assert metric(tmp_path / "color", scale=2.0)
     assert not metric(write_colmap(tmp_path / "model", 3))
     poses = tmp_path / "depth" / "transforms.json"
     capture = open_capture(tmp_path / "depth", Options(depth=False))

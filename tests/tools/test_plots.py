@@ -68,7 +68,7 @@ def test_stages_of_rows_that_have_them(tmp_path) -> None:
 
 def test_a_trajectory_states_its_units(tmp_path) -> None:
     text = text_of("trajectory", tmp_path)
-    assert all(label in text for label in ("a walk", "metres", "error (cm)", "true path", "estimated"))
+    assert all(label in text for label in ("a walk", "meters", "error (cm)", "true path", "estimated"))
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (0.1, -2, 0.4)])

@@ -6,7 +6,7 @@
 Rows are captures x variants. A variant is an ablation of configs/ablations (mapped and scored by the command), a peer,
 or another measurement. Each is measured in a process of its own, so that its threads, its memory peak and its imports
 are its own; this process imports little. Times a frame are over all frames of the capture, although the peers that make
-voxels use every second one. A time moves by some per cent with what else the machine does: compare ratios of one run.
+voxels use every second one. A time moves by some percent with what else the machine does: compare ratios of one run.
 """
 
 from __future__ import annotations

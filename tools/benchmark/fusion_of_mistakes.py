@@ -34,7 +34,7 @@ def measure_fusion(map_path: str) -> Figures:
 
 
 class Flipped:
-    """Class images of which a share of the regions is relabelled to another class at random."""
+    """Class images of which a share of the regions is relabeled to another class at random."""
 
     def __init__(self, images: Any, classes: int, kind: str, seed: int):
         self.images, self.classes, self.kind, self.seed = images, classes, kind, seed

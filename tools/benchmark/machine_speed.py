@@ -17,7 +17,7 @@ def copy_bytes_per_second() -> float:
 
 
 def exps_per_second() -> float:
-    """float32 exponentials a second, NumPy's vectorised one on one thread times the number of processors."""
+    """float32 exponentials a second, NumPy's vectorized one on one thread times the number of processors."""
     import numpy as np
 
     values = -np.random.default_rng(0).random(1 << 20, np.float32)

@@ -1,12 +1,12 @@
 """The strongest peers that run on a CPU, measured beside our own map on the same frames and poses.
 
-    dense_slam               Open3D's dense SLAM (``t.pipelines.slam``): colour and depth to poses
+    dense_slam               Open3D's dense SLAM (``t.pipelines.slam``): color and depth to poses
     tsdf_occupied            Open3D's TSDF (``t.geometry.VoxelBlockGrid``): the surface at given poses
     back_projected_occupied  the plainest baseline: depth pixels added up in the voxels that they fall in
     octomap_occupied         OctoMap (A. Hornung et al., OctoMap, Autonomous Robots 2013) through pyoctomap
 
 Every parameter is a constant of this module, the same for all captures; the occupancy peers' were chosen once, in
-their favour, on 7-Scenes' kitchen and two rendered rooms together. What the libraries ask for is left as they publish
+their favor, on 7-Scenes' kitchen and two rendered rooms together. What the libraries ask for is left as they publish
 it, except where a constant below says why not. A capture's reader has already dropped depth beyond the sensor's range,
 so the occupancy peers use all that is left. They take the same frames, every second one with a pose, answer on the same
 lattice in the frame of the poses that they are given, and know no unknown: a voxel that they have not seen is not
@@ -41,8 +41,8 @@ SLAM_BLOCKS = 40_000
 """Open3D's examples/python/t_reconstruction_system/default_config.yml, but for the voxel size and the greatest depth,
 there 3 m: with the sensor's 6 m the kitchen's error stays what it is, and the house's bedroom is not lost."""
 
-SLAM_UNITS_PER_METRE = 5000.0
-"""Of the 16-bit depth that dense SLAM is given: no rounding for captures in millimetres, 13 m at most."""
+SLAM_UNITS_PER_METER = 5000.0
+"""Of the 16-bit depth that dense SLAM is given: no rounding for captures in millimeters, 13 m at most."""
 
 TSDF_VOXEL_SIZE_M = 0.02
 TSDF_TRUNCATION_VOXELS = 4.0
@@ -67,8 +67,8 @@ depth, so that the far side of a room is held to the same as the near one."""
 class Lattice:
     """Where occupancy is asked: voxel (i, j, k) covers ``origin + [i, i+1) * voxel_size``.
 
-    origin: (3,) lower corner of voxel (0, 0, 0) in the frame of the poses, metres.
-    shape: voxels along x, y and z.  voxel_size: edge of a voxel, metres.
+    origin: (3,) lower corner of voxel (0, 0, 0) in the frame of the poses, meters.
+    shape: voxels along x, y and z.  voxel_size: edge of a voxel, meters.
     """
 
     origin: NDArray[np.float64]
@@ -107,14 +107,14 @@ def dense_slam(capture: Capture, frames: Sequence[int]) -> tuple[NDArray[np.floa
     for count, index in enumerate(frames):
         mark = time.perf_counter()
         frame = capture[index]
-        depth = np.rint(frame.depth_m * SLAM_UNITS_PER_METRE).astype(np.uint16)
+        depth = np.rint(frame.depth_m * SLAM_UNITS_PER_METER).astype(np.uint16)
         measured.set_data_from_image("depth", o3d.t.geometry.Image(depth))
         measured.set_data_from_image("color", o3d.t.geometry.Image(frame.color))
         mark = lap(seconds, "decode", mark)
         if count > 0:
             try:
                 result = model.track_frame_to_model(
-                    measured, rendered, SLAM_UNITS_PER_METRE, SLAM_DEPTH_MAX_M, SLAM_DEPTH_DIFF_M
+                    measured, rendered, SLAM_UNITS_PER_METER, SLAM_DEPTH_MAX_M, SLAM_DEPTH_DIFF_M
                 )
                 T_world_cam = T_world_cam @ result.transformation
             except RuntimeError:
@@ -122,10 +122,10 @@ def dense_slam(capture: Capture, frames: Sequence[int]) -> tuple[NDArray[np.floa
         mark = lap(seconds, "track", mark)
         poses[index] = T_world_cam.numpy()
         model.update_frame_pose(count, T_world_cam)
-        model.integrate(measured, SLAM_UNITS_PER_METRE, SLAM_DEPTH_MAX_M, SLAM_TRUNCATION_VOXELS)
+        model.integrate(measured, SLAM_UNITS_PER_METER, SLAM_DEPTH_MAX_M, SLAM_TRUNCATION_VOXELS)
         mark = lap(seconds, "integrate", mark)
         model.synthesize_model_frame(
-            rendered, SLAM_UNITS_PER_METRE, SLAM_DEPTH_MIN_M, SLAM_DEPTH_MAX_M, SLAM_TRUNCATION_VOXELS, False
+            rendered, SLAM_UNITS_PER_METER, SLAM_DEPTH_MIN_M, SLAM_DEPTH_MAX_M, SLAM_TRUNCATION_VOXELS, False
         )
         lap(seconds, "synthesise", mark)
     return poses, seconds, failures
@@ -150,7 +150,7 @@ def tsdf_occupied(
 def surface_area(
     capture: Capture, T_world_cam: NDArray[np.float64], lattice: Lattice, every: int
 ) -> tuple[NDArray[np.float64], Seconds]:
-    """(X, Y, Z) square metres of the TSDF's surface in each voxel, a triangle belonging where its centroid lies."""
+    """(X, Y, Z) square meters of the TSDF's surface in each voxel, a triangle belonging where its centroid lies."""
     import open3d as o3d
 
     core = o3d.core
@@ -207,7 +207,7 @@ def back_projected_occupied(
 def seen_area(
     capture: Capture, T_world_cam: NDArray[np.float64], lattice: Lattice, every: int
 ) -> tuple[NDArray[np.float64], Seconds]:
-    """(X, Y, Z) square metres that the depth pixels in each voxel cover at their depth, summed over the frames."""
+    """(X, Y, Z) square meters that the depth pixels in each voxel cover at their depth, summed over the frames."""
     seconds = start_steps("decode", "count")
     area = np.zeros(lattice.shape)
     for frame in _decoded(capture, frames_with_pose(T_world_cam, every), seconds):
@@ -264,7 +264,7 @@ def _decoded(capture: Capture, frames: NDArray[np.int64], seconds: Seconds) -> I
 
 
 def _points(frame: Frame) -> NDArray[np.float64]:
-    """(P, 3) measured points of every ``PIXEL_STRIDE``-th pixel of every such row, camera, metres."""
+    """(P, 3) measured points of every ``PIXEL_STRIDE``-th pixel of every such row, camera, meters."""
     depth_m = frame.depth_m[::PIXEL_STRIDE, ::PIXEL_STRIDE]
     rows, columns = np.nonzero(depth_m > 0)
     pixels = PIXEL_STRIDE * np.stack((columns, rows), axis=1).astype(np.float64)

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 
 COLORS = ("#77aadd", "#ee8866", "#44bb99", "#eedd88", "#ffaabb", "#99ddff", "#bbcc33", "#aaaa00", "#dddddd")
-"""Paul Tol's "light" scheme: told apart by the colour-blind too, and black text is read on each."""
+"""Paul Tol's "light" scheme: told apart by the color-blind too, and black text is read on each."""
 
 HATCHES = ("", "///", "...", "xxx")
-"""What tells names apart once the colours have all been used."""
+"""What tells names apart once the colors have all been used."""
 
 STYLE: Any = {
     "font.size": 11.0,
@@ -43,10 +43,10 @@ def trajectory_plot(
     errors_m: NDArray[np.floating],
     up: ArrayLike,
 ) -> None:
-    """A trajectory from above, coloured by its error.
+    """A trajectory from above, colored by its error.
 
-    true_xyz: (N, 3) true camera centres, metres.  estimated_xyz: (M, 3) estimated ones, aligned to the true frame.
-    errors_m: (M,) distance of each from its true one.  up: (3,) the direction towards the ceiling in the true frame.
+    true_xyz: (N, 3) true camera centers, meters.  estimated_xyz: (M, 3) estimated ones, aligned to the true frame.
+    errors_m: (M,) distance of each from its true one.  up: (3,) the direction toward the ceiling in the true frame.
     """
     import matplotlib
 
@@ -76,7 +76,7 @@ def trajectory_plot(
                 *true[0], marker="o", markersize=8, markerfacecolor="none", color="0.2", linestyle="", label="start"
             )
         axes.set_aspect("equal", adjustable="datalim")
-        axes.set(title=title, xlabel="metres", ylabel="metres")
+        axes.set(title=title, xlabel="meters", ylabel="meters")
         axes.grid(color="0.92")
         axes.set_axisbelow(True)
         figure.colorbar(drawn, ax=axes, label="error (cm)", fraction=0.05)

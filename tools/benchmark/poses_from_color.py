@@ -103,7 +103,7 @@ def _or_none(pose: Any) -> Any:
 
 
 def _scores(T_world_cam: Any, true: Any) -> Figures:
-    """Of (N, 4, 4) poses against true ones: share that is placed, and ATE of the camera centres after Sim(3)."""
+    """Of (N, 4, 4) poses against true ones: share that is placed, and ATE of the camera centers after Sim(3)."""
     import numpy as np
 
     from freeocc3d.core.transforms import umeyama

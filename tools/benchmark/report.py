@@ -99,7 +99,7 @@ def _fit_lines(rows: list[Figures]) -> list[str]:
             )
         surface = found.get((capture, "true_poses_tsdf"), {}).get("surface_m2")
         if surface and ours.get("gaussians"):
-            lines.append(f"\n{capture}: {ours['gaussians'] / surface:.0f} Gaussians per square metre of surface")
+            lines.append(f"\n{capture}: {ours['gaussians'] / surface:.0f} Gaussians per square meter of surface")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""Multi-view stereo on a capture's colour at its true poses, against its depth."""
+"""Multi-view stereo on a capture's color at its true poses, against its depth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from freeocc3d.tracking.trackers import known
 from .figures import Figures
 
 ASKED = "<= 1.5 % (rendered), <= 3 % (kitchen), >= 40 % kept"
-_CLOSE = 0.01  # metres from frame to frame: below it every fifth frame is used, above it every third
+_CLOSE = 0.01  # meters from frame to frame: below it every fifth frame is used, above it every third
 _AROUND = 10  # frames on either side of these that stereo is given
 
 
@@ -40,7 +40,7 @@ def measure_stereo(capture: str, frames: int | None = None) -> Figures:
     used = list(select_frames(opened))
     ratio = focal_calibration.estimate_color_focal(opened, select_frames(opened))
 
-    def colour(frame: Frame) -> Frame:
+    def color(frame: Frame) -> Frame:
         camera = frame.intrinsics
         return replace(frame, intrinsics=replace(camera, fx=camera.fx * ratio, fy=camera.fy * ratio))
 
@@ -49,15 +49,15 @@ def measure_stereo(capture: str, frames: int | None = None) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         depth = multi_view_stereo.StereoDepth(Path(folder), multi_view_stereo.Options())
         started, cpu = time.perf_counter(), time.process_time()
-        scan = triangulate(opened, T_world_cam, used, Progress(), colour)
-        depth.compute(opened, scan, _with_others(compared, used), Progress(), colour)
+        scan = triangulate(opened, T_world_cam, used, Progress(), color)
+        depth.compute(opened, scan, _with_others(compared, used), Progress(), color)
         done = len(_with_others(compared, used))
         seconds, cpu = (time.perf_counter() - started) / done, (time.process_time() - cpu) / done
         errors, in_sigmas, true = [], [], 0
         for index in compared:
             frame = opened[index]
             truth = (
-                PixelGrid(frame.intrinsics, colour(frame).intrinsics).depth(frame.depth_m)
+                PixelGrid(frame.intrinsics, color(frame).intrinsics).depth(frame.depth_m)
                 if ratio != 1
                 else frame.depth_m
             )
@@ -89,7 +89,7 @@ def _with_others(compared: Sequence[int], used: Sequence[int]) -> list[int]:
 
 
 def _spacing(capture: Capture) -> float:
-    """Median way between one frame and the next, metres."""
+    """Median way between one frame and the next, meters."""
     poses = [capture.pose(index) for index in range(min(len(capture), 200))]
     places = np.array([pose[:3, 3] for pose in poses if pose is not None])
     return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
@@ -100,7 +100,7 @@ def tabulate_stereo(rows: list[Figures]) -> list[str]:
     if not rows:
         return []
     lines = [
-        f"\nDepth from colour alone at true poses (asked: {ASKED})\n",
+        f"\nDepth from color alone at true poses (asked: {ASKED})\n",
         "| capture | median relative error % | kept % | within 5 % | errors within a sigma % | s/frame | CPU s/frame |",
         "|---|---|---|---|---|---|---|",
     ]

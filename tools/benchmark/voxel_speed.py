@@ -30,7 +30,7 @@ def measure_voxels() -> Figures:
 
 
 def _features() -> Figures:
-    """Gaussians a second with 512-dimensional features, from binning to normalised voxels; the floor is the reading of
+    """Gaussians a second with 512-dimensional features, from binning to normalized voxels; the floor is the reading of
     each feature from memory once."""
     import numpy as np
 
@@ -138,7 +138,7 @@ def _codes() -> Figures:
 
 
 def _smooth(points: Any, length: float) -> Any:
-    """(P, 512) unit features that change over a length, metres."""
+    """(P, 512) unit features that change over a length, meters."""
     import numpy as np
 
     rng = np.random.default_rng(0)

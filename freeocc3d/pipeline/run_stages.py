@@ -141,7 +141,7 @@ def build_gaussians(run: Run) -> None:
     if len(run.gaussians) == 0:
         raise TrackingError(
             f"The {len(run.mapper.keyframes)} keyframes of {run.mapper.capture.path} hold too little depth for a map: "
-            "is its depth in metres after scaling (capture.depth_scale), and nearer than capture.max_depth?"
+            "is its depth in meters after scaling (capture.depth_scale), and nearer than capture.max_depth?"
         )
 
 

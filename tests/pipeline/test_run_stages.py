@@ -13,7 +13,7 @@ from vision_servers import saying, serving
 import freeocc3d
 from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, Interrupted, MapError
 from freeocc3d.core.progress import Progress
-from freeocc3d.pipeline import stages
+from freeocc3d.pipeline import run_stages
 from freeocc3d.pipeline.mapper import Mapper
 from freeocc3d.storage import writer
 from freeocc3d.storage.manifest import NameCount
@@ -35,7 +35,7 @@ class Stopper(Progress):
 
 @pytest.mark.parametrize(("stage", "after"), [("tracking", 12), ("tracking", 3), ("language", 1)])
 def test_an_interrupted_run_leaves_no_map_and_resumes_to_the_same(tmp_path, room, monkeypatch, stage, after) -> None:
-    monkeypatch.setattr(stages, "_CHECKPOINT_FRAMES", 5)
+    monkeypatch.setattr(run_stages, "_CHECKPOINT_FRAMES", 5)
     output = tmp_path / "map"
     with pytest.raises(Interrupted, match="--resume" if after != 3 else "nothing is kept"):
         freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper(stage, after))
@@ -63,7 +63,7 @@ def test_a_resumed_run_takes_up_refined_poses(tmp_path, room, monkeypatch) -> No
 
 
 def test_a_run_is_not_resumed_with_other_options_and_loses_nothing_by_the_attempt(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(stages, "_CHECKPOINT_FRAMES", 5)
+    monkeypatch.setattr(run_stages, "_CHECKPOINT_FRAMES", 5)
     output, work = tmp_path / "map", tmp_path / "map.partial"
     with pytest.raises(Interrupted):
         freeocc3d.reconstruct("builtin:room", output, ROOM, progress=Stopper("tracking", 12))
@@ -79,7 +79,7 @@ def test_a_run_is_not_resumed_with_other_options_and_loses_nothing_by_the_attemp
 
 
 def test_time_before_an_interruption_counts(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(stages, "_CHECKPOINT_FRAMES", 20)
+    monkeypatch.setattr(run_stages, "_CHECKPOINT_FRAMES", 20)
     with pytest.raises(Interrupted):
         freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, progress=Stopper("tracking", 21))
     state = np.load(tmp_path / "map.partial" / "tracking.npz")
