@@ -13,7 +13,7 @@ LONGEST_FILE, LONGEST_FUNCTION, LONGEST_KERNEL = 400, 80, 120
 SHORT, SHARE_OF_SHORT = 32, 0.95
 """Lines that this share of all functions does not exceed."""
 
-STILL_LONG = {"evaluation/scoring.py"}
+STILL_LONG: set[str] = set()
 """Files that are still over ``LONGEST_FILE``: none is added."""
 
 FILES = {str(path.relative_to(ROOT)): path for path in sorted(ROOT.rglob("*.py"))}

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from .. import __version__
 
 if TYPE_CHECKING:
-    from ..evaluation.scoring import Evaluation, ScoredScene
+    from ..evaluation.scene_scoring import ScoredScene
+    from ..evaluation.scoring import Evaluation
 
 
 def scores_document(evaluation: Evaluation) -> dict[str, Any]:

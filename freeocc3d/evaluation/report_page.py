@@ -17,7 +17,8 @@ from ..core.errors import DependencyError
 from ..viewer.grid_pictures import LabelGrid, draw_grids
 from ..viewer.palette import assign_class_colors, color_by_value
 from ..viewer.scene_rendering import CUT, turn_upright
-from .scoring import PRIMARY_MASK, TOP, Evaluation, ScoredScene
+from .scene_scoring import ScoredScene
+from .scoring import PRIMARY_MASK, TOP, Evaluation
 
 MOST_SEGMENTS = 2000
 """Pieces that a drawn trajectory has at most."""

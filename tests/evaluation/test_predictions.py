@@ -12,7 +12,7 @@ import freeocc3d
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.transforms import quats_to_rotations, rotations_to_quats
 from freeocc3d.core.types import Gaussians, PosedFrame
-from freeocc3d.evaluation import predictions, scoring
+from freeocc3d.evaluation import predictions, scene_scoring, scoring
 from freeocc3d.evaluation.confusion import Prediction
 from freeocc3d.evaluation.ground_truth import save_ground_truth
 from freeocc3d.evaluation.scored_classes import ClassMap, map_each_to_itself
@@ -91,7 +91,7 @@ def test_the_rooms_map_agrees_with_its_truth(room: Any) -> None:
     capture = room.capture
     arrays = capture.ground_truth()  # type: ignore[attr-defined]
     truth = GroundTruth(arrays["labels"], arrays["origin"], arrays["voxel_size"], tuple(arrays["classes"].tolist()))
-    scene = scoring.score_map(room, truth, map_each_to_itself(truth.classes))
+    scene = scene_scoring.score_map(room, truth, map_each_to_itself(truth.classes))
     assert scene.errors is not None
     assert scene.errors.ate_rmse_m < 0.01
     scored = scoring.Evaluation((scene,), truth.classes[1:], "se3")
@@ -121,7 +121,7 @@ def test_the_order_of_frames_does_not_count(room: Any) -> None:
     np.testing.assert_array_equal(usual.state, shuffled.state)
     own = select_estimated_poses(room.trajectory)
     turned = Poses(own.timestamps[::-1], own.T_world_cam[::-1])
-    scored = [scoring.score_map(room, lattice(), NO_CLASSES, poses) for poses in (own, turned)]
+    scored = [scene_scoring.score_map(room, lattice(), NO_CLASSES, poses) for poses in (own, turned)]
     np.testing.assert_array_equal(scored[0].predicted.occupied, scored[1].predicted.occupied)
 
 
@@ -338,13 +338,13 @@ def test_another_systems_map_is_scored_through_its_trajectory(room: Any, tmp_pat
     direct = predictions.predict_from_gaussians(
         room.gaussians, None, config.load(None), TrajectoryAlignment.identity(), lattice()
     )
-    scene = scoring.score_gaussians(ply, lattice(), NO_CLASSES, theirs, own, "sim3")
+    scene = scene_scoring.score_gaussians(ply, lattice(), NO_CLASSES, theirs, own, "sim3")
     assert scene.alignment.scale == pytest.approx(2.0)
     assert agreement(scene.predicted.occupied, direct.occupied) > 0.995
-    wrong = scoring.score_gaussians(ply, lattice(), NO_CLASSES, theirs, own, "se3")
+    wrong = scene_scoring.score_gaussians(ply, lattice(), NO_CLASSES, theirs, own, "se3")
     assert agreement(wrong.predicted.occupied, direct.occupied) < 0.5
     assert align_trajectories(theirs, own, "sim3").scale == pytest.approx(2.0)
     with pytest.raises(FreeOccError, match="--trajectory"):
-        scoring.score_gaussians(ply, lattice(), NO_CLASSES, None, own)
+        scene_scoring.score_gaussians(ply, lattice(), NO_CLASSES, None, own)
     with pytest.raises(FreeOccError, match="--poses"):
-        scoring.score_gaussians(ply, lattice(), NO_CLASSES, theirs, None)
+        scene_scoring.score_gaussians(ply, lattice(), NO_CLASSES, theirs, None)

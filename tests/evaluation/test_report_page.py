@@ -13,7 +13,8 @@ import pytest
 from freeocc3d.core.errors import DependencyError, ExportError
 from freeocc3d.evaluation import report_page
 from freeocc3d.evaluation.confusion import Prediction
-from freeocc3d.evaluation.scoring import Evaluation, ScoredScene
+from freeocc3d.evaluation.scene_scoring import ScoredScene
+from freeocc3d.evaluation.scoring import Evaluation
 from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors
 from freeocc3d.evaluation.true_occupancy import GroundTruth
 from freeocc3d.tracking.trajectory_alignment import Poses, TrajectoryAlignment

@@ -15,8 +15,9 @@ from freeocc3d.cli.scores import scores_document, scores_text
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.evaluation.confusion import Prediction
 from freeocc3d.evaluation.ground_truth import load_ground_truth, save_ground_truth
+from freeocc3d.evaluation.scene_scoring import ScoredScene
 from freeocc3d.evaluation.scored_classes import map_each_to_itself
-from freeocc3d.evaluation.scoring import Evaluation, ScoredScene, ScoringRequest, evaluate_scenes
+from freeocc3d.evaluation.scoring import Evaluation, ScoringRequest, evaluate_scenes
 from freeocc3d.evaluation.true_occupancy import GroundTruth
 from freeocc3d.tracking.trajectory_alignment import TrajectoryAlignment
 

@@ -51,7 +51,7 @@ def _count_frames(capture: Path) -> int:
 def score_map(map: str, capture: str, out: str) -> Figures:
     """ATE and RPE against the capture's poses; IoU and mIoU where it brings a ground truth. Leaves the aligned poses of
     all frames in ``out``."""
-    from freeocc3d.evaluation import scoring
+    from freeocc3d.evaluation import scene_scoring, scoring
     from freeocc3d.evaluation.ground_truth import load_ground_truth
     from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors
     from freeocc3d.query.scan_map import load_map
@@ -69,7 +69,7 @@ def score_map(map: str, capture: str, out: str) -> Figures:
     if truth_path.is_file():
         truth = load_ground_truth(truth_path)
         classes = scoring.collect_common_classes([truth])
-        scene = scoring.score_map(loaded, truth, classes, true, how)
+        scene = scene_scoring.score_map(loaded, truth, classes, true, how)
         scored = scoring.Evaluation((scene,), classes.classes, how)
         figures |= scores_row(scored.scores, scored.miou(), scored.classes_in_miou)
     return figures

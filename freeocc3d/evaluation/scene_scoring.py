@@ -1,0 +1,201 @@
+"""One scene scored: its truth, a claim about its voxels and, where there is one, its trajectory.
+
+The claim comes from a saved map, from the Gaussians of another system, from per-frame Gaussians or from a voxel grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import FreeOccError
+from ..core.types import UNKNOWN
+from ..gaussians.splat_ply import read_standard_ply
+from ..occupancy.up_direction import estimate_up
+from ..query.scan_map import Map
+from ..settings import config
+from ..storage.map_files import CONFIG
+from ..tracking.trajectory_alignment import (
+    Poses,
+    TrajectoryAlignment,
+    align_trajectories,
+    read_true_poses,
+    select_estimated_poses,
+)
+from . import predictions
+from .confusion import Prediction
+from .scored_classes import ClassMap
+from .trajectory_errors import TrajectoryErrors, measure_trajectory_errors
+from .true_occupancy import GroundTruth
+
+
+@dataclass(frozen=True)
+class ScoredScene:
+    """One scored scene.
+
+    name: of the map, file or folder that was scored.  truth: in terms of the scored classes.
+    alignment: of the estimate's world with the true one.  errors: of the trajectory, None where there is none.
+    frames: of the capture, or with a true pose.  frames_with_pose: of those, with an estimated pose.
+    up: (3,) unit vector towards the ceiling in the true world, for pictures.
+    notes: sentences about what should be known when the figures are read.
+    """
+
+    name: str
+    truth: GroundTruth
+    predicted: Prediction
+    alignment: TrajectoryAlignment
+    errors: TrajectoryErrors | None
+    frames: int | None
+    frames_with_pose: int | None
+    up: NDArray[np.float64]
+    notes: tuple[str, ...]
+
+
+def score_map(
+    scan_map: Map,
+    truth: GroundTruth,
+    classes: ClassMap,
+    poses: Poses | None = None,
+    how: str = "se3",
+    overrides: Sequence[str] = (),
+) -> ScoredScene:
+    """Score a map. poses: the true ones, by default those of the capture that the map was made of.
+
+    overrides: options of layer 4, ``occupancy.threshold=0.4``, in place of those that the map was made with.
+    Raises FreeOccError: no true poses, an alignment that is not determined.
+    """
+    settings = config.load_saved(scan_map.path / CONFIG, list(overrides))
+    estimated = select_estimated_poses(scan_map.trajectory)
+    if poses is None:
+        try:
+            poses = _own_poses(scan_map)
+        except FreeOccError:
+            if how != "none":
+                raise
+    alignment = TrajectoryAlignment.identity() if poses is None else align_trajectories(estimated, poses, how)
+    predicted, note = predictions.predict_from_map(scan_map, settings, alignment, truth, classes)
+    notes = [note] if note else []
+    if not scan_map.metric and how != "sim3":
+        notes.append("The map's scale is unknown: --align sim3 compares it at the true one.")
+    return ScoredScene(
+        name=str(scan_map.path),
+        truth=truth,
+        predicted=predicted,
+        alignment=alignment,
+        errors=None if poses is None else measure_trajectory_errors(estimated, poses, alignment),
+        frames=len(scan_map.trajectory),
+        frames_with_pose=len(estimated),
+        up=alignment.rotation @ scan_map.up,
+        notes=tuple(notes),
+    )
+
+
+def score_gaussians(
+    ply: Path,
+    truth: GroundTruth,
+    classes: ClassMap,
+    trajectory: Poses | None,
+    poses: Poses | None,
+    how: str = "se3",
+    overrides: Sequence[str] = (),
+) -> ScoredScene:
+    """Score the Gaussians of another system: a 3DGS PLY and the trajectory that belongs to it.
+
+    trajectory: the system's own, whose world the Gaussians are in; None if they are in the true frame (``how`` none).
+    poses: the true ones. Raises FreeOccError as ``score_map``, and for a PLY that cannot be read.
+    """
+    alignment, errors = _aligned(trajectory, poses, how, ply)
+    gaussians, labels = read_standard_ply(ply)
+    semantics = predictions.encode_one_hot(labels, classes, ply)
+    predicted = predictions.predict_from_gaussians(
+        gaussians, semantics, config.load(None, list(overrides)), alignment, truth
+    )
+    notes = [] if labels is not None else [f"The Gaussians of {ply.name} have no classes: mIoU is not available."]
+    return _other(ply, truth, predicted, alignment, errors, trajectory, poses, notes)
+
+
+def score_frames(
+    folder: Path, truth: GroundTruth, classes: ClassMap, poses: Poses, overrides: Sequence[str] = ()
+) -> ScoredScene:
+    """Score per-frame Gaussians fused by true poses (``project.of_frames``)."""
+    predicted, fused = predictions.predict_from_frames(
+        folder, poses, config.load(None, list(overrides)), truth, classes
+    )
+    notes = [f"The Gaussians of {fused} frames were fused by true poses."]
+    scene = _other(folder, truth, predicted, TrajectoryAlignment.identity(), None, None, poses, notes)
+    return scene
+
+
+def score_grid(
+    path: Path,
+    truth: GroundTruth,
+    classes: ClassMap,
+    trajectory: Poses | None = None,
+    poses: Poses | None = None,
+    how: str = "se3",
+) -> ScoredScene:
+    """Score a finished voxel grid. Without a trajectory it is in the true frame already."""
+    alignment, errors = _aligned(trajectory, poses, how if trajectory is not None else "none", path)
+    predicted, note = predictions.predict_from_grid(path, alignment, truth, classes)
+    return _other(path, truth, predicted, alignment, errors, trajectory, poses, [note] if note else [])
+
+
+def _aligned(
+    trajectory: Poses | None, poses: Poses | None, how: str, path: Path
+) -> tuple[TrajectoryAlignment, TrajectoryErrors | None]:
+    if trajectory is None or poses is None:
+        if how != "none":
+            lacking = (
+                "the trajectory that it was made with (--trajectory)" if trajectory is None else "true poses (--poses)"
+            )
+            raise FreeOccError(
+                f"{path} is aligned by camera centres, for which {lacking} must be given; if it is in the frame of the "
+                "true poses already, use --align none."
+            )
+        return TrajectoryAlignment.identity(), None
+    alignment = align_trajectories(trajectory, poses, how)
+    return alignment, measure_trajectory_errors(trajectory, poses, alignment)
+
+
+def _other(
+    path: Path,
+    truth: GroundTruth,
+    predicted: Prediction,
+    alignment: TrajectoryAlignment,
+    errors: TrajectoryErrors | None,
+    trajectory: Poses | None,
+    poses: Poses | None,
+    notes: Sequence[str],
+) -> ScoredScene:
+    """A scene of another system's."""
+    return ScoredScene(
+        name=str(path),
+        truth=truth,
+        predicted=predicted,
+        alignment=alignment,
+        errors=errors,
+        frames=None if poses is None else len(poses),
+        frames_with_pose=None if trajectory is None else len(trajectory),
+        up=_up(truth, poses),
+        notes=tuple(notes),
+    )
+
+
+def _up(truth: GroundTruth, poses: Poses | None) -> NDArray[np.float64]:
+    """(3,) where up is in the true world; without poses z, as in the published data sets."""
+    if poses is None:
+        return np.array((0.0, 0.0, 1.0))
+    return estimate_up(poses.T_world_cam, truth.centers()[(truth.labels > 0) & (truth.labels != UNKNOWN)])
+
+
+def _own_poses(scan_map: Map) -> Poses:
+    """The poses that the map's capture states. Raises FreeOccError."""
+    try:
+        capture = scan_map.capture
+    except FreeOccError as error:
+        raise FreeOccError(f"{error} Name the true poses with --poses.") from error
+    return read_true_poses(capture)
