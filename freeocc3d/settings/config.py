@@ -1,7 +1,7 @@
-"""A configuration: strict in (an unknown key is an error that names the nearest), typed once, resolved YAML out.
+"""Configurations: an unknown key is an error that suggests the nearest one; values are typed once and written as YAML.
 
-A configuration file is a mapping section -> key -> value. A section is a class of ``stages``; what its backends are
-configured with stands in one sub-section for each, by the backend's name.
+A configuration file is a mapping section -> key -> value. Each section is a class of ``stages``. The options of its
+backends are in one sub-section for each, under the backend's name.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from .typed_options import TypedOptions, build, field_types, nearest
 from .yaml_files import apply_override, read_yaml
 
 BackendValues = dict[str, dict[str, Any]]
-"""Name of a backend -> its options that are given, as plain values."""
+"""Name of a backend -> the values given for its options."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a configuration file. folder: of its backends.  choice: the option that names the one to use.
-    within: the section that it stands in, where that is not the file itself."""
+    """A section of a configuration file. folder: that of its backends.  choice: the option that selects one of them.
+    within: the section that contains this one; empty = the file itself."""
 
     options: type[TypedOptions]
     folder: str = ""
@@ -49,11 +49,11 @@ SECTIONS: dict[str, Section] = {
     "occupancy": Section(stages.OccupancyOptions),
     "carving": Section(stages.CarvingOptions),
 }
-"""Field of ``Settings`` -> how it stands in a file."""
+"""Field of ``Settings`` -> its section of a file."""
 
 
 class Settings(msgspec.Struct, frozen=True):
-    """A resolved configuration: the options of every stage, and what is given for backends."""
+    """A resolved configuration: the options of every stage, and the values given for backends."""
 
     capture: stages.CaptureOptions
     tracking: stages.TrackingOptions
@@ -65,48 +65,48 @@ class Settings(msgspec.Struct, frozen=True):
     occupancy: stages.OccupancyOptions
     carving: stages.CarvingOptions
     backends: dict[str, BackendValues] = {}
-    """Section -> what is given for its backends; options that are not given have their defaults."""
+    """Section -> the values given for its backends; other options have their defaults."""
 
     def changed(self, section: str, **values: Any) -> Settings:
-        """A copy with other values in a section (a field of this class). Raises ConfigError."""
+        """Returns a copy with other values in a section (a field of this class). Raises ConfigError."""
         return msgspec.structs.replace(self, **{section: getattr(self, section).changed(**values)})
 
     def with_backend(self, section: str, **values: Any) -> Settings:
-        """A copy with other values for the section's chosen backend. Raises ConfigError."""
+        """Returns a copy with other values for the selected backend of a section. Raises ConfigError."""
         name, backends = self.chosen(section), copy.deepcopy(self.backends)
         given = {**backends.get(section, {}).get(name, {}), **values}
         backends.setdefault(section, {})[name] = _checked(section, name, given)
         return msgspec.structs.replace(self, backends=backends)
 
     def has_backend_option(self, section: str, name: str) -> bool:
-        """Whether the backend that a section chooses has an option."""
+        """Whether the selected backend of a section has an option."""
         backend = registry.backend(SECTIONS[section].folder, self.chosen(section))
         return any(option.name == name for option in backend.options)
 
     def chosen(self, section: str) -> str:
-        """The name of the backend that a section chooses."""
+        """The name of the selected backend of a section."""
         return str(getattr(getattr(self, section), SECTIONS[section].choice))
 
     def backend(self, section: str) -> tuple[Any, Any]:
-        """The module of the backend that a section chooses, and its options, None where it has none.
+        """The module of the selected backend of a section, and its options (None if it has none).
 
-        Raises ConfigError: unknown name or option; DependencyError for one whose packages are not installed.
+        Raises ConfigError for an unknown name or option, DependencyError if its packages are not installed.
         """
         name = self.chosen(section)
         module = registry.load(SECTIONS[section].folder, name)
         return module, registry.build_options(module, self.given(section, name), f"{section}.{name}.")
 
     def load_backend(self, section: str, *arguments: Any) -> Any:
-        """The backend that a section chooses, made with its own options and with what else its kind takes."""
+        """Makes the selected backend of a section from its own options and the arguments that its kind takes."""
         module, options = self.backend(section)
         return module.load(*arguments) if options is None else module.load(options, *arguments)
 
     def given(self, section: str, name: str) -> dict[str, Any]:
-        """What is given for a backend."""
+        """The values given for a backend."""
         return self.backends.get(section, {}).get(name, {})
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
-        """Plain values as in a file: every option of the stages and of the backends that are chosen or given."""
+        """Plain values as in a file: every option of the stages and of the backends that are selected or given."""
         plain: dict[str, dict[str, Any]] = {}
         for name, section in SECTIONS.items():
             values = getattr(self, name).to_dict()
@@ -119,7 +119,8 @@ class Settings(msgspec.Struct, frozen=True):
         return plain
 
     def _backends_of(self, section: str) -> BackendValues:
-        """The options of a section's backends that are chosen or given; of all where the choice is left open."""
+        """The options of a section's backends that are selected or given; of all backends if the selection is
+        "auto"."""
         folder, chosen, given = SECTIONS[section].folder, self.chosen(section), self.backends.get(section, {})
         names = dict.fromkeys([*(registry.backends(folder) if chosen == "auto" else [chosen]), *given])
         found: BackendValues = {}
@@ -131,11 +132,11 @@ class Settings(msgspec.Struct, frozen=True):
 
 
 def load(path: Path | None, overrides: Iterable[str] = ()) -> Settings:
-    """The configuration of a YAML file or of a preset (``mono``), or the defaults, with overrides applied.
+    """Reads a configuration from a YAML file or a preset (``mono``), and applies overrides.
 
     path: None = the defaults.  overrides: ``section.key=value``.
-    Raises ConfigError: unreadable or invalid YAML, unknown key, a value of another type or out of its range, malformed
-    override.
+    Raises ConfigError for YAML that is unreadable or invalid, an unknown key, a value of another type or out of its
+    range, and a malformed override.
     """
     values: dict[Any, Any] = {}
     if path is not None:
@@ -153,10 +154,10 @@ def load(path: Path | None, overrides: Iterable[str] = ()) -> Settings:
 
 
 def load_saved(path: Path, overrides: Iterable[str] = ()) -> Settings:
-    """The configuration that a map was made with, as ``load``.
+    """Reads the configuration that a map was made with; overrides are as in ``load``.
 
-    It was checked then: what it says of backends that it does not choose is left out, and what it says of those that it
-    chooses is checked when they are used.
+    It was checked then. Options of backends that it does not select are left out; those of the selected ones are
+    checked when the backends are used.
     """
     try:
         saved = _resolve(read_yaml(path), saved=True)
@@ -170,25 +171,26 @@ def load_saved(path: Path, overrides: Iterable[str] = ()) -> Settings:
 
 
 def resolve(values: Mapping[str, Any] | Settings) -> Settings:
-    """``values``, checked, with all defaults filled in. Raises ConfigError."""
+    """Checks ``values`` and fills in all defaults. Raises ConfigError."""
     return values if isinstance(values, Settings) else _resolve(values, saved=False)
 
 
 def dump(settings: Settings) -> str:
-    """Resolved YAML; ``load`` of it gives the same configuration back."""
+    """Resolved YAML; ``load`` reads the same configuration back."""
     plain = json.loads(json.dumps(settings.to_dict()))  # tuples become lists
     return yaml.safe_dump(plain, sort_keys=False)
 
 
 def fingerprint(settings: Settings, sections: Iterable[str], *identity: Any) -> str:
-    """A hash of some sections and of what else a saved stage depends on: it is reused only while that is unchanged."""
+    """A hash of some sections and of other values that a saved stage depends on. A saved stage with the same hash is
+    reused."""
     plain = settings.to_dict()
     text = json.dumps([{name: plain[name] for name in sections}, identity], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _resolve(values: Mapping[Any, Any], saved: bool) -> Settings:
-    """saved: of a map's file, whose earlier names are no concern of the user's."""
+    """saved: the values come from a map's file, so old names give no warning."""
     outer = [name for name, section in SECTIONS.items() if not section.within]
     for name in values:
         if name not in outer:
@@ -220,7 +222,7 @@ def _resolve(values: Mapping[Any, Any], saved: bool) -> Settings:
 
 
 def _divided(name: str, given: dict[Any, Any], nested: list[str], warn: bool) -> tuple[dict[Any, Any], BackendValues]:
-    """A section's own options, and what it gives for its backends. Raises ConfigError for a key that is neither."""
+    """Separates a section's own options from those of its backends. Raises ConfigError for a key that is neither."""
     section, own, backends = SECTIONS[name], {}, {}
     known = field_types(section.options)
     for key, value in given.items():
@@ -239,8 +241,8 @@ def _divided(name: str, given: dict[Any, Any], nested: list[str], warn: bool) ->
 
 
 def _checked(section: str, name: str, values: dict[str, Any]) -> dict[str, Any]:
-    """What is given for a backend and is not the default, checked by the backend's class, or by its options' names
-    alone where its packages are not installed. Raises ConfigError."""
+    """The values given for a backend that are not its defaults. The backend's class checks them; if its packages are
+    not installed, only the names are checked. Raises ConfigError."""
     folder, where = SECTIONS[section].folder, f"{section}.{name}."
     backend = registry.backend(folder, name)
     defaults = {option.name: json.dumps(option.default) for option in backend.options}
@@ -257,11 +259,11 @@ def _checked(section: str, name: str, values: dict[str, Any]) -> dict[str, Any]:
 def _section(values: Mapping[Any, Any], name: str) -> dict[Any, Any]:
     given = values.get(name) or {}
     if not isinstance(given, dict):
-        raise ConfigError(f"Section '{name}' must hold 'key: value' lines, got {given!r}.")
+        raise ConfigError(f"The section '{name}' must contain 'key: value' lines, got {given!r}.")
     return given
 
 
 def _lines(given: Any, where: str) -> dict[Any, Any]:
     if not isinstance(given or {}, dict):
-        raise ConfigError(f"'{where}' must hold 'key: value' lines, got {given!r}.")
+        raise ConfigError(f"'{where}' must contain 'key: value' lines, got {given!r}.")
     return given or {}

@@ -1,4 +1,4 @@
-"""A configuration with every option, its default and what it does: ``configs/default.yaml``, which is written by
+"""Writes ``configs/default.yaml``, a configuration with every option, its default and what it does:
 
 python -m freeocc3d.settings.default_yaml > configs/default.yaml
 """
@@ -14,8 +14,8 @@ from .config import SECTIONS
 from .syntax_trees import Option, options_of
 
 _HEAD = """\
-# Every option with its default. A file of your own needs only the keys that it changes.
-# Options marked (advanced) are for comparisons with other methods: the defaults are meant to stay.
+# Every option with its default. Your own file needs only the keys that it changes.
+# Options marked (advanced) are for comparisons with other methods. Keep their defaults otherwise.
 """
 
 

@@ -1,13 +1,14 @@
-"""The types that options are declared with: numbers with their ranges, choices, and how a message describes a type.
+"""The types of options: numbers with ranges, choices, and the words for a type in messages.
 
-A range stands in the annotation, so that one declaration checks values, explains errors and documents the option::
+The annotation of an option holds its range, so one declaration checks values, explains errors and documents the
+option::
 
     voxel_size: Positive = 0.08
     stop: NotNegativeInt | None = None
     order: Literal["auto", "video", "photos"] = "auto"
     cutoff: Advanced[Positive] = 3.0
 
-Every type of number refuses what is not finite.
+All number types refuse infinity and NaN.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ PositiveInt = Annotated[int, Meta(ge=1)]
 NotNegativeInt = Annotated[int, Meta(ge=0)]
 
 Advanced = Annotated[T, Meta(extra={"advanced": True})]
-"""An option that only comparisons with other methods need: ``freeocc3d list`` shows it when it is asked for."""
+"""An option that is only for comparisons with other methods; ``freeocc3d list`` shows it only on request."""
 
 _NOUNS = {
     float: ("a number", "numbers"),
@@ -54,14 +55,14 @@ _NAMES = {
     "PositiveShare": PositiveShare, "Share": Share, "bool": bool, "float": float, "int": int, "str": str,
     "tuple": tuple,
 }  # fmt: skip
-"""What an annotation of an option may be made of."""
+"""The names that an option's annotation may contain."""
 
 
 def converted(kind: Any, value: Any, name: str) -> Any:
-    """``value`` as the type ``kind``: whole numbers become floats where a float is asked for, lists become tuples.
+    """Converts ``value`` to the type ``kind``: whole numbers become floats for a float type, lists become tuples.
 
-    name: what a message calls the option, such as "occupancy.voxel_size". Raises ConfigError for a value of another
-    type or out of its range.
+    name: the option's name in messages, such as "occupancy.voxel_size". Raises ConfigError for a value of another type
+    or out of its range.
     """
     try:
         plain = _plain(value)
@@ -73,7 +74,7 @@ def converted(kind: Any, value: Any, name: str) -> Any:
 
 
 def described(kind: Any) -> str:
-    """A type in words: "a number greater than 0 or null"."""
+    """Describes a type in words, such as "a number greater than 0 or null"."""
     return _listed(_alternatives(kind))
 
 
@@ -84,7 +85,7 @@ def is_advanced(kind: Any) -> bool:
 
 
 def holds_text(kind: Any) -> bool:
-    """Whether text is among the values of the type, or of its items."""
+    """Whether the type, or the type of its items, includes text."""
     base = _base(kind)
     return base is str or any(holds_text(part) for part in get_args(base))
 
@@ -95,7 +96,7 @@ def is_list(kind: Any) -> bool:
 
 
 def annotated_type(annotation: ast.expr, aliases: dict[str, ast.expr]) -> Any:
-    """The type that an annotation in a syntax tree stands for, or its source text where that cannot be known.
+    """The type that an annotation in a syntax tree means, or its source text if that is unknown.
 
     aliases: the names that its module assigns, such as ``Form = Literal["cubes", "points"]``.
     """
@@ -107,7 +108,7 @@ def annotated_type(annotation: ast.expr, aliases: dict[str, ast.expr]) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """The value with numpy's numbers as Python's."""
+    """Converts numpy numbers in the value to Python numbers."""
     if type(value) in (bool, int, float, str, type(None)):
         return value
     if isinstance(value, list | tuple):
@@ -129,7 +130,7 @@ def _base(kind: Any) -> Any:
 
 
 def _parts(kind: Any) -> tuple[Any, ...]:
-    """The alternatives of a union, None last; else the type alone."""
+    """The alternatives of a union, None last; otherwise the type itself."""
     base = _base(kind)
     if get_origin(base) in (Union, types.UnionType):
         return tuple(sorted(get_args(base), key=lambda part: part is type(None)))
@@ -159,7 +160,7 @@ def _described_list(kind: Any) -> str:
 
 
 def _range(kind: Any) -> str:
-    """The range of a number in words, empty for any finite number."""
+    """The range of a number in words; empty if every finite number is allowed."""
     metas = [part for part in getattr(kind, "__metadata__", ()) if isinstance(part, Meta)]
     low = next((f"at least {meta.ge:g}" for meta in metas if meta.ge is not None and meta.ge > -_LARGEST), "")
     low = next((f"greater than {meta.gt:g}" for meta in metas if meta.gt is not None), low)
@@ -179,7 +180,7 @@ def _listed(texts: list[str]) -> str:
 
 
 def _expected(kind: Any, value: Any) -> str:
-    """What the value should have been; only the range, where it is a number out of it."""
+    """Describes the expected value; for a number out of range, only the range."""
     plain = _plain(value)
     if isinstance(plain, float) and not math.isfinite(plain):
         return "a finite number"

@@ -1,7 +1,7 @@
-"""Files that come with freeocc3d and go by name: configurations, ablations and classes.
+"""Files that come with freeocc3d and that users select by name: configurations, ablations and classes.
 
-They lie in ``configs/`` of the repository. The folder ``preset_files`` next to this module is a link to it, so that a
-wheel holds them too.
+They are in ``configs/`` of the repository. The folder ``preset_files`` next to this module is a link to it, so that a
+wheel contains them too.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ _ABLATIONS = "ablations"
 
 
 def find_preset(given: str | Path, kind: Literal["configuration", "classes"] = "configuration") -> Path:
-    """The file that a path or a name means: ``mono`` is ``configs/mono.yaml``, ``rgbd_no_loops`` and
-    ``ablations/rgbd_no_loops`` are files of ``configs/ablations``, and with kind "classes" ``nyu40_to_embodiedocc`` is
-    one of ``configs/classes``.
+    """Finds the file for a path or a name: ``mono`` is ``configs/mono.yaml``. ``rgbd_no_loops`` and
+    ``ablations/rgbd_no_loops`` are files in ``configs/ablations``. With kind "classes", ``nyu40_to_embodiedocc`` is in
+    ``configs/classes``.
 
-    A file that exists comes before a preset. What has a suffix, or is an absolute path, is no name: it is returned
-    unchanged. Raises ConfigError for an unknown name.
+    An existing file takes precedence over a preset. A path with a suffix and an absolute path are no names; they are
+    returned unchanged. Raises ConfigError for an unknown name.
     """
     path = Path(given)
     if path.is_file() or path.suffix or path.is_absolute():
@@ -33,13 +33,13 @@ def find_preset(given: str | Path, kind: Literal["configuration", "classes"] = "
             return found
     known = list_presets(kind)
     raise ConfigError(
-        f"There is no file '{given}', and nothing of that name comes with freeocc3d{nearest(str(given), known)}: name "
-        f"a file, or one of {', '.join(known)}."
+        f"There is no file or preset '{given}'{nearest(str(given), known)}. Give the path of a file, or one of the "
+        f"presets {', '.join(known)}."
     )
 
 
 def list_presets(kind: Literal["configuration", "classes"] = "configuration") -> list[str]:
-    """Names that ``find_preset`` knows, ablations last."""
+    """The names that ``find_preset`` accepts, ablations last."""
     if kind == "classes":
         return _names(FOLDER / "classes")
     return [*_names(FOLDER), *(f"{_ABLATIONS}/{name}" for name in _names(FOLDER / _ABLATIONS))]

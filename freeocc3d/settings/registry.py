@@ -1,10 +1,12 @@
 """Lists the backends of a folder without importing them, loads one by name, and makes its options.
 
-A backend is one file. Its docstring's first line says what it does; ``REQUIRES`` names the packages that it imports
-beyond the core ones; ``Options``, if it has any, is a class of ``typed_options`` whose fields each carry a docstring.
-All of that is read from the syntax tree, so that listing is instant and works where a backend's packages are not
-installed. Another package adds a backend by an entry point, whose name is the backend's and whose value is the module:
-group "freeocc3d.encoders", or the same with readers, trackers, rasterizers or exporters.
+A backend is one file. The first line of its docstring says what it does. ``REQUIRES`` names the packages that it
+imports in addition to the core ones. ``Options``, if it exists, is a class of ``typed_options``; each field has a
+docstring. All this is read from the syntax tree, so listing is fast and works if the packages of a backend are not
+installed.
+
+Another package adds a backend by an entry point: its name is the backend's name, its value is the module, and its group
+is "freeocc3d.encoders", or the same with readers, trackers, rasterizers or exporters.
 """
 
 from __future__ import annotations
@@ -33,12 +35,12 @@ FOLDERS = {
     "language.encoders": "encoder",
     "export": "exporter",
 }
-"""Folders that hold backends, and what one of them is called."""
+"""Folder of backends -> what a message calls one of them."""
 
 
 @dataclass(frozen=True)
 class Backend:
-    """What the syntax tree of a backend's file says of it. module: the file's dotted name."""
+    """What the syntax tree of a backend's file states. module: the file's dotted name."""
 
     folder: str
     name: str
@@ -55,8 +57,8 @@ class Backend:
 
 @functools.cache
 def backends(folder: str) -> dict[str, Backend]:
-    """The backends of ``folder`` (a key of FOLDERS) by name, sorted; those of other packages follow. A name that this
-    package has is its own. Nothing is imported."""
+    """Lists the backends of ``folder`` (a key of FOLDERS) by name: those of this package, sorted, then those of other
+    packages. If both have a name, it means this package's backend. Imports nothing."""
     stems = sorted(path.stem for path in PACKAGE.joinpath(*folder.split(".")).glob("*.py"))
     own = {stem.rstrip("_"): f"freeocc3d.{folder}.{stem}" for stem in stems}
     found = {name: backend for name, module in own.items() if (backend := _described(folder, name, module))}
@@ -65,20 +67,20 @@ def backends(folder: str) -> dict[str, Backend]:
 
 
 def backend(folder: str, name: str) -> Backend:
-    """One of a folder's, also by an earlier name; it is not imported. Raises ConfigError for an unknown name, naming
-    the nearest."""
+    """Finds a backend by its name or an old name; does not import it. Raises ConfigError for an unknown name and
+    suggests the nearest."""
     name = renamed.current_backend(folder, name)
     found = _own(folder, name)
     if found is not None:
         return found
     known = backends(folder)
     if name not in known:
-        raise ConfigError(f"Unknown {FOLDERS[folder]} '{name}'{nearest(name, known)}; there are: {', '.join(known)}.")
+        raise ConfigError(f"Unknown {FOLDERS[folder]} '{name}'{nearest(name, known)}. Choose from: {', '.join(known)}.")
     return known[name]
 
 
 def folder_of(kind: str) -> str:
-    """The key of FOLDERS that someone means: "exporters", "exporter" and "export" are one. Raises ConfigError."""
+    """Finds the key of FOLDERS for a kind: "exporters", "exporter" and "export" mean the same. Raises ConfigError."""
     names = {
         name: folder
         for folder, title in FOLDERS.items()
@@ -86,40 +88,40 @@ def folder_of(kind: str) -> str:
     }
     if kind not in names:
         kinds = [f"{title.split()[-1]}s" for title in FOLDERS.values()]
-        raise ConfigError(f"Unknown kind '{kind}'{nearest(kind, kinds)}; there are: {', '.join(kinds)}.")
+        raise ConfigError(f"Unknown kind '{kind}'{nearest(kind, kinds)}. Choose from: {', '.join(kinds)}.")
     return names[kind]
 
 
 def load(folder: str, name: str) -> types.ModuleType:
-    """Import the backend ``name`` of ``folder``.
+    """Imports the backend ``name`` of ``folder``.
 
-    Raises ConfigError for an unknown name (naming the nearest), DependencyError if a required package is missing.
+    Raises ConfigError for an unknown name and suggests the nearest; DependencyError if a required package is missing.
     """
     found = backend(folder, name)
     if missing := found.missing:
-        raise DependencyError(f"The {FOLDERS[folder]} '{name}' needs {', '.join(missing)}: pip install them first.")
+        raise DependencyError(f"The {FOLDERS[folder]} '{name}' needs {', '.join(missing)}: install with pip.")
     return importlib.import_module(found.module)
 
 
 def build_options(module: types.ModuleType, values: Mapping[str, Any], where: str = "") -> Any:
-    """The module's ``Options`` made of plain values, None where it has none. where: what stands before a key in
-    messages. Raises ConfigError: an unknown key, a value of another type or out of its range."""
+    """Makes the module's ``Options`` from plain values; None if it has none. where: the text before a key in messages.
+    Raises ConfigError for an unknown key and for a value of another type or out of its range."""
     options = getattr(module, "Options", None)
-    if options is not None and options.__module__ == module.__name__:  # else it is another file's, imported
+    if options is not None and options.__module__ == module.__name__:  # else it was imported from another file
         return build(options, values, where)
     if values:
-        raise ConfigError(f"'{where.rstrip('.')}' has no options, got {', '.join(map(str, values))}.")
+        raise ConfigError(f"'{where.rstrip('.')}' has no options. Remove {', '.join(map(str, values))}.")
     return None
 
 
 def is_backend(folder: str, name: str) -> bool:
-    """Whether a folder has a backend of that name, or had one."""
+    """Whether a folder has, or had, a backend with that name."""
     name = renamed.current_backend(folder, name)
     return _own(folder, name) is not None or name in backends(folder)
 
 
 def check_names(backend: Backend, values: Mapping[str, Any], where: str) -> None:
-    """Raises ConfigError for an option that a backend lacks, which is not imported."""
+    """Raises ConfigError for an option that a backend does not have; does not import the backend."""
     known = [option.name for option in backend.options]
     for key in values:
         if key not in known:
@@ -127,7 +129,7 @@ def check_names(backend: Backend, values: Mapping[str, Any], where: str) -> None
 
 
 def _own(folder: str, name: str) -> Backend | None:
-    """This package's own backend of that name, if there is one; the other files of its folder are not read."""
+    """This package's backend with that name, or None; reads no other file of the folder."""
     for stem in (name, f"{name}_"):
         if name.isidentifier() and PACKAGE.joinpath(*folder.split("."), f"{stem}.py").is_file():
             return _described(folder, name, f"freeocc3d.{folder}.{stem}")
@@ -136,7 +138,7 @@ def _own(folder: str, name: str) -> Backend | None:
 
 @functools.cache
 def _described(folder: str, name: str, module: str) -> Backend | None:
-    """What a module says of itself; None for one that is no backend, as it names no requirements."""
+    """What a module states about itself; None if it names no requirements and so is no backend."""
     try:
         requires = syntax_trees.assigned_value(module, "REQUIRES")
     except FileNotFoundError:
@@ -149,7 +151,7 @@ def _described(folder: str, name: str, module: str) -> Backend | None:
 
 def _added_elsewhere(folder: str) -> dict[str, str]:
     """Name -> module of the backends that installed packages add to a folder."""
-    from importlib.metadata import entry_points  # takes a tenth of a second, and is for listing and unknown names
+    from importlib.metadata import entry_points  # slow (0.1 s), and only listing and unknown names need it
 
     group = f"freeocc3d.{FOLDERS[folder].split()[-1]}s"
     return {point.name: point.module for point in entry_points(group=group)}

@@ -1,7 +1,7 @@
-"""The options of the stages, one class for each section of a configuration.
+"""The options of the stages: one class for each section of a configuration.
 
-Options of a backend (a tracker, an encoder, ...) stand in the backend's own file; what only some caller needs, such as
-the options of a query, stands with it.
+The options of a backend (a tracker, an encoder, …) are in the backend's own file. Options that only one caller needs,
+such as those of a query, are in that caller's file.
 """
 
 from __future__ import annotations
@@ -25,158 +25,161 @@ from .typed_options import TypedOptions
 
 
 class CaptureOptions(TypedOptions, frozen=True):
-    """How any capture is read."""
+    """How captures are read."""
 
     format: str = "auto"
-    """Name of the reader, or "auto" to recognize the layout of the folder."""
+    """Name of the reader; "auto" = recognize the layout of the folder."""
     start: NotNegativeInt = 0
-    """First frame that is used."""
+    """Index of the first frame to use."""
     stop: int | None = None
-    """Frame before which to stop; null = the last."""
+    """Index of the frame before which to stop; null = use all frames to the last."""
     stride: PositiveInt = 1
     """Use every n-th frame."""
     depth: bool = True
-    """Read the capture's depth; false = color alone, as of a plain video, though depth may be there."""
+    """Read the capture's depth; false = use color only, even if the capture has depth."""
     depth_scale: Positive | None = None
-    """Depth units per metre (1000 for millimetres); null = what the format or its files say."""
+    """Depth units per meter (1000 for millimeters); null = as the format or its files state."""
     max_depth: Positive = 6.0
-    """Depth beyond this many metres counts as not measured."""
+    """Depth beyond this many meters counts as not measured."""
     max_size: Annotated[int, Meta(ge=16)] | None = 960
-    """Longer side in pixels that images of videos, photographs and reconstructions are reduced to if they are larger;
-    null = as they are."""
+    """Larger images of videos, photographs and reconstructions are reduced to this many pixels on the longer side; null
+    = keep their size."""
     scale: Positive | None = None
-    """Metres per unit of poses that come without a scale, those of a scan without depth; null = unknown."""
+    """Meters per unit of poses without a known scale, as in a scan without depth; null = unknown."""
     intrinsics: tuple[Positive, Positive, Finite, Finite] | None = None
-    """fx, fy, cx, cy of the color image in pixels, in place of what the files say."""
+    """fx, fy, cx, cy of the color image in pixels; they replace those in the files. null = as the files state."""
     color_focal: Annotated[float, Meta(ge=0.5, le=2)] | None = None
-    """Focal length of the color camera over what the files say, where depth fits them and color does not (7-Scenes'
-    Kinect: 0.90); null = measured in the scan itself, 1 = as the files say."""
+    """Focal length of the color camera divided by the one in the files, for files that suit the depth but not the color
+    (7-Scenes' Kinect: 0.90); null = measure it in the scan, 1 = as in the files."""
     max_broken: Share = 0.1
-    """Share of the frames that may be unreadable before the run stops."""
+    """The run stops if more than this share of the frames is unreadable."""
 
 
 class TrackingOptions(TypedOptions, frozen=True):
-    """Layer 1."""
+    """Layer 1: camera poses."""
 
     backend: str = "rgbd"
-    """Where poses come from: "rgbd" estimates them from color and depth, "colmap" from color alone, "known" takes the
-    capture's own, "file" those of another system."""
+    """Source of the poses: "rgbd" estimates them from color and depth, "colmap" from color only; "known" uses the poses
+    in the capture, "file" those of another system."""
 
 
 class StereoOptions(TypedOptions, frozen=True):
-    """Depth for captures that have none, by multi-view stereo."""
+    """Depth by multi-view stereo, for captures without depth."""
 
     size: Annotated[int, Meta(ge=64)] = 640
-    """Longer side of the depth images in pixels; frames get them enlarged to their own size."""
+    """Longer side of the stereo depth maps in pixels; they are then enlarged to the size of the frames."""
     neighbors: PositiveInt = 4
-    """Views that each frame is compared with."""
+    """Number of views that each frame is compared with."""
     agreeing: Advanced[PositiveInt] = 2
-    """Views whose depth must confirm a pixel's, of twice as many as each frame is compared with, for it to become part
-    of the surface."""
+    """Number of views, of 2 * neighbors, that must confirm the depth of a pixel to make it part of the surface."""
     network: str | None = None
-    """ONNX network that guesses (inverse) depth from one image, fitted to each frame's stereo depth; it fills what
-    stereo leaves empty."""
+    """ONNX network that predicts (inverse) depth from one image. Its depth is fitted to the stereo depth of each frame
+    and fills the gaps in it. null = no network."""
     device: str = "cpu"
-    """Where stereo is computed: "cpu", or a CUDA device of torch's."""
+    """Device that computes stereo: "cpu", or a CUDA device of torch such as "cuda:0"."""
 
 
 class GaussianOptions(TypedOptions, frozen=True):
-    """Layer 2: how keyframe depth becomes Gaussians."""
+    """Layer 2: how the depth of keyframes becomes Gaussians."""
 
     cell_size: Positive | None = None
-    """Edge of the cells that hold one Gaussian each, metres; null = half the voxel size, and no more than a hundredth
-    of the usual depth where the scale is unknown, for voxels may turn out to be large there."""
+    """Edge in meters of the cells that hold one Gaussian each; null = half the voxel size. If the scale is unknown,
+    voxels may turn out to be large, so null then also limits the edge to a hundredth of the usual depth."""
     pixel_stride: PositiveInt | None = None
-    """Every n-th pixel of a keyframe, in both directions, is lifted; null = as many as leave 320 columns, more where
-    cells are small, and all of depth by stereo."""
+    """Use every n-th row and column of a keyframe; null = about 320 columns, more if cells are small, and all pixels of
+    stereo depth."""
     every: NotNegativeInt = 1
-    """Every n-th tracked frame shows the surface, besides the keyframes; 0 = keyframes alone, as in the paper, which
-    loses two to nine points of IoU on the shipped captures."""
+    """Use every n-th tracked frame for the surface, in addition to the keyframes; 0 = keyframes only, as in the paper,
+    which loses two to nine points of IoU on the shipped captures."""
     denoise: Advanced[bool] = True
-    """Move the cells' points to where all frames' depth images together have the surface, and leave out those that
-    most see through: adds 6 to 22 points of IoU on the shipped captures and halves the number of Gaussians."""
+    """Move the points of the cells to the surface on which the depth maps of all frames agree, and remove points that
+    most depth maps see through. This adds 6 to 22 points of IoU on the shipped captures and halves the number of
+    Gaussians."""
     coverage: Advanced[Positive] = 0.7
-    """s_perp over the spacing of the Gaussians, which is the cell's edge or, where that is greater, the footprint of a
-    pixel on the surface. At 0.7 a flat wall reaches alpha = 0.5 at 0.6 voxels from its surface: a voxel's centre is
-    within 0.5 voxels of a surface through it where that is along the lattice, and up to 0.87 where it is oblique."""
+    """s_perp divided by the spacing of the Gaussians. The spacing is the edge of a cell, or the footprint of a pixel on
+    the surface where that is larger. At 0.7 a flat wall reaches alpha = 0.5 at 0.6 voxels from its surface. The center
+    of a voxel that the surface crosses is within 0.5 voxels of the surface where the surface is parallel to the grid,
+    and within 0.87 where it is oblique."""
     uncertainty: Advanced[NotNegative] = 0.0
-    """Standard deviations of an anchor's averaged depth that are added (in quadrature) to that spacing. Uncertain
-    surfaces, those that few keyframes saw from afar, come out thicker: 1 loses two to eight points of IoU on the house
+    """Standard deviations of an anchor's averaged depth to add (in quadrature) to the spacing. Uncertain surfaces,
+    which few keyframes saw from afar, become thicker. A value of 1 loses two to eight points of IoU on the house
     captures and gains 0.3 on the kitchen."""
     gamma: Advanced[Positive] = 1.0
-    """Elongation along the viewing ray, s_par = gamma * s_perp; at 1 a Gaussian is a sphere, which measures best on the
-    shipped captures (0.6 and 1.5 lose one to five points of IoU on the kitchen)."""
+    """Elongation along the viewing ray, s_par = gamma * s_perp; at 1 a Gaussian is a sphere. 1 gives the best results
+    on the shipped captures (0.6 and 1.5 lose one to five points of IoU on the kitchen)."""
     opacity: Advanced[PositiveShare] = 0.9
-    """Opacity of a new Gaussian, 0…1: where fitting starts, and its weight when voxels take up features and colors;
-    alpha does not depend on it."""
+    """Opacity of a new Gaussian, 0…1. Fitting starts from it, and it weights the Gaussian when voxels receive features
+    and colors; alpha does not depend on it."""
     initialization: Advanced[Literal["ray_aligned", "isotropic"]] = "ray_aligned"
-    """"ray_aligned": as above, the paper's geometry-aware initialization; "isotropic": spheres of the mean distance to
-    the three nearest Gaussians, as in 3D Gaussian splatting (for comparison)."""
+    """"ray_aligned": the paper's geometry-aware initialization, as above; "isotropic": spheres with the mean distance
+    to the three nearest Gaussians, as in 3D Gaussian splatting (for comparison)."""
     edge: Advanced[Positive] = 0.05
-    """Pixels whose depth differs from a neighbor's by more than this share of it are dropped: at an edge the sensor
+    """Drop pixels whose depth differs from a neighbor's by more than this share of the depth. At an edge, a sensor
     reports depths that belong to neither side."""
     min_pixels: Advanced[PositiveInt] = 2
-    """Measurements that a cell needs, unless it is too small to hold that many."""
+    """Number of measurements that a cell needs; a cell too small for that many needs fewer."""
 
 
 class FittingOptions(TypedOptions, frozen=True):
     """Layer 2: how Gaussians are fitted to the images."""
 
     rasterizer: str = "cpu"
-    """What renders: "cpu" (compiled), "gsplat" (CUDA), or "reference" (plain PyTorch, slow)."""
+    """The renderer: "cpu" (compiled), "gsplat" (CUDA), or "reference" (plain PyTorch, slow)."""
     passes: NotNegativeInt = 6
-    """Times that every keyframe is rendered and compared; 0 = Gaussians stay as they were initialized."""
+    """Number of times that each keyframe is rendered and compared; 0 = keep the initial Gaussians."""
     means: Advanced[Literal["anchored", "free"]] = "anchored"
-    """"anchored": means stay on the measured surface, and shapes near the initialization; "free": everything is moved
-    by the images, as elsewhere (for comparison; costs occupancy)."""
+    """"anchored": means stay on the measured surface, and shapes stay near the initialization; "free": the images move
+    every parameter, as in other systems (for comparison; makes occupancy worse)."""
     width: PositiveInt = 320
-    """Columns of the rendered images."""
+    """Width of the rendered images in pixels."""
     depth_weight: Advanced[Positive] = 1.0
-    """beta: a depth wrong by a metre weighs as much as a color wrong by its whole range."""
+    """beta: a depth error of one meter weighs as much as a color error of the whole color range."""
     shape_weight: Advanced[NotNegative] = 0.1
-    """Pull of anchored Gaussians' outlines to the initialization: weight of the mean squared logarithm of their
-    change. Smaller renders better (0.02: + 0.4 dB) and loses occupancy (0.5 to 1 point of IoU)."""
+    """Weight that keeps the outlines of anchored Gaussians near the initialization; it multiplies the mean squared
+    logarithm of their change. A smaller value renders better (0.02: + 0.4 dB) and makes occupancy worse (by 0.5 to 1
+    point of IoU)."""
 
 
 class LanguageOptions(TypedOptions, frozen=True):
-    """Layer 3: what is known of the Gaussians in words."""
+    """Layer 3: what the Gaussians mean in words."""
 
     encoder: str = "color"
-    """What turns images and words into features; "color" needs no network and knows color names only."""
+    """Turns images and words into features. "color" needs no network and knows color names only."""
     keyframes: Positive = 1.0
-    """Keyframes that are encoded: up to 1 their share of all, above it their number. Fewer are chosen so that they are
-    sharp and together show the most surface; layer 3's time falls in proportion."""
+    """Keyframes to encode: a value up to 1 is a share of all keyframes, a larger one a number. If not all are encoded,
+    sharp keyframes that together show the most surface are chosen. The time of layer 3 is proportional to this
+    number."""
     visible_within: Advanced[Positive] = 0.02
-    """A Gaussian is seen if the depth image shows something within this many metres of it…"""
+    """A Gaussian is visible if the depth map shows something within this many meters of it…"""
     visible_share: Advanced[NotNegative] = 0.01
-    """…plus this share of its depth, plus its own standard deviation along the ray; otherwise it is hidden. Where
-    nothing was measured, the Gaussians' own rendered depth decides."""
+    """…plus this share of its depth, plus its own standard deviation along the ray; otherwise it is hidden. Where no
+    depth was measured, the rendered depth of the Gaussians is used."""
     near: Advanced[Positive] = 0.5
-    """Views count in proportion to 1 / depth^2; all views nearer than this, in metres, count the same."""
+    """Views count in proportion to 1 / depth^2; all views nearer than this many meters count the same."""
     border: Advanced[Annotated[float, Meta(ge=0, le=0.5)]] = 0.1
-    """Share of the image's height, from its edge inwards, over which views come to count in full: encoders see things
-    cut off there."""
+    """Width of the border of an image, as a share of its shorter side, in which views count less toward the edge:
+    encoders see things there that the edge cuts off."""
     disagreement: Advanced[Positive | None] = 0.6
-    """Regions of a view are left out that differ from what the other views say by more than this share of what two
-    random places of the scene differ by; null = none are."""
+    """Leave out a region of a view if its features differ too much from those of the other views: by more than this
+    share of the difference between two random places of the scene. null = leave out none."""
 
 
 class VocabularyOptions(TypedOptions, frozen=True):
-    """Names of what is in the scene, by a vision-language model; they are what a word competes with."""
+    """Names of what is in the scene, from a vision-language model. A word that is asked for competes with them."""
 
     endpoint: str | None = None
-    """Address of an OpenAI-compatible server, such as http://localhost:11434/v1 (Ollama); null = no model is asked. The
-    keyframes that are asked about are sent there."""
+    """Address of an OpenAI-compatible server, such as http://localhost:11434/v1 (Ollama). Keyframes are sent to it.
+    null = ask no model."""
     model: str = ""
-    """What the server calls the model."""
+    """Name of the model on the server."""
     api_key_env: str | None = None
-    """Name of the environment variable that holds the server's key; null = it wants none."""
+    """Name of the environment variable that holds the server's key; null = the server needs no key."""
     keyframes: PositiveInt = 24
-    """The most keyframes that are asked about, evenly spread."""
+    """Largest number of keyframes to ask about; they are evenly spread."""
     timeout: Positive = 60.0
-    """Seconds that one answer may take."""
+    """Longest time in seconds to wait for one answer."""
     retries: NotNegativeInt = 2
-    """Times that a question is asked again after an answer that did not come."""
+    """Number of times to repeat a question that got no answer."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -188,49 +191,50 @@ class OccupancyOptions(TypedOptions, frozen=True):
     """Layer 4: how Gaussians become voxels."""
 
     voxel_size: Positive = 0.08
-    """Edge of a voxel, metres."""
+    """Edge of a voxel in meters."""
     finest: Positive | None = None
-    """Edge of the smallest voxels, metres, such as 0.01 where the others have 0.08: voxels are cut by halves down to it
-    where the surface is not flat or its meaning changes; null = all are of one size."""
+    """Edge of the smallest voxels in meters, such as 0.01 where the others have 0.08. Voxels are halved down to this
+    size where the surface is not flat or its meaning changes. null = all voxels have one size."""
     projection: Advanced[Literal["probabilistic", "poisson", "integrated", "released"]] = "probabilistic"
     """What a Gaussian adds to a voxel: "probabilistic" (the paper's equations), "poisson" (with its opacity, in the
-    form of the paper's code), "integrated" (its mass within the voxel), "released" (a dilation, as that code runs)."""
+    form of the paper's code), "integrated" (its mass inside the voxel), "released" (a dilation, as the paper's code
+    runs)."""
     cutoff: Advanced[Positive] = 3.0
-    """Neighborhood of a Gaussian in standard deviations."""
+    """Distance, in standard deviations, to which a Gaussian affects voxels."""
     threshold: Annotated[float, Meta(gt=0, lt=1)] = 0.5
-    """Occupied from this alpha on."""
+    """A voxel is occupied if its alpha is at least this."""
     device: str = "cpu"
-    """Where Gaussians are projected: "cpu" (compiled), or a GPU for torch, such as "cuda:0"."""
+    """Device that projects the Gaussians: "cpu" (compiled), or a GPU of torch such as "cuda:0"."""
     contradiction: Advanced[Positive] = 4.0
-    """A voxel above the threshold is free all the same when the log-odds of what depth images saw there (see carving)
-    are at most minus this: 4 is ten images that saw through it, or more where others ended in it."""
+    """A voxel above the threshold is nevertheless free if the log-odds of the depth maps there (see carving) are at
+    most minus this. 4 is ten depth maps that saw through the voxel, or more if others ended in it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.projection == "integrated" and self.device != "cpu":
-            raise ConfigError("The projection 'integrated' runs on the processor only: set occupancy.device=cpu.")
+            raise ConfigError("The projection 'integrated' runs only on the CPU: set occupancy.device=cpu.")
 
 
 class CarvingOptions(TypedOptions, frozen=True):
-    """Layer 4: free space from depth."""
+    """Layer 4: free space from depth maps."""
 
     margin: Advanced[Positive] = 1.0
-    """A voxel is seen through when the depth behind its centre is greater by this many voxel edges (and by the
-    depth's uncertainty)."""
+    """A depth map sees through a voxel if its depth exceeds that of the voxel's center by this many voxel edges (plus
+    the uncertainty of the depth)."""
     noise: Advanced[NotNegative] = 0.0019
-    """Growth of a depth's standard deviation with its square, 1/m, where nothing else says how great it is; three of
-    them are added to the margin."""
+    """Standard deviation of a depth divided by the depth squared, in 1/m, where the frame states no uncertainty. Three
+    standard deviations are added to the margin."""
     hit: Advanced[Positive] = 0.85
-    """Log-odds that a depth image which ends in a voxel adds: OctoMap's, a probability of 0.7."""
+    """Log-odds that a depth map adds to the voxel in which it ends: OctoMap's value, a probability of 0.7."""
     miss: Advanced[Positive] = 0.4
-    """Log-odds that one which sees through a voxel takes away: OctoMap's, a probability of 0.4."""
+    """Log-odds that a depth map subtracts from a voxel that it sees through: OctoMap's value, a probability of 0.4."""
     min_free: PositiveInt = 1
-    """Depth images that must see through a voxel that holds no surface before it counts as free."""
+    """A voxel without surface is free if at least this many depth maps see through it."""
     every: NotNegativeInt = 1
-    """Every n-th tracked frame shows what is free, besides the keyframes; 0 = keyframes alone."""
+    """Use every n-th tracked frame for free space, in addition to the keyframes; 0 = keyframes only."""
     no_return: NotNegative = 0.0
-    """Metres up to which space counts as seen through where a wide patch of a depth image holds no measurement; 0 =
-    such a patch says nothing. For sensors that fail beyond their range alone: what is black, shiny or too near has no
-    depth either, and would be carved away."""
+    """Where a wide patch of a depth map has no measurement, space up to this many meters counts as seen through; 0 =
+    such a patch has no effect. Use it only for sensors that fail just beyond their range: black, shiny and very near
+    things have no depth either, and would be carved away."""
     ray_step: Advanced[PositiveInt] = 16
-    """Every n-th pixel's ray (more where blocks are small) is followed to find the blocks that a camera looked into."""
+    """Follow the ray of every n-th pixel (of more pixels if blocks are small) to find the blocks that a camera saw."""

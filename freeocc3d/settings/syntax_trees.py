@@ -1,4 +1,5 @@
-"""What a module says of itself, read from its syntax tree: it is not imported, so its packages need not be there."""
+"""Reads what a module states about itself from its syntax tree, so that the module and its packages are not
+imported."""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ _PACKAGE = Path(__file__).parents[1]
 
 @dataclass(frozen=True)
 class Option:
-    """One option as its class declares it. type: in words.  kind: the type itself, its source text if unknown.  doc:
-    its docstring.  advanced: whether only comparisons with other methods need it."""
+    """An option as its class declares it. type: in words.  kind: the type itself; its source text if unknown.  doc: its
+    docstring.  advanced: whether it is only for comparisons with other methods."""
 
     name: str
     type: str
@@ -31,7 +32,7 @@ class Option:
 
 
 def path_of(module: str) -> Path | None:
-    """The file of a module, by its dotted name, which is not imported; None where there is none to read."""
+    """Finds the file of a module by its dotted name, without importing it; None if it has no readable file."""
     top, *rest = module.split(".")
     if top == _ROOT:
         folder = _PACKAGE
@@ -62,13 +63,13 @@ def summary_of(module: str) -> str:
 
 
 def assigned_value(module: str, name: str) -> ast.expr | None:
-    """What a module assigns to a name at its top level, or None."""
+    """The expression that a module assigns to a name at its top level, or None."""
     return _assigned(tree_of(module)).get(name)
 
 
 @functools.cache
 def options_of(module: str, class_name: str = _OPTIONS) -> tuple[Option, ...]:
-    """The options that a class in a module's own file declares and inherits; none where there is no such class."""
+    """The options that a class in a module's own file declares and inherits; none if the class does not exist."""
     classes = [node for node in tree_of(module).body if isinstance(node, ast.ClassDef) and node.name == class_name]
     options: dict[str, Option] = {}
     for node in classes:
@@ -88,7 +89,8 @@ def _inherited(module: str, class_name: str) -> tuple[Option, ...]:
 
 
 def _declared(node: ast.ClassDef, module: str, inherited: dict[str, Option]) -> dict[str, Option]:
-    """The options in a class's own body; one that overrides another keeps its docstring, unless it has its own."""
+    """The options in a class's own body; an option that overrides another and has no docstring keeps the inherited
+    one."""
     options = {}
     for statement, after in itertools.zip_longest(node.body, node.body[1:]):
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name) and statement.value:
@@ -106,7 +108,7 @@ def _declared(node: ast.ClassDef, module: str, inherited: dict[str, Option]) -> 
 
 
 def _alias(module: str, name: str) -> ast.expr | None:
-    """What a module, or the one that it imports the name from, assigns to a name."""
+    """The expression that a module, or the module from which it imports the name, assigns to a name."""
     found = assigned_value(module, name)
     origin = _imported_from(tree_of(module), module, name) if found is None else None
     return found if origin is None or path_of(origin[0]) is None else assigned_value(*origin)

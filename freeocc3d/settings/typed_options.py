@@ -1,13 +1,12 @@
-"""The base of every options class: frozen, of declared types and ranges, checked whoever makes it.
+"""The base of every options class: frozen, with declared types and ranges that are always checked.
 
-A subclass declares its fields with the types of ``option_types`` and gives each a default and a docstring::
+A subclass declares its fields with the types of ``option_types`` and gives each field a default and a docstring::
 
     class Options(TypedOptions, frozen=True):
         stride: PositiveInt = 4
         \"\"\"Every n-th pixel is used.\"\"\"
 
-Classes that share options inherit them. What depends on several options is checked in ``__post_init__``, after
-``super().__post_init__()``.
+Classes that share options inherit them. A class checks rules between several options in ``__post_init__``, after
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from .option_types import converted
 
 
 class TypedOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of one stage or backend. Making one raises ConfigError for a value of another type or out of range."""
+    """Options of one stage or backend. Raises ConfigError for a value of another type or out of its range."""
 
     def __post_init__(self) -> None:
         for name, kind in field_types(type(self)).items():
             converted(kind, getattr(self, name), name)
 
     def changed(self: O, **values: Any) -> O:
-        """A copy with other values, which are checked."""
+        """Returns a copy with other values, which are checked."""
         return build(type(self), {**msgspec.structs.asdict(self), **values})
 
     def to_dict(self) -> dict[str, Any]:
-        """All options by name, with their values."""
+        """All options, name -> value."""
         return msgspec.structs.asdict(self)
 
 
@@ -45,16 +44,16 @@ O = TypeVar("O", bound=TypedOptions)  # noqa: E741
 
 @functools.cache
 def field_types(options: type[TypedOptions]) -> dict[str, Any]:
-    """Name -> type of each option of a class, those that it inherits first."""
+    """Name -> type of each option of a class; inherited options come first."""
     hints = get_type_hints(options, include_extras=True)
     return {name: hints[name] for name in options.__struct_fields__}
 
 
 def build(options: type[O], values: Mapping[str, Any], where: str = "") -> O:
-    """Options made of plain values; what is not given has its default.
+    """Makes options from plain values; an option that is not given has its default.
 
-    where: what stands before a key in messages, such as "occupancy.". Raises ConfigError: an unknown key, naming the
-    nearest, a value of another type or out of its range.
+    where: the text before a key in messages, such as "occupancy.". Raises ConfigError for an unknown key (suggesting
+    the nearest) and for a value of another type or out of its range.
     """
     types = field_types(options)
     for key in values:
@@ -69,6 +68,7 @@ def build(options: type[O], values: Mapping[str, Any], where: str = "") -> O:
 
 
 def nearest(word: object, known: Iterable[str], least: float = 0.5) -> str:
-    """``" (did you mean 'x'?)"`` for the closest known word, or an empty string. least: of difflib's ratio, 0…1."""
+    """Returns ``" (did you mean 'x'?)"`` for the nearest known word, or an empty string. least: of difflib's ratio,
+    0…1."""
     close = difflib.get_close_matches(str(word), list(known), n=1, cutoff=least)
     return f" (did you mean '{close[0]}'?)" if close else ""

@@ -1,4 +1,4 @@
-"""YAML as options are written in it: files, and overrides such as ``occupancy.voxel_size=0.05``."""
+"""Reads YAML as options use it: files, and overrides such as ``occupancy.voxel_size=0.05``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .option_types import holds_text, is_list
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Takes 1e-4 for a number, as YAML 1.2 does; 1.1 wants a point in it."""
+    """Reads 1e-4 as a number, as YAML 1.2 does; YAML 1.1 requires a decimal point."""
 
 
 _Loader.add_implicit_resolver(
@@ -28,7 +28,8 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path) -> dict[Any, Any]:
-    """The sections of a configuration file. Raises ConfigError: unreadable, invalid, not of sections."""
+    """Reads the sections of a configuration file. Raises ConfigError if it is unreadable, invalid YAML or not a
+    mapping."""
     try:
         loaded = parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -36,16 +37,16 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
     if loaded is not None and not isinstance(loaded, dict):
-        raise ConfigError(f"{path} must hold sections such as 'tracking:', not a {type(loaded).__name__}.")
+        raise ConfigError(f"{path} must contain sections such as 'tracking:', got a {type(loaded).__name__}.")
     return loaded or {}
 
 
 def apply_override(values: dict[Any, Any], override: str) -> None:
-    """Set what ``section.key=value`` says in nested ``values``. Raises ConfigError where it is malformed."""
+    """Sets ``section.key=value`` in nested ``values``. Raises ConfigError if it is malformed."""
     name, separator, text = override.partition("=")
     keys = name.strip().split(".")
     if not separator or len(keys) < 2 or not all(keys):
-        raise ConfigError(f"An override reads section.key=value, got '{override}'.")
+        raise ConfigError(f"An override has the form section.key=value, got '{override}'.")
     try:
         value = parse_yaml(text)
     except yaml.YAMLError as error:
@@ -56,15 +57,15 @@ def apply_override(values: dict[Any, Any], override: str) -> None:
         if child is None:
             child = node[key] = {}
         if not isinstance(child, dict):
-            raise ConfigError(f"'{override}' does not fit: '{key}' holds a value, not a section.")
+            raise ConfigError(f"Cannot apply the override '{override}': '{key}' is a value, not a section.")
         node = child
     node[keys[-1]] = value
 
 
 def named_values(assignments: Iterable[str], kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """Values by name, from ``name=value`` in YAML; a list may go without brackets.
+    """Reads values by name from ``name=value`` in YAML; a list needs no brackets.
 
-    kinds: the types of the options (see ``option_types``) by name. Raises ConfigError for what is not of that form.
+    kinds: name -> type of the options (see ``option_types``). Raises ConfigError for another form.
     """
     values = {}
     for assignment in assignments:

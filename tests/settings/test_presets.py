@@ -52,8 +52,12 @@ def test_paths_are_left_as_they_are(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "kind", "said"),
     [
-        ("momo", "configuration", r"There is no file 'momo'.*did you mean 'mono'.*one of .*rgbd, .*ablations/mono"),
-        ("nyu40", "classes", r"one of house_to_embodiedocc, nyu40_to_embodiedocc\."),
+        (
+            "momo",
+            "configuration",
+            r"There is no file or preset 'momo'.*did you mean 'mono'.*presets .*rgbd, .*ablations/mono",
+        ),
+        ("nyu40", "classes", r"one of the presets house_to_embodiedocc, nyu40_to_embodiedocc\."),
     ],
 )
 def test_an_unknown_name_lists_what_there_is(name: str, kind: str, said: str) -> None:

@@ -36,7 +36,7 @@ def test_old_names_are_accepted_with_a_warning_each() -> None:
 
 
 def test_the_old_and_the_new_name_of_one_option_are_too_much() -> None:
-    with pytest.raises(ConfigError, match=r"'gaussians\.initialisation'.*only one"):
+    with pytest.raises(ConfigError, match=r"'gaussians\.initialisation' is the old name.*only the new one"):
         config.resolve({"gaussians": {"initialisation": "isotropic", "initialization": "ray_aligned"}})
 
 

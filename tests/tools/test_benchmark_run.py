@@ -97,7 +97,7 @@ def test_the_ablations_of_the_paper_are_there_by_name() -> None:
     runs = {name for name, variant in known.items() if not variant.lacking}
     assert {"rgbd", "rgbd_true_poses", "rgbd_closed_set", "rgbd_true_poses_closed_set"} <= runs
     for kind in ("rgbd", "mono"):
-        for part in ("", "_no_initialisation", "_no_anchoring_no_initialisation"):
+        for part in ("", "_no_initialization", "_no_anchoring_no_initialization"):
             assert kind + part in known
     assert {"mono_mast3r_slam", "mono_vggt_slam", "mono_seem", "mono_dinov2"} <= set(known)
     for variant in known.values():
