@@ -1,1 +1,1 @@
-"""LAYER 2: 3D Gaussians anchored at the points of layer 1."""
+"""LAYER 2: 3D Gaussians, anchored to the points of layer 1."""

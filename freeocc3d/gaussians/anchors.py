@@ -1,10 +1,10 @@
-"""Lifts keyframe depth to Gaussians: one per cell of the surface, ray-aligned, anchored to a keyframe.
+"""Lifts keyframe depth to Gaussians: one per surface cell, aligned with its viewing ray and anchored to a keyframe.
 
-Dense pixels are not Gaussians of their own: a wall seen by a hundred keyframes would be a hundred layers thick, which
-saturates the occupancy product and fills memory. The measurements of a cell are averaged, weighted by their depth
-uncertainty; the averages are moved to where all depth images together have the surface (``fusion``) and averaged by
-cells again; and what results is anchored to the keyframe that measures it best. The number of Gaussians grows with the
-surface, not with the frames.
+Dense pixels do not become Gaussians of their own: a wall seen by a hundred keyframes would be a hundred layers thick,
+which saturates the occupancy product and fills memory. Instead, the measurements in a cell are averaged, weighted by
+their depth uncertainty. The averages move to the surface that all depth maps together show (``denoising``) and are
+averaged by cell again. Each result is anchored to the keyframe that measures it best. The number of Gaussians grows
+with the surface, not with the number of frames.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from .surface_cells import Cells, CellSums
 
 
 def compute_least_scale(options: Options, cell_size: float, voxel_size: float) -> float:
-    """Standard deviation in metres that Gaussians of cells of ``cell_size`` must at least have to be shown by voxels of
-    ``voxel_size``: that of cells of half a voxel, if theirs are smaller; 0 where they are not."""
+    """The smallest standard deviation, in meters, that lets voxels of ``voxel_size`` show Gaussians of cells of
+    ``cell_size``: that of cells of half a voxel if their own cells are smaller, otherwise 0."""
     usual = 0.5 * voxel_size
     return options.coverage * usual if cell_size < usual else 0.0
 
 
 class AnchoredCells:
-    """Collects keyframes; ``gaussians`` turns what was collected into anchored Gaussians.
+    """Collects keyframes; ``gaussians`` turns them into anchored Gaussians.
 
-    Memory: 130 bytes a cell; a Gaussian takes 67 bytes (positions, scales and anchor 12 each, rotation 16, opacity and
-    keyframe 4 each, colour 3, feature 4).
+    Memory: 130 bytes per cell. A Gaussian takes 67 bytes (positions, scales and anchor 12 each, rotation 16, opacity
+    and keyframe 4 each, color 3, feature 4).
     """
 
     def __init__(self, options: Options, cell_size: float, T_world_keyframe: NDArray[np.float64]):
@@ -44,14 +44,15 @@ class AnchoredCells:
         self._sums = CellSums(cell_size)
 
     def add(self, posed: PosedFrame) -> None:
-        """Take a keyframe, or a frame between keyframes: what it shows is anchored to the keyframe that it hangs on."""
+        """Adds a keyframe, or a frame between keyframes; the points of such a frame are anchored to its keyframe."""
         self._sums.add_frame(posed, self.stride(posed.frame), self.options.edge)
 
     def gaussians(self, frames: Iterable[PosedFrame]) -> Gaussians:
-        """One Gaussian per cell with enough measurements. frames: those that were taken, again, to denoise the
+        """Returns one Gaussian per cell with enough measurements. frames: the added frames again, to denoise the
         surface."""
         cells = self._sums.cells()
-        # A cell smaller than the measurements' spacing cannot hold as many as a large one: one is enough there.
+        # A cell smaller than the spacing of the measurements cannot contain as many as a large one: one is enough
+        # there.
         possible = np.maximum((self.cell_size / cells.footprint) ** 2, 1.0)
         cells = cells[cells.pixels >= np.minimum(self.options.min_pixels, np.floor(possible))]
         if self.options.denoise:
@@ -67,10 +68,11 @@ class AnchoredCells:
         return make_isotropic(made) if self.options.initialization == "isotropic" else made
 
     def _denoised(self, cells: Cells, frames: Iterable[PosedFrame]) -> Cells:
-        """The cells' points where all depth images have the surface, averaged by the cells that they are in now."""
+        """Moves the points of the cells to the surface that all depth maps show, and averages them by their new
+        cells."""
         directions = cells.points - self._T_world_keyframe[cells.keyframe, :3, 3]
         found = denoising.denoise(cells.points, directions, frames, self.options.edge)
-        seen = found.weights > 0  # what no image shows, because its pixel is another point's, stays as it was measured
+        seen = found.weights > 0  # points that no image shows, because others cover their pixels, stay where they are
         moved = replace(
             cells,
             points=found.points,
@@ -83,8 +85,9 @@ class AnchoredCells:
         return sums.cells()
 
     def stride(self, frame: Frame) -> int:
-        """Every how many-th pixel of a frame is taken: the option, or as many as leave 320 columns, more where cells
-        are small: about two to a cell's edge. All are where depth says itself how uncertain it is."""
+        """The step between the pixels used in a frame: the option, or the step that leaves about 320 columns. If cells
+        are small, the step is smaller: about two pixels per cell edge. If the depth states its uncertainty, all pixels
+        are used."""
         if self.options.pixel_stride is not None:
             return self.options.pixel_stride
         if frame.depth_sigma_m is not None:
@@ -104,11 +107,11 @@ def align_to_rays(
     colors: NDArray[np.uint8],
     options: Options,
 ) -> Gaussians:
-    """Gaussians at (N, 3) anchors in their keyframes' camera frames, local +z along the viewing ray and
-    s = (s_perp, s_perp, gamma s_perp): the paper's geometry-aware initialisation."""
+    """Makes Gaussians at (N, 3) anchors in the camera frames of their keyframes, with local +z along the viewing ray
+    and s = (s_perp, s_perp, gamma s_perp): the paper's geometry-aware initialization."""
     ray = anchor_cam / np.linalg.norm(anchor_cam, axis=1, keepdims=True)
-    # The shortest rotation that takes +z to the ray. What a frame beside the keyframe shows may lie behind it, but for
-    # exactly backwards there is one; there, none does, for an ellipsoid has no sign.
+    # The shortest rotation from +z to the ray. A point from a frame near the keyframe may be behind the keyframe; the
+    # rotation exists for it, too, except exactly backward. There none is needed: an ellipsoid has no sign.
     quats_cam = np.stack((np.maximum(1 + ray[:, 2], 1e-6), -ray[:, 1], ray[:, 0], np.zeros(len(ray))), axis=1)
     quats_cam /= np.linalg.norm(quats_cam, axis=1, keepdims=True)
     quats_keyframe = rotations_to_quats(T_world_keyframe[:, :3, :3])
@@ -125,7 +128,7 @@ def align_to_rays(
 
 
 def make_isotropic(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians as spheres whose standard deviation is the mean distance to the three nearest others.
+    """Returns the Gaussians as spheres; the standard deviation is the mean distance to the three nearest neighbors.
 
     Source: B. Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023, Sec. 5.1.
     """
@@ -139,7 +142,7 @@ def make_isotropic(gaussians: Gaussians) -> Gaussians:
 
 
 def anchor_in_place(gaussians: Gaussians, T_world_keyframe: NDArray[np.float64]) -> Gaussians:
-    """The Gaussians with anchors that say where their means are now, for means that something else has moved."""
+    """Returns the Gaussians with anchors at their current means, after other code has moved the means."""
     anchor_cam = _move_each(invert(T_world_keyframe), gaussians.anchor_keyframe, gaussians.means)
     return replace(gaussians, anchor_cam=anchor_cam)
 
@@ -147,7 +150,7 @@ def anchor_in_place(gaussians: Gaussians, T_world_keyframe: NDArray[np.float64])
 def reanchor(
     gaussians: Gaussians, T_world_keyframe_old: NDArray[np.float64], T_world_keyframe_new: NDArray[np.float64]
 ) -> Gaussians:
-    """Means and rotations recomputed after the keyframes moved from the (K, 4, 4) old to the new poses."""
+    """Recomputes means and rotations after the keyframes moved from the (K, 4, 4) old poses to the new ones."""
     turn = rotations_to_quats(T_world_keyframe_new[:, :3, :3] @ np.swapaxes(T_world_keyframe_old[:, :3, :3], -1, -2))
     keyframe = gaussians.anchor_keyframe
     return Gaussians(
@@ -162,8 +165,8 @@ def reanchor(
 
 
 def align_gaussians(gaussians: Gaussians, scale: float, R: NDArray[np.float64], t: NDArray[np.float64]) -> Gaussians:
-    """The Gaussians in another world frame: x' = s R x + t, sigma' = s sigma, R_g' = R R_g (paper, "Coordinate System
-    Alignment"). Anchors scale with the camera frames that they live in."""
+    """Returns the Gaussians in another world frame: x' = s R x + t, sigma' = s sigma, R_g' = R R_g (paper, "Coordinate
+    System Alignment"). The anchors scale with their camera frames."""
     means = scale * gaussians.means.astype(np.float64) @ R.T + t
     return Gaussians(
         means=means.astype(np.float32),
@@ -177,6 +180,6 @@ def align_gaussians(gaussians: Gaussians, scale: float, R: NDArray[np.float64], 
 
 
 def _move_each(T: NDArray[np.float64], row: NDArray[np.int32], points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Points (N, 3), each by its own transform T[row]."""
+    """Transforms (N, 3) points, each by its own T[row]."""
     moved = np.einsum("nij,nj->ni", T[row, :3, :3], points.astype(np.float64)) + T[row, :3, 3]
     return moved.astype(np.float32)

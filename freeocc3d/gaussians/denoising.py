@@ -1,13 +1,13 @@
-"""Denoises a surface: each point is moved to where, on average, the depth images that show it have the surface.
+"""Denoises a surface: moves each point to the mean of the surfaces in the depth maps that show it.
 
-Points that were measured in a single image carry its noise: a wall seen by ten frames is as thick as their depths
-differ. Along the viewing ray of every frame t that shows a point p, its depth image says how far the surface is:
+A point measured in a single image has the noise of that image: a wall seen by ten frames is as thick as their depths
+differ. Along the viewing ray of every frame t that shows a point p, the depth map gives the distance of the surface:
 
     p' = p + sum_t w_t (d_t(u_t) - z_t) r_t / sum_t w_t,   w_t = 1 / sigma(d_t)^2,   r_t = (p - c_t) / z_t,
 
-over the frames with |d_t - z_t| within reach, which is a truncated signed distance evaluated at the points alone: no
-grid, and a wall ends one layer thick. Frames that look at the other side of a board or a door do not count: they show
-another surface. A point that more frames see through than show is no surface.
+over the frames with |d_t - z_t| within reach. This is a truncated signed distance that is evaluated only at the points:
+it needs no grid, and a wall becomes one layer thick. Frames that look at the other side of a board or a door do not
+count, because they show another surface. A point is removed if more frames see through it than show it.
 
 Source: B. Curless, M. Levoy, A Volumetric Method for Building Complex Models from Range Images, SIGGRAPH 1996 (the
 weighted mean of projective distances).
@@ -29,17 +29,18 @@ from ..core.types import PosedFrame
 from .depth_edges import is_at_edge, mask_away_from_edges
 
 _REACH_M, _REACH_PER_M = 0.03, 0.01
-"""A depth image shows a point if it ends within this of it, and this times the squared depth: noise and the poses'
-errors. Twice or half of either moves IoU by less than one point on the shipped captures."""
+"""A depth map shows a point if it ends within the first value of it, plus the second value times the squared depth.
+This covers noise and pose errors. Half or twice either value changes IoU by less than one point on the shipped
+captures."""
 
 
 @dataclass
 class DenoisedPoints:
-    """What depth images say of N points.
+    """N points and what the depth maps show of them.
 
-    points: (N, 3) float64 world, metres.  weights: (N,) sums of 1 / sigma^2, 0 where no image shows the point.
-    best: (N,) the greatest of these terms, and keyframe: (N,) int32 the keyframe of the frame whose it is (-1: none).
-    kept: (N,) bool, false for points that more images see through than show.
+    points: (N, 3) float64 world, meters.  weights: (N,) sums of 1 / sigma^2, 0 if no image shows the point.
+    best: (N,) the largest of these terms.  keyframe: (N,) int32 the keyframe of the frame that gives it (-1: none).
+    kept: (N,) bool, false if more images see through the point than show it.
     """
 
     points: NDArray[np.float64]
@@ -52,10 +53,10 @@ class DenoisedPoints:
 def denoise(
     points: NDArray[np.float64], directions: NDArray[np.float64], frames: Iterable[PosedFrame], edge: float
 ) -> DenoisedPoints:
-    """(N, 3) world points moved to the mean of what depth images say.
+    """Moves (N, 3) world points to the mean surface of the depth maps.
 
-    directions: (N, 3) of the rays along which the points were measured, world, of any length.  frames: read once; a
-    depth of 0 says nothing, and neither does a pixel where depth jumps by more than ``edge`` times itself.
+    directions: (N, 3) the rays along which the points were measured, world, of any length.  frames: read once. Pixels
+    with depth 0 are ignored, and so are pixels where depth jumps by more than ``edge`` times itself.
     """
     n = len(points)
     moved, weights, best = np.zeros((n, 3)), np.zeros(n), np.zeros(n)
@@ -90,7 +91,7 @@ def _look(
     best: NDArray[np.float64],
     keyframe: NDArray[np.int32],
 ) -> None:
-    """Add what one depth image says of each point."""
+    """Adds what one depth map shows of each point."""
     fx, fy, cx, cy = camera
     height, width = depth_m.shape
     for n in prange(len(points)):
@@ -116,7 +117,7 @@ def _look(
                 R[0, 2] * x + R[1, 2] * y + R[2, 2] * z,
             )
             if ray[0] * directions[n, 0] + ray[1] * directions[n, 1] + ray[2] * directions[n, 2] <= 0:
-                continue  # the other side
+                continue  # it shows the other side
             sigma = look_up_sigma(sigma_m, line, column, depth)
             w = 1.0 / (sigma * sigma)
             step = w * beyond / z
@@ -131,8 +132,8 @@ def _look(
 def look_reference(
     points: NDArray[np.float64], directions: NDArray[np.float64], posed: PosedFrame, edge: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """What one depth image says of (N, 3) points, in plain NumPy: (N, 3) weighted offset, (N,) weight, and whether it
-    sees through each."""
+    """What one depth map shows of (N, 3) points, in plain NumPy: (N, 3) weighted offset, (N,) weight, and (N,) whether
+    it sees through the point."""
     camera, depth_m = posed.frame.intrinsics, posed.frame.depth_m
     depth_m = np.where(mask_away_from_edges(depth_m, edge), depth_m, 0)
     T = invert(posed.T_world_cam)

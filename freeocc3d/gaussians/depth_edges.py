@@ -1,4 +1,4 @@
-"""Pixels at depth edges: there a sensor reports depths that belong to neither side."""
+"""Finds pixels at depth edges, where a sensor reports depths that belong to neither side."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 @njit(cache=True, nogil=True)
 def is_at_edge(depth_m: NDArray[np.float32], row: int, column: int, edge: float) -> bool:
-    """Whether the depth of one of a pixel's four neighbours differs by more than ``edge`` times the nearer of both."""
+    """Whether the depth of one of the pixel's four neighbors differs by more than ``edge`` times the nearer of the
+    two."""
     depth = depth_m[row, column]
     for i, j in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
         if i < 0 or j < 0 or i >= depth_m.shape[0] or j >= depth_m.shape[1]:
@@ -21,7 +22,7 @@ def is_at_edge(depth_m: NDArray[np.float32], row: int, column: int, edge: float)
 
 
 def mask_away_from_edges(depth_m: NDArray[np.float32], edge: float) -> NDArray[np.bool_]:
-    """(H, W) pixels with a depth that are not ``is_at_edge``, in plain NumPy."""
+    """(H, W) the pixels with a depth for which ``is_at_edge`` is false, in plain NumPy."""
     good = depth_m > 0
     for axis in (0, 1):
         near, far = np.take(depth_m, range(depth_m.shape[axis] - 1), axis), np.delete(depth_m, 0, axis)

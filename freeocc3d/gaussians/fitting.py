@@ -1,15 +1,15 @@
-"""Fits Gaussians to the keyframes' images while their means stay where layer 1 put them.
+"""Fits Gaussians to the images of the keyframes; their means stay where layer 1 put them.
 
-Paper, "Geometrically Anchored Gaussian Updates": over scales, rotations, opacities and colours,
+Paper, "Geometrically Anchored Gaussian Updates": over scales, rotations, opacities and colors,
 
     min sum_t |I^_t - I_t|^2 + beta |D^_t - D_t|^2   s.t.  mu = P
 
-over the pixels that have a depth: what lies beyond has no anchor, and Gaussians beside it would grow to paint it.
+over the pixels that have a depth. The space beyond has no anchors, and nearby Gaussians would grow to paint it.
 
-A camera sees the outline of a Gaussian, not its extent along the ray, nor how much room it takes where others lie
-behind. What images cannot tell stays as the initialisation has it: an anchored Gaussian keeps its axis along its
-keyframe's ray and its extent on it; across the ray, the outline's two axes turn and change their ratio, while their
-mean precision stays, for alpha(x) of the occupancy is exp(-1/2 d^T Sigma^-1 d). Opacities and colours are free.
+A camera sees the outline of a Gaussian, but not its extent along the ray, nor the space it takes in front of others.
+The initialization keeps what images cannot show: the axis of an anchored Gaussian stays along its keyframe's ray, with
+the same extent. Across the ray, the two axes of the outline turn and change their ratio, but their mean precision
+stays, because alpha(x) of the occupancy is exp(-1/2 d^T Sigma^-1 d). Opacities and colors are free.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ from .rasterizers.base import ALPHA_MIN, Rasterizer, Rendered, Splats
 from .rendered_views import CapturedView
 
 _RATES = {"outline": 1e-2, "turn": 1e-2, "shape": 1e-2, "quats": 5e-3, "means": 2e-4, "logits": 5e-2, "colors": 1e-2}
-"""Adam's step of each parameter: natural logarithms, radians, metres, logits, 0…1."""
+"""Adam's step for each parameter: natural logarithms, radians, meters, logits, 0…1."""
 _DECAY, _DECAY_FROM = 0.1, 0.3
-"""Steps shrink to this share of their size, from this share of the way on."""
+"""Steps shrink to the first share of their size; they start to shrink after the second share of all steps."""
 _LARGEST_LOGIT = 6.0
 _LARGEST_CHANGE = math.log(4.0)
-"""Of a scale, natural logarithm: what no image has, such as a frame of one colour, lets none grow without bounds."""
+"""Largest change of a scale, natural logarithm. It limits growth where images show nothing, as in a frame of one
+color."""
 
 
 def fit_gaussians(
@@ -45,8 +46,8 @@ def fit_gaussians(
     passes: int,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Gaussians:
-    """The Gaussians after ``passes`` over the views in random order (always the same), less those that became
-    invisible. progress: called with the number of images rendered."""
+    """Returns the Gaussians after ``passes`` over the views in random order (always the same), without those that
+    became invisible. progress: called with the number of rendered images."""
     if passes == 0 or not views or not len(gaussians):
         return gaussians
     with _one_torch_thread():
@@ -55,8 +56,8 @@ def fit_gaussians(
 
 @contextlib.contextmanager
 def _one_torch_thread() -> Iterator[None]:
-    """torch's threads and numba's wait for each other spinning: on a machine that does something else besides, two of
-    each take six times as long as one of torch's, whose work here is small."""
+    """Limits torch to one thread. torch's and numba's threads wait for each other by spinning: on a machine that runs
+    other programs, two threads of each take six times as long as one of torch's, whose work here is small."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -74,35 +75,35 @@ def _fitted(
     progress: Callable[[int], None],
 ) -> Gaussians:
     parameters = (_Free if options.means == "free" else _Anchored)(gaussians, options, rasterizer.device)
-    groups = [{"params": [tensor], "lr": _RATES[name]} for name, tensor in parameters.optimised.items()]
-    optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+    groups = [{"params": [tensor], "lr": _RATES[name]} for name, tensor in parameters.optimized.items()]
+    optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
     generator = np.random.default_rng(0)
     steps = passes * len(views)
     order = np.concatenate([generator.permutation(len(views)) for _ in range(passes)])
     for step, index in enumerate(order):
         late = max(0.0, step / steps - _DECAY_FROM) / (1 - _DECAY_FROM)
-        for group, rate in zip(optimiser.param_groups, map(_RATES.get, parameters.optimised), strict=True):
+        for group, rate in zip(optimizer.param_groups, map(_RATES.get, parameters.optimized), strict=True):
             group["lr"] = rate * _DECAY**late
         view = views[index]
         rendered = rasterizer.render(parameters.splats(), view.T_cam_world, view.camera)
         loss = _loss(rendered, view, options.depth_weight) + parameters.prior()
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss.backward()
-        optimiser.step()
+        optimizer.step()
         parameters.clamp()
         progress(step + 1)
     return parameters.gaussians(gaussians)
 
 
 def _loss(rendered: Rendered, view: CapturedView, depth_weight: float) -> Tensor:
-    """Mean over the image's pixels of the squared errors, none where there is no depth."""
+    """Mean over the image's pixels of the squared errors, which are 0 where there is no depth."""
     color = ((rendered.image - view.image) ** 2).sum(dim=2)
     depth = (rendered.depth - view.depth_m) ** 2
     return ((color + depth_weight * depth) * view.measured).mean()
 
 
 class _Parameters:
-    """What is optimised, by its name in ``_RATES``; ``splats`` makes Gaussians of it."""
+    """The optimized tensors, by their names in ``_RATES``; ``splats`` makes Gaussians from them."""
 
     def __init__(self, gaussians: Gaussians, device: torch.device):
         def tensor(array: np.ndarray) -> Tensor:
@@ -111,14 +112,14 @@ class _Parameters:
         self.means = tensor(gaussians.means)
         self.log_scales = tensor(np.log(gaussians.scales))
         self.quats = tensor(gaussians.quats_wxyz)
-        self.optimised = {
+        self.optimized = {
             "logits": torch.logit(tensor(gaussians.opacities), 1e-3),
             "colors": tensor(gaussians.colors) / 255,
         }
 
-    def _optimise(self, **tensors: Tensor) -> None:
-        self.optimised |= tensors
-        for tensor in self.optimised.values():
+    def _optimize(self, **tensors: Tensor) -> None:
+        self.optimized |= tensors
+        for tensor in self.optimized.values():
             tensor.requires_grad_()
 
     def shapes(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,22 +127,22 @@ class _Parameters:
         raise NotImplementedError
 
     def splats(self) -> Splats:
-        """The Gaussians as they are rendered."""
-        return Splats(*self.shapes(), torch.sigmoid(self.optimised["logits"]), self.optimised["colors"])
+        """The current Gaussians, ready to be rendered."""
+        return Splats(*self.shapes(), torch.sigmoid(self.optimized["logits"]), self.optimized["colors"])
 
     def prior(self) -> Tensor:
-        """What keeps shapes near the initialisation."""
+        """The penalty that keeps shapes near the initialization."""
         return torch.zeros((), device=self.means.device)
 
     @torch.no_grad()
     def clamp(self) -> None:
-        """Back to where parameters make sense."""
-        self.optimised["logits"].clamp_(-_LARGEST_LOGIT, _LARGEST_LOGIT)
-        self.optimised["colors"].clamp_(0, 1)
+        """Clamps the parameters to their valid ranges."""
+        self.optimized["logits"].clamp_(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+        self.optimized["colors"].clamp_(0, 1)
 
     @torch.no_grad()
     def gaussians(self, before: Gaussians) -> Gaussians:
-        """The Gaussians as they are now."""
+        """The current Gaussians."""
         means, scales, quats, opacities, colors = (tensor.cpu().numpy() for tensor in self.splats())
         after = replace(
             before,
@@ -161,10 +162,10 @@ class _Anchored(_Parameters):
         super().__init__(gaussians, device)
         n = len(gaussians)
         self._weight = options.shape_weight
-        self._optimise(outline=torch.zeros((n, 2), device=device), turn=torch.zeros(n, device=device))
+        self._optimize(outline=torch.zeros((n, 2), device=device), turn=torch.zeros(n, device=device))
 
     def shapes(self) -> tuple[Tensor, Tensor, Tensor]:
-        outline, turn = self.optimised["outline"], self.optimised["turn"]
+        outline, turn = self.optimized["outline"], self.optimized["turn"]
         kept = outline + 0.5 * torch.log(torch.exp(-2 * outline).mean(dim=1, keepdim=True))  # mean of 1 / change^2 is 1
         change = torch.cat((kept, torch.zeros_like(turn)[:, None]), dim=1)
         w, x, y, z = self.quats.unbind(1)
@@ -173,12 +174,12 @@ class _Anchored(_Parameters):
         return self.means, torch.exp(self.log_scales + change), turned
 
     def prior(self) -> Tensor:
-        return self._weight * (self.optimised["outline"] ** 2).mean()
+        return self._weight * (self.optimized["outline"] ** 2).mean()
 
     @torch.no_grad()
     def clamp(self) -> None:
         super().clamp()
-        self.optimised["outline"].clamp_(-0.5 * _LARGEST_CHANGE, 0.5 * _LARGEST_CHANGE)
+        self.optimized["outline"].clamp_(-0.5 * _LARGEST_CHANGE, 0.5 * _LARGEST_CHANGE)
 
 
 class _Free(_Parameters):
@@ -186,16 +187,16 @@ class _Free(_Parameters):
 
     def __init__(self, gaussians: Gaussians, options: Options, device: torch.device):
         super().__init__(gaussians, device)
-        self._optimise(means=self.means.clone(), shape=self.log_scales.clone(), quats=self.quats.clone())
+        self._optimize(means=self.means.clone(), shape=self.log_scales.clone(), quats=self.quats.clone())
 
     def shapes(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self.optimised["means"], torch.exp(self.optimised["shape"]), self.optimised["quats"]
+        return self.optimized["means"], torch.exp(self.optimized["shape"]), self.optimized["quats"]
 
     @torch.no_grad()
     def clamp(self) -> None:
         super().clamp()
-        shape = self.optimised["shape"]
+        shape = self.optimized["shape"]
         shape.copy_(
             torch.maximum(torch.minimum(shape, self.log_scales + _LARGEST_CHANGE), self.log_scales - _LARGEST_CHANGE)
         )
-        self.optimised["quats"].copy_(torch.nn.functional.normalize(self.optimised["quats"], dim=1))
+        self.optimized["quats"].copy_(torch.nn.functional.normalize(self.optimized["quats"], dim=1))

@@ -22,14 +22,14 @@ _ATTRIBUTES = {
     "keyframe": ("anchor_keyframe", 1, np.int32),
     "anchor": ("anchor_cam", 3, np.float32),
 }
-"""Point attribute -> (field, columns, type); besides ``positions`` and ``colors``."""
+"""Point attribute -> (field, columns, type), in addition to ``positions`` and ``colors``."""
 
-_BYTES = 67  # of one Gaussian: 14 float32, 2 int32, 3 uint8
+_BYTES = 67  # per Gaussian: 14 float32, 2 int32, 3 uint8
 
 
 def to_point_cloud(gaussians: Gaussians) -> o3d.t.geometry.PointCloud:
-    """Zero-copy: the cloud's attributes share the arrays' memory. A Gaussian's id, to which its features belong, is its
-    row; the attribute ``feature`` carries it, so that it survives a selection of points."""
+    """Makes a point cloud whose attributes share memory with the arrays. The id of a Gaussian, which its features refer
+    to, is its row; the attribute ``feature`` carries it, so that it survives a selection of points."""
     import open3d as o3d
 
     cloud = o3d.t.geometry.PointCloud(_tensor(gaussians.means))
@@ -54,20 +54,20 @@ def _from_columns(columns: dict[str, np.ndarray]) -> Gaussians:
 
 
 def write_gaussian_ply(gaussians: Gaussians, path: Path) -> None:
-    """Write the point cloud as binary PLY. Raises OSError, or MapError if it could not be written whole."""
+    """Writes the point cloud as binary PLY. Raises OSError, or MapError if the file could not be written completely."""
     import open3d as o3d
 
     size = _BYTES * len(gaussians)
     with path.open("wb") as stream:
-        # Open3D reports a full disk as a line per property that it could not write: find out first.
+        # On a full disk, Open3D reports each property that it cannot write. Find out first.
         os.posix_fallocate(stream.fileno(), 0, size + 4096)
     written = len(gaussians) > 0 and o3d.t.io.write_point_cloud(str(path), to_point_cloud(gaussians))
     if not written or path.stat().st_size < size:
-        raise MapError(f"Cannot write {path}: there are no Gaussians, or the disk is full.")
+        raise MapError(f"Cannot write {path}: there are no Gaussians to write, or the disk is full.")
 
 
 def read_gaussian_ply(path: Path) -> Gaussians:
-    """Read what ``write_gaussian_ply`` wrote. Raises MapError."""
+    """Reads a file of ``write_gaussian_ply``. Raises MapError."""
     try:
         rows = read_ply_vertices(path)
     except FreeOccError as error:
@@ -80,7 +80,7 @@ def read_gaussian_ply(path: Path) -> Gaussians:
 
 
 def _take(columns: dict[str, np.ndarray], name: str, width: int, dtype: type) -> np.ndarray:
-    """An attribute as (N, width): whole, or from the columns name_0, name_1, … that a PLY file splits it into."""
+    """An attribute as (N, width): whole, or joined from the columns name_0, name_1, … of a PLY file."""
     if name not in columns:
         parts = [f"{name}_{i}" for i in range(width)]
         if any(part not in columns for part in parts):

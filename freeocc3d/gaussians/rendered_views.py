@@ -1,4 +1,4 @@
-"""What Gaussians are fitted to and measured against: keyframes at the size in which they are rendered."""
+"""The keyframes, at rendering size, that Gaussians are fitted to and compared with."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ class CapturedView:
 
     @property
     def measured(self) -> Tensor:
-        """(H, W) bool, where there is a depth."""
+        """(H, W) bool, where depth was measured."""
         return self.depth_m > 0
 
 
 def prepare_captured_view(
     frame: Frame, T_world_cam: NDArray[np.float64], width: int, device: torch.device
 ) -> CapturedView:
-    """A frame at ``width`` columns, or its own if it has fewer. Colour is averaged; depth is picked, for an average
-    across an edge lies on no surface."""
+    """Reduces a frame to ``width`` columns if it has more. Color is averaged. Depth is picked, because an average
+    across an edge is on no surface."""
     camera, color, depth_m = frame.intrinsics, frame.color, frame.depth_m
     if camera.width > width:
         size = width, max(1, round(camera.height * width / camera.width))
@@ -57,7 +57,7 @@ def prepare_captured_view(
 
 
 def render_gaussians(gaussians: Gaussians, view: CapturedView, rasterizer: Rasterizer) -> Rendered:
-    """The Gaussians as the view's camera sees them; not differentiable."""
+    """Renders the Gaussians from the view's camera; not differentiable."""
     arrays = gaussians.means, gaussians.scales, gaussians.quats_wxyz, gaussians.opacities, gaussians.colors / 255.0
     tensors = (torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(rasterizer.device) for array in arrays)
     with torch.no_grad():
@@ -66,10 +66,10 @@ def render_gaussians(gaussians: Gaussians, view: CapturedView, rasterizer: Raste
 
 @dataclass(frozen=True)
 class Fidelity:
-    """How well rendered views agree with what was captured, means over views (None: in no view).
+    """How well rendered views agree with the captured ones: means over the views (None: in no view).
 
-    psnr: dB over all pixels.  psnr_measured: dB over the pixels that have a depth, which is where there are anchors.
-    depth_l1_m: mean |D / alpha - d| over the pixels that have a depth and alpha >= 1/2, metres.
+    psnr: dB over all pixels.  psnr_measured: dB over the pixels that have a depth, which is where anchors are.
+    depth_l1_m: mean |D / alpha - d| over the pixels that have a depth and alpha >= 1/2, meters.
     covered: share of the pixels with a depth that have alpha >= 1/2.
     """
 
@@ -80,7 +80,7 @@ class Fidelity:
 
 
 def measure_fidelity(gaussians: Gaussians, views: Sequence[CapturedView], rasterizer: Rasterizer) -> Fidelity:
-    """Render each view and compare."""
+    """Renders each view and compares it with the captured one."""
     rows = [_fidelity(render_gaussians(gaussians, view, rasterizer), view) for view in views]
     if not rows:
         return Fidelity(None, None, None, None)

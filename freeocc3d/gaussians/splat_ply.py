@@ -1,7 +1,7 @@
 """Reads and writes the PLY files of 3D Gaussian splatting (SplaTAM, MonoGS, Photo-SLAM, viewers, …).
 
 Format: B. Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023: ``x y z``, ``f_dc_0..2`` with rgb = 0.5 + f_dc / (2
-sqrt(pi)), ``opacity`` as a logit, ``scale_*`` as natural logarithms (one where the Gaussians are spheres), ``rot_0..3``
+sqrt(pi)), ``opacity`` as a logit, ``scale_*`` as natural logarithms (one if the Gaussians are spheres), ``rot_0..3``
 wxyz, not always of unit length.
 """
 
@@ -18,15 +18,15 @@ from ..core.ply_files import read_ply_header, read_ply_vertices, write_ply
 from ..core.types import Gaussians
 
 _SH_C0 = 0.5 / math.sqrt(math.pi)
-_LEAST_OPACITY = 1e-6  # whose logit, and that of one minus it, are finite
+_LEAST_OPACITY = 1e-6  # its logit, and the logit of 1 minus it, are finite
 _NEEDED = ("x", "y", "z", "opacity", "scale_0", "rot_0", "rot_1", "rot_2", "rot_3")
 
 
 def read_standard_ply(path: Path) -> tuple[Gaussians, NDArray[np.int64] | None]:
-    """The Gaussians of a 3DGS PLY in its own world, and (N,) what its property ``label`` says, if there is one.
+    """Reads the Gaussians of a 3DGS PLY in its own world, and (N,) the values of its property ``label``, if it has one.
 
-    Gaussians with a value that is not finite are left out; there is no keyframe that they are anchored to. Raises
-    FreeOccError: no such file, damaged, a property is missing.
+    Leaves out Gaussians with a value that is not finite. The Gaussians are anchored to no keyframe. Raises FreeOccError
+    if the file does not exist, is damaged, or lacks a property.
     """
     rows = _rows(path)
     names = rows.dtype.names or ()
@@ -54,7 +54,7 @@ def read_standard_ply(path: Path) -> tuple[Gaussians, NDArray[np.int64] | None]:
 
 
 def write_standard_ply(gaussians: Gaussians, path: Path) -> None:
-    """Write N Gaussians in the frame that they are in, without spherical harmonics beyond the first. Raises OSError."""
+    """Writes N Gaussians in their current frame, with spherical harmonics of degree 0 only. Raises OSError."""
     names = [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
         *(f"scale_{i}" for i in range(3)),
@@ -74,7 +74,7 @@ def write_standard_ply(gaussians: Gaussians, path: Path) -> None:
 
 
 def _columns(rows: NDArray[np.void], names: list[str]) -> NDArray[np.float64]:
-    """(N, K) some properties."""
+    """(N, K) the named properties."""
     return np.stack([rows[name].astype(np.float64) for name in names], axis=1)
 
 
@@ -82,6 +82,6 @@ def _rows(path: Path) -> NDArray[np.void]:
     """(N,) the vertices as records of their properties."""
     names = [line[-1] for line in read_ply_header(path).elements[0][2]]
     if missing := [name for name in _NEEDED if name not in names]:
-        hint = " It is a map's own file: evaluate the map's folder." if "anchor_0" in names else ""
-        raise FreeOccError(f"{path} is no 3D Gaussian splatting PLY: its vertices lack {', '.join(missing)}.{hint}")
+        hint = " It is an internal file of a map: evaluate the map's folder instead." if "anchor_0" in names else ""
+        raise FreeOccError(f"{path} is not a 3D Gaussian splatting PLY: its vertices lack {', '.join(missing)}.{hint}")
     return read_ply_vertices(path)

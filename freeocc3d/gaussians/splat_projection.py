@@ -1,7 +1,7 @@
-"""Gaussians to splats in an image, and gradients back, compiled (``rasterizers/base.py`` has the equations).
+"""Projects Gaussians to splats in an image, and gradients back, compiled (equations: ``rasterizers/base.py``).
 
 A splat is a row of numbers: its pixel u, v; its conic a, b, c, the inverse of Sigma_2; opacity; the smallest exponent
-that reaches ALPHA_MIN; colour; z. Its gradient is a row of these without the exponent.
+that reaches ALPHA_MIN; color; z. Its gradient is the same row without the exponent.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PIXEL_U, PIXEL_V, CONIC_A, CONIC_B, CONIC_C, OPACITY, LEAST, RED, Z = 0, 1, 2, 3
 
 COLUMNS = 11
 GRADIENTS = 10
-"""Columns of a splat, and of its gradient."""
+"""Number of columns of a splat, and of its gradient."""
 
 _LOG_ALPHA_MIN = math.log(ALPHA_MIN)
 _STEEPEST = 1.5  # |J| <= this (fx + fy) / z while |x / z| and |y / z| are below 1: sqrt(2) rounded up
@@ -53,7 +53,8 @@ def project_splats(
     width: int,
     height: int,
 ) -> tuple[Array, NDArray[np.int32]]:
-    """(N, 11) splats, and (N, 4) first and last column, first and last row that they reach; first > last: none."""
+    """(N, 11) splats, and (N, 4) the first and last column and the first and last row that each reaches; first > last:
+    none."""
     n = len(means)
     splats = np.empty((n, COLUMNS), np.float32)
     box = np.empty((n, 4), np.int32)
@@ -68,7 +69,7 @@ def project_splats(
         u, v = fx * x / z + cx, fy * y / z + cy
         least = np.float32(_LOG_ALPHA_MIN) - math.log(opacities[g])
         reach = math.sqrt(np.float32(-2) * least)
-        # A bound of the extent that needs no rotation leaves most of what is out of view.
+        # A bound on the extent that needs no rotation skips most Gaussians out of view.
         largest = max(scales[g, 0], scales[g, 1], scales[g, 2])
         bound = reach * (math.sqrt(np.float32(BLUR)) + largest * (fx + fy) * np.float32(_STEEPEST) / z)
         outside = u < -bound or v < -bound or u > width - 1 + bound or v > height - 1 + bound
@@ -124,8 +125,8 @@ def project_backward(
     rows: NDArray[np.int64],
     parts: Array,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Gradients of means, scales, quaternions, opacities, colours from those of the splats, which are rows of the
-    Gaussians."""
+    """Gradients of means, scales, quaternions, opacities and colors from the gradients of splats; rows: the Gaussian of
+    each splat."""
     n = len(means)
     d_means, d_scales = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
     d_quats, d_opacities = np.zeros((n, 4), np.float32), np.zeros(n, np.float32)
@@ -170,7 +171,7 @@ def _part_backward(
     d_opacities: Array,
     d_colors: Array,
 ) -> None:
-    """A thread's share of ``project_backward``: every n-th splat."""
+    """The part of ``project_backward`` for one thread: every n-th splat."""
     d = np.empty(GRADIENTS, np.float32)
     M = np.empty((2, 3), np.float32)
     C = np.empty((3, 3), np.float32)  # R Q: the principal axes in the camera's frame
@@ -203,7 +204,7 @@ def _part_backward(
             vv += M[1, j] * M[1, j]
         determinant = uu * vv - uv * uv
         ka, kb, kc = vv / determinant, -uv / determinant, uu / determinant
-        # dL/dSigma = -K (dL/dK) K with K = Sigma^-1 and the off-diagonal gradient, of both entries, halved.
+        # dL/dSigma = -K (dL/dK) K with K = Sigma^-1; the off-diagonal gradient, which covers both entries, is halved.
         ga, gb, gc = d[2], np.float32(0.5) * d[3], d[4]
         e00, e01 = ga * ka + gb * kb, ga * kb + gb * kc
         e10, e11 = gb * ka + gc * kb, gb * kb + gc * kc
@@ -246,10 +247,11 @@ def _part_backward(
             + qw * (D[1, 0] - D[0, 1])
             - two * qz * (D[0, 0] + D[1, 1])
         )
-        along = dw * qw + dx * qx + dy * qy + dz * qz  # what lengthens the quaternion changes nothing
+        along = dw * qw + dx * qx + dy * qy + dz * qz  # the length of the quaternion has no effect
         d_quats[g, 0], d_quats[g, 1] = (dw - along * qw) / norm, (dx - along * qx) / norm
         d_quats[g, 2], d_quats[g, 3] = (dy - along * qy) / norm, (dz - along * qz) / norm
-        # The mean moves the pixel, z, and J through 1 / z and the slopes (only while they are within their limits).
+        # The mean moves the pixel, z, and J through 1 / z and through the slopes (only while they are within their
+        # limits).
         cam_x = d[0] * fx / z
         cam_y = d[1] * fy / z
         cam_z = d[9] - (d[0] * fx * x + d[1] * fy * y) / (z * z) - d_fz / (z * z)

@@ -1,4 +1,4 @@
-"""Sums over points by the cubic cells that they lie in, kept in a hash table: memory grows with the surface."""
+"""Sums points by cubic cells, which are kept in a hash table: memory grows with the surface."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from ..core.types import PosedFrame
 from ..core.voxel_keys import pack_voxels
 from .depth_edges import is_at_edge, mask_away_from_edges
 
-"""Cells on either side of the world's origin, along each axis."""
+"""Number of cells on either side of the world's origin along each axis."""
 
 
 @dataclass(frozen=True)
 class Cells:
-    """What lies in N cells, ``key`` ascending.
+    """N cells and the sums over their points, by ascending ``key``.
 
-    points: (N, 3) float64 weighted means, world, metres.  colors: (N, 3) float64 weighted means.  weights: (N,) sums.
-    pixels: (N,) measurements.  best: (N,) the greatest weight of one measurement, keyframe: (N,) int32 and footprint:
-    (N,) float32, metres, of that measurement.
+    points: (N, 3) float64 weighted means, world, meters.  colors: (N, 3) float64 weighted means.  weights: (N,) sums.
+    pixels: (N,) number of measurements.  best: (N,) the largest weight of a measurement.  keyframe: (N,) int32 and
+    footprint: (N,) float32, meters, those of that measurement.
     """
 
     key: NDArray[np.int64]
@@ -46,21 +46,21 @@ class Cells:
 
 
 class CellSums:
-    """Adds up measurements; ``cells`` gives their means. 88 bytes a cell, and 24 to 48 of a table."""
+    """Sums measurements; ``cells`` returns their means. Memory: 88 bytes per cell, and 24 to 48 for the hash table."""
 
     def __init__(self, cell_size: float):
         self.cell_size = cell_size
         self._used = 0
         self._table, self._rows = build_table(np.zeros(0, np.int64), 0)
         self._key = np.zeros(0, np.int64)
-        self._sums = np.zeros((0, 7))  # of weights, weighted positions, weighted colours
+        self._sums = np.zeros((0, 7))  # of weights, weighted positions, weighted colors
         self._pixels = np.zeros(0, np.int64)
         self._best = np.zeros(0)
         self._keyframe = np.zeros(0, np.int32)
         self._footprint = np.zeros(0, np.float32)
 
     def add_frame(self, posed: PosedFrame, step: int, edge: float) -> None:
-        """Add every ``step``-th pixel of every such row that has a depth and is not at a depth edge."""
+        """Adds every ``step``-th pixel of every ``step``-th row, if it has a depth and is not at a depth edge."""
         frame, T, keyframe = posed
         camera = frame.intrinsics
         height, width = frame.depth_m.shape
@@ -71,7 +71,7 @@ class CellSums:
         )  # fmt: skip
 
     def add(self, cells: Cells) -> None:
-        """Add means, by where they are now, with all that they are made of."""
+        """Adds means to the cells that contain them, with all their measurements."""
         self._make_room(len(cells))
         self._used = _add_cells(
             cell_keys(cells.points, self.cell_size), cells.points, cells.colors, cells.weights, cells.pixels,
@@ -79,7 +79,7 @@ class CellSums:
         )  # fmt: skip
 
     def cells(self) -> Cells:
-        """What was added so far."""
+        """The means of all that was added."""
         rows = np.argsort(self._key[: self._used])
         sums = self._sums[rows]
         return Cells(
@@ -98,7 +98,7 @@ class CellSums:
         return (self._table, self._rows, *columns)
 
     def _make_room(self, more: int) -> None:
-        """For so many new cells."""
+        """Makes room for ``more`` new cells."""
         wanted = self._used + more
         if wanted > len(self._key):
             room = max(wanted, 3 * len(self._key) // 2)
@@ -110,12 +110,13 @@ class CellSums:
 
 
 def cell_keys(points_world: NDArray[np.float64], cell_size: float) -> NDArray[np.int64]:
-    """(N, 3) metres to (N,) one integer per cell; cells within 2**20 of the origin along each axis are told apart."""
+    """Converts (N, 3) meters to (N,) integers, one per cell; cells within 2**20 of the origin along each axis have
+    distinct integers."""
     return pack_voxels(np.floor(points_world / cell_size).astype(np.int64))
 
 
 def cells_reference(posed: PosedFrame, step: int, edge: float, cell_size: float) -> Cells:
-    """What ``CellSums`` makes of one frame, in plain NumPy."""
+    """The cells that ``CellSums`` makes from one frame, in plain NumPy."""
     frame, T, row = posed
     v, u = (step * index for index in np.nonzero(mask_away_from_edges(frame.depth_m, edge)[::step, ::step]))
     depth = frame.depth_m[v, u]
@@ -139,7 +140,7 @@ def cells_reference(posed: PosedFrame, step: int, edge: float, cell_size: float)
 
 @njit(cache=True, nogil=True)
 def _row_of(key, used, table, rows, keys):  # type: ignore[no-untyped-def]
-    """Row of a cell, a new one if there is none yet, and the number of rows."""
+    """Returns the row of a cell, a new one if it has none, and the number of rows."""
     at = find_slot(table, key)
     if table[at] == -1:
         table[at] = key

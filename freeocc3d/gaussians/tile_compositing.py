@@ -1,4 +1,4 @@
-"""Splats to pixels, and gradients back, compiled: tiles, each composited nearest first until it is opaque."""
+"""Composites splats to pixels, and gradients back, compiled: tile by tile, nearest first until the tile is opaque."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from .rasterizers.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .splat_projection import CONIC_A, CONIC_B, CONIC_C, GRADIENTS, LEAST, OPACITY, PIXEL_U, PIXEL_V, RED, Z
 
 TILE = 16
-"""Pixels along a tile's edge: the 3D Gaussian Splatting paper's."""
+"""Edge of a tile in pixels, as in the 3D Gaussian Splatting paper."""
 
-_VALUES = 5  # of a Gaussian that are composited: red, green, blue, z, 1
-_SHORT = 5  # columns: a shorter row of a splat is not worth the search for the ellipse's ends
+_VALUES = 5  # composited values of a Gaussian: red, green, blue, z, 1
+_SHORT = 5  # columns: for a shorter row of a splat, finding the ends of the ellipse costs more than it saves
 
 Array = NDArray[np.float32]
 
 
 @njit(cache=True)
 def sort_nearest_first(rows: NDArray[np.int64], bits: NDArray[np.uint32]) -> NDArray[np.int64]:
-    """Rows sorted by the floats whose bits are given, which sort as integers do, being positive; ties as they come.
-    Three passes of a radix sort: np.argsort takes ten times as long."""
+    """Sorts rows by the floats with the given bits. Positive floats sort like integers; ties keep their order. Three
+    passes of a radix sort; np.argsort takes ten times as long."""
     for shift in (0, 11, 22):
         place = np.zeros(2049, np.int64)
         for n in range(len(bits)):
@@ -41,7 +41,7 @@ def sort_nearest_first(rows: NDArray[np.int64], bits: NDArray[np.uint32]) -> NDA
 
 @njit(cache=True)
 def list_by_tile(box: NDArray[np.int32], across: int, down: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Counting sort: tile t's splats are ``listed[start[t]:start[t + 1]]``, in their order."""
+    """Counting sort: the splats of tile t are ``listed[start[t]:start[t + 1]]``, in their order."""
     start = np.zeros(across * down + 1, np.int64)
     for s in range(len(box)):
         for row in range(box[s, 2] // TILE, box[s, 3] // TILE + 1):
@@ -69,7 +69,7 @@ def composite(
     width: int,
     height: int,
 ) -> Array:
-    """(H, W, 5) sums of w_k (colour, z, 1)."""
+    """(H, W, 5) sums of w_k (color, z, 1)."""
     across = (width + TILE - 1) // TILE
     out = np.zeros((height, width, _VALUES), np.float32)
     for tile in prange(len(start) - 1):
@@ -131,7 +131,7 @@ def _span(
     low: int,
     high: int,
 ) -> tuple[int, int]:
-    """First and last column of a row that an ellipse reaches, within low … high, and not one pixel too few."""
+    """First and last column, within low … high, of a row that an ellipse reaches; never one pixel too few."""
     half = b * b * dv * dv - a * (c * dv * dv + np.float32(2) * least)
     if half <= 0:
         half = np.float32(0)
@@ -150,10 +150,10 @@ def composite_backward(
     gradient: Array,
     threads: int,
 ) -> Array:
-    """(threads, S, 10) parts of the gradients of S splats.
+    """(threads, S, 10) partial gradients of S splats.
 
-    With v_k = dL/dw_k and S_k = sum_{j>k} w_j v_j, dL/dalpha_k = T_k v_k - S_k / (1 - alpha_k); S_k is what is left of
-    the pixel's sum, which the forward pass gave."""
+    With v_k = dL/dw_k and S_k = sum_{j>k} w_j v_j, dL/dalpha_k = T_k v_k - S_k / (1 - alpha_k). S_k is the rest of the
+    pixel's sum, which the forward pass gave."""
     height, width = out.shape[:2]
     across = (width + TILE - 1) // TILE
     parts = np.zeros((threads, len(splats), GRADIENTS), np.float32)

@@ -1,1 +1,1 @@
-"""Differentiable renderers of Gaussians behind one contract (``base``); a renderer is one file."""
+"""Differentiable renderers of Gaussians, one file each; ``base`` is their contract."""

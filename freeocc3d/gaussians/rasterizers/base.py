@@ -1,4 +1,4 @@
-"""The contract of a rasterizer, and the constants of alpha compositing that all of them share.
+"""The contract of a rasterizer, and the constants of alpha compositing that all rasterizers share.
 
 A rasterizer is one file of this folder with ``load() -> Rasterizer``, or ``load(options)`` if it has ``Options``. It
 renders N Gaussians (paper, Eq. render) as
@@ -10,7 +10,8 @@ renders N Gaussians (paper, Eq. render) as
 
 with z_k the mean's camera-frame z. Depth is not divided by alpha.
 
-Source: B. Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023; constants as in gsplat, so that all agree.
+Source: B. Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023. The constants are gsplat's, so that all rasterizers
+agree.
 """
 
 from __future__ import annotations
@@ -23,18 +24,18 @@ from torch import Tensor
 from ...core.types import Intrinsics
 
 BLUR = 0.3
-"""Variance in pixels^2 that every splat is widened by: none is smaller than a pixel."""
+"""Variance in pixels^2 that is added to every splat, so that none is smaller than a pixel."""
 ALPHA_MIN, ALPHA_MAX = 1.0 / 255.0, 0.999
 TRANSMITTANCE_MIN = 1e-4
 NEAR = 0.01
-"""Metres; Gaussians whose mean is nearer are not drawn."""
+"""Meters; Gaussians with nearer means are not drawn."""
 BEYOND = 0.15
-"""Share of the image's width and height, on either side, within which J is taken at the mean; beyond it at the border
-of that, where the linear projection still holds."""
+"""J is evaluated at the mean up to this share of the image's width and height beyond each edge. For means beyond that
+limit it is evaluated at the limit, where the linear projection is still valid."""
 
 
 class Rendered(NamedTuple):
-    """image (H, W, 3) with the background black, depth (H, W) metres times alpha, alpha (H, W); float32."""
+    """image (H, W, 3) on a black background, depth (H, W) meters times alpha, alpha (H, W); float32."""
 
     image: Tensor
     depth: Tensor
@@ -42,9 +43,9 @@ class Rendered(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """What a rasterizer takes of N Gaussians, float32 on its device.
+    """The input of a rasterizer for N Gaussians, float32 on its device.
 
-    means (N, 3) world metres, scales (N, 3) metres, quats_wxyz (N, 4) of any length but 0, opacities (N,) and colors
+    means (N, 3) world meters, scales (N, 3) meters, quats_wxyz (N, 4) of any length but 0, opacities (N,) and colors
     (N, 3) in 0…1.
     """
 
@@ -61,12 +62,12 @@ class Rasterizer(Protocol):
     device: torch.device
 
     def render(self, splats: Splats, T_cam_world: Tensor, camera: Intrinsics) -> Rendered:
-        """The image that ``camera`` sees. T_cam_world: (4, 4) float32 on ``device``."""
+        """Renders the image of ``camera``. T_cam_world: (4, 4) float32 on ``device``."""
         ...
 
 
 def compute_slope_limits(camera: Intrinsics) -> tuple[float, float, float, float]:
-    """Least and greatest x/z, then y/z, at which J is taken (``BEYOND``)."""
+    """The smallest and largest x/z, then y/z, at which J is evaluated (``BEYOND``)."""
     beside, above = BEYOND * camera.width / camera.fx, BEYOND * camera.height / camera.fy
     return (
         -(camera.cx + 0.5) / camera.fx - beside,

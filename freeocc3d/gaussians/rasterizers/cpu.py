@@ -1,4 +1,4 @@
-"""Compiled for CPUs: tiles, sorted splats, forward and backward on all cores."""
+"""Compiled for CPUs: tiles, sorted splats, forward and backward pass on all cores."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Array = NDArray[np.float32]
 
 
 class CpuRasterizer:
-    """Splats are sorted by depth once, then listed by the tiles that they reach; a tile is composited nearest first
-    until it is opaque. The backward pass composites again, and each thread adds up gradients of its own.
+    """Sorts splats by depth once, then lists them by the tiles that they reach. It composites each tile nearest first
+    until the tile is opaque. The backward pass composites again, and each thread sums its own gradients.
 
-    Memory: 44 bytes a splat in view, 4 a splat and tile, and backward 40 a splat and thread."""
+    Memory: 44 bytes per splat in view, 4 per splat and tile, and for the backward pass 40 per splat and thread."""
 
     def __init__(self) -> None:
         self.device = torch.device("cpu")
@@ -67,5 +67,5 @@ def _array(tensor: Tensor) -> Array:
 
 
 def load() -> CpuRasterizer:
-    """The rasterizer."""
+    """Makes the rasterizer."""
     return CpuRasterizer()

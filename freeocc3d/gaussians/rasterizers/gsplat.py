@@ -1,4 +1,4 @@
-"""gsplat's CUDA kernels; needs an NVIDIA GPU and ``pip install freeocc3d[gsplat]``."""
+"""gsplat's CUDA kernels; they need an NVIDIA GPU and ``pip install freeocc3d[gsplat]``."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ REQUIRES = ("gsplat",)
 
 
 class Options(TypedOptions, frozen=True):
-    """Where it runs."""
+    """The device."""
 
     device: str = "cuda:0"
-    """A CUDA device of torch's."""
+    """A CUDA device of torch, such as "cuda:0"."""
 
 
 class GsplatRasterizer:
@@ -30,7 +30,7 @@ class GsplatRasterizer:
         """See ``base.Rasterizer``."""
         from gsplat import rasterization
 
-        # Pixel centres are at halves there, at integers here.
+        # gsplat puts pixel centers at halves; here they are at integers.
         K = torch.tensor(
             ((camera.fx, 0.0, camera.cx + 0.5), (0.0, camera.fy, camera.cy + 0.5), (0.0, 0.0, 1.0)), device=self.device
         )
@@ -52,7 +52,7 @@ class GsplatRasterizer:
 
 
 def load(options: Options) -> GsplatRasterizer:
-    """The rasterizer on a CUDA device. Raises DependencyError where there is none."""
+    """Makes the rasterizer on a CUDA device. Raises DependencyError if there is none."""
     if not torch.cuda.is_available():
         raise DependencyError(
             "The rasterizer 'gsplat' needs an NVIDIA GPU and a torch built for CUDA: use fitting.rasterizer=cpu."

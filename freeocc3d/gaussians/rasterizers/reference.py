@@ -1,4 +1,4 @@
-"""Plain PyTorch on any device: the oracle that the others are tested against, too slow for whole scans."""
+"""Plain PyTorch on any device: the reference for tests of the other rasterizers; too slow for whole scans."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _TILE = 16
 
 
 class Options(TypedOptions, frozen=True):
-    """Where it runs."""
+    """The device."""
 
     device: str = "cpu"
-    """A device of torch's: "cpu", "cuda:0"…"""
+    """A device of torch, such as "cpu" or "cuda:0"."""
 
 
 class ReferenceRasterizer:
-    """Pixels are rendered in tiles, so that memory holds; within a tile every Gaussian that reaches it is evaluated at
-    every pixel."""
+    """Renders tile by tile to limit memory; within a tile, every Gaussian that reaches it is evaluated at every
+    pixel."""
 
     def __init__(self, device: str = "cpu"):
         self.device = torch.device(device)
@@ -33,7 +33,7 @@ class ReferenceRasterizer:
         means, scales, quats_wxyz, opacities, colors = splats
         center, covariance, z = project_gaussians(means, scales, quats_wxyz, T_cam_world, camera)
         with torch.no_grad():
-            # alpha >= ALPHA_MIN within this box, and nowhere else.
+            # alpha >= ALPHA_MIN only within this box.
             reach = torch.sqrt(2 * torch.log((opacities / ALPHA_MIN).clamp(min=1)))[:, None]
             half = reach * torch.sqrt(torch.stack((covariance[:, 0, 0], covariance[:, 1, 1]), 1)) + 1e-3
             low, high = center - half, center + half
@@ -112,5 +112,5 @@ def _composite(pixels: Tensor, center: Tensor, conic: Tensor, opacities: Tensor,
 
 
 def load(options: Options) -> ReferenceRasterizer:
-    """The rasterizer."""
+    """Makes the rasterizer."""
     return ReferenceRasterizer(options.device)
