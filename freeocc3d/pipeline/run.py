@@ -20,8 +20,8 @@ from ..storage.work_folder import WorkFolder
 from ..tracking.rgbd import focal_calibration
 from .checks import check, warn_of_color_focal
 from .mapper import Mapper
-from .saving import absolute
 from .run_stages import STAGES, Run
+from .saving import absolute
 
 
 def reconstruct(

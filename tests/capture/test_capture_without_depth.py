@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import SIZE, camera_matrix, color_image, write_replica, write_scannet, write_seven_scenes
+from small_captures import SIZE, camera_matrix, color_image, write_replica, write_scannet, write_seven_scenes
 
 from freeocc3d.capture import Options, open_capture
 from freeocc3d.capture.camera_files import USUAL_FOCAL

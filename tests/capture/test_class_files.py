@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import models_folder
+from small_captures import models_folder
 
 from freeocc3d.capture.class_files import read_class_file, read_class_names
 from freeocc3d.core.errors import CaptureError

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import data_folder, depth_image, write_image, write_replica, write_scannet, write_seven_scenes
+from small_captures import data_folder, depth_image, write_image, write_replica, write_scannet, write_seven_scenes
 
 from freeocc3d.capture import Options, check_depth_scale, open_capture, select_frames
 from freeocc3d.core.errors import CaptureError, ConfigError

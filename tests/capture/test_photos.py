@@ -5,8 +5,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import color_image, depth_image, truncate, write_image, write_replica, write_scannet, write_seven_scenes
 from PIL import Image, ImageOps
+from small_captures import (
+    color_image,
+    depth_image,
+    truncate,
+    write_image,
+    write_replica,
+    write_scannet,
+    write_seven_scenes,
+)
 
 from freeocc3d.capture import Options, open_capture
 from freeocc3d.capture.camera_files import DIAGONAL_35MM, USUAL_FOCAL

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import class_image, color_image, data_folder, pose_matrix, write_image, write_replica
+from small_captures import class_image, color_image, data_folder, pose_matrix, write_image, write_replica
 
 from freeocc3d.capture.base import Options
 from freeocc3d.capture.readers.replica import Reader

@@ -5,7 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import camera_matrix, class_image, color_image, pose_matrix, write_image, write_matrix, write_scannet
+from small_captures import (
+    camera_matrix,
+    class_image,
+    color_image,
+    pose_matrix,
+    write_image,
+    write_matrix,
+    write_scannet,
+)
 
 from freeocc3d.capture.base import Options
 from freeocc3d.capture.depth_registration import OVERLAP_PX, DepthPatches, PixelGrid

@@ -5,7 +5,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import color_image, data_folder, pose_matrix, truncate, write_image, write_matrix, write_seven_scenes
+from small_captures import (
+    color_image,
+    data_folder,
+    pose_matrix,
+    truncate,
+    write_image,
+    write_matrix,
+    write_seven_scenes,
+)
 
 from freeocc3d.capture.base import Options
 from freeocc3d.capture.readers.seven_scenes import Reader

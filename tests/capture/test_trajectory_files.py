@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import pose_matrix, write_seven_scenes
 from scenes import CAMERA, wall_frame
+from small_captures import pose_matrix, write_seven_scenes
 
 from freeocc3d.capture import PoseFile, open_capture, read_trajectory
 from freeocc3d.core.errors import CaptureError, ConfigError, TrackingError

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import truncate
+from small_captures import truncate
 from videos import SIZE, number_of, write_video
 
 from freeocc3d.capture import Options, open_capture, read_ahead, select_frames

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 from command_line import SMALL, refused, run
-from helpers import data_folder, write_scannet, write_seven_scenes
+from small_captures import data_folder, write_scannet, write_seven_scenes
 
 ROOT = Path(__file__).parents[2]
 

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from test_word_query import WORDS, box, feature, occupancy
+from worded_voxels import WORDS, box, feature, occupancy
 
 from freeocc3d.cli.query_answers import answers_document, answers_text
 from freeocc3d.query.word_query import query

@@ -3,53 +3,33 @@
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
+from depth_networks import write_network
 
 from freeocc3d.core.errors import ModelError
 from freeocc3d.depth import depth_network
-
-
-def _write(path: Path, size=("height", "width"), channels: int = 3, output: str | None = None) -> Path:
-    """The image's red, unnormalized, as its (inverse) depth: (1, 1, H, W)."""
-    weight = np.zeros((1, channels, 1, 1), np.float32)
-    weight[0, 0] = 0.229
-    node = helper.make_node("Conv", ["image", "weight", "bias"], ["depth"])
-    graph = helper.make_graph(
-        [node], "depth",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, channels, *size])],
-        [helper.make_tensor_value_info("depth", TensorProto.FLOAT, [1, 1, *size])],
-        [numpy_helper.from_array(weight, "weight"), numpy_helper.from_array(np.array([0.485], np.float32), "bias")],
-    )  # fmt: skip
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    if output is not None:
-        helper.set_model_props(model, {"output": output})
-    onnx.save(model, str(path))
-    return path
-
 
 RAMP = np.broadcast_to(np.linspace(50, 250, 64, dtype=np.uint8)[None, :, None], (48, 64, 3)).copy()
 
 
 @pytest.mark.parametrize("size", [("height", "width"), (56, 70)])
 def test_output_has_the_size_that_stereo_has(tmp_path: Path, size) -> None:
-    network = depth_network.load_depth_network(_write(tmp_path / "n.onnx", size))
+    network = depth_network.load_depth_network(write_network(tmp_path / "n.onnx", size))
     guess = network(RAMP, 32, 24)
     assert guess.shape == (24, 32)
     np.testing.assert_allclose(guess[12, 2:-2], np.linspace(50, 250, 32)[2:-2] / 255, atol=0.02)
 
 
 def test_depth_becomes_inverse_depth(tmp_path: Path) -> None:
-    inverse = depth_network.load_depth_network(_write(tmp_path / "a.onnx"))(RAMP, 32, 24)
-    depth = depth_network.load_depth_network(_write(tmp_path / "b.onnx", output="depth"))(RAMP, 32, 24)
+    inverse = depth_network.load_depth_network(write_network(tmp_path / "a.onnx"))(RAMP, 32, 24)
+    depth = depth_network.load_depth_network(write_network(tmp_path / "b.onnx", output="depth"))(RAMP, 32, 24)
     np.testing.assert_allclose(depth[:, 2:-2], 1 / inverse[:, 2:-2], rtol=0.03)
 
 
 @pytest.mark.parametrize(("given", "says"), [({"channels": 1}, "must take one image"), ({"output": "x"}, "'output'")])
 def test_other_networks_are_refused(tmp_path: Path, given, says: str) -> None:
     with pytest.raises(ModelError, match=says):
-        depth_network.load_depth_network(_write(tmp_path / "n.onnx", **given))
+        depth_network.load_depth_network(write_network(tmp_path / "n.onnx", **given))
 
 
 def test_a_guess_is_fitted_and_fills_what_is_empty() -> None:

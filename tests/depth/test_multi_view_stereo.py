@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_depth_network import _write as write_network
+from depth_networks import write_network
 
 from freeocc3d.capture import open_capture
 from freeocc3d.capture.base import Capture, Options

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import camera_matrix, color_image, depth_image
+from small_captures import camera_matrix, color_image, depth_image
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = "example_backends"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import refused, run
+from posed_captures import write_colmap, write_nerfstudio
 
 from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import FreeOccError, MapError
@@ -219,8 +220,6 @@ def test_the_commands_say_what_the_unit_is(room: Map, half: Map, tmp_path: Path)
 
 
 def test_given_trackers_know_whether_their_poses_are_metric(tmp_path: Path, room: Map) -> None:
-    from test_posed_images import write_colmap, write_nerfstudio
-
     from freeocc3d.capture import Options
 
     def metric(folder: Path, **options) -> bool:

@@ -1,12 +1,12 @@
 """Published ground-truth packages, on small files of the same structure."""
 
 import json
-import pickle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from embodiedocc_packages import CORNER, SHAPE, centres, one_sentence, package, write_package
 
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.evaluation.embodiedocc import (
@@ -17,35 +17,6 @@ from freeocc3d.evaluation.embodiedocc import (
     read_split,
 )
 
-SHAPE = (3, 4, 2)
-CORNER = np.array([-1.04, 2.0, 0.16])
-
-
-def centres(shape: tuple[int, int, int] = SHAPE, voxel: float = 0.08) -> np.ndarray:
-    return CORNER + (np.moveaxis(np.indices(shape), 0, -1) + 0.5) * voxel
-
-
-def package(**changes: Any) -> dict[str, Any]:
-    """What a global package holds, some of it replaced; a value of None is left out."""
-    labels = (np.arange(24).reshape(SHAPE) % 12).astype(np.int64)
-    labels[0, 0, 0] = 255
-    whole = {
-        "scene_dim": np.array(SHAPE), "global_labels": labels, "global_pts": centres(),
-        "global_mask": np.ones(SHAPE, bool), "valid_img_paths": ["/data1/posed_images/scene0000_00/00007.jpg"],
-    } | changes  # fmt: skip
-    return {key: value for key, value in whole.items() if value is not None}
-
-
-def write(path: Path, content: object, protocol: int = 4) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(pickle.dumps(content, protocol))
-    return path
-
-
-def one_sentence(error: pytest.ExceptionInfo[FreeOccError]) -> bool:
-    text = str(error.value)
-    return text.isprintable() and text.endswith((".", "?")) and len(text) < 400
-
 
 @pytest.mark.parametrize("protocol", [2, 4, 5])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -53,7 +24,7 @@ def test_a_global_package_is_read(tmp_path: Path, protocol: int, dtype: Any) -> 
     mask = np.ones(SHAPE, bool)
     mask[2, 3, 1] = False
     content = package(global_pts=centres().astype(dtype), global_mask=mask)
-    truth = load_global_package(write(tmp_path / "scene.pkl", content, protocol))
+    truth = load_global_package(write_package(tmp_path / "scene.pkl", content, protocol))
     expected = content["global_labels"]  # whatever the global mask says
     assert truth.labels.dtype == np.uint8
     np.testing.assert_array_equal(truth.labels, expected)
@@ -74,8 +45,8 @@ def test_flat_arrays_and_plain_lists_give_the_same(tmp_path: Path) -> None:
         global_mask=whole["global_mask"].ravel().astype(np.uint8),
         valid_img_paths=None,
     )
-    one = load_global_package(write(tmp_path / "one.pkl", whole))
-    two = load_global_package(write(tmp_path / "two.pkl", flat))
+    one = load_global_package(write_package(tmp_path / "one.pkl", whole))
+    two = load_global_package(write_package(tmp_path / "two.pkl", flat))
     np.testing.assert_array_equal(one.labels, two.labels)
     np.testing.assert_array_equal(one.origin, two.origin)
 
@@ -85,11 +56,11 @@ def test_a_grid_of_one_layer_has_a_voxel_size(tmp_path: Path) -> None:
     content = package(
         scene_dim=shape, global_labels=np.zeros(shape, int), global_mask=np.ones(shape), global_pts=centres(shape)
     )
-    truth = load_global_package(write(tmp_path / "a.pkl", content))
+    truth = load_global_package(write_package(tmp_path / "a.pkl", content))
     np.testing.assert_allclose(truth.origin, CORNER, atol=1e-9)
     point = package(scene_dim=[1] * 3, global_labels=np.zeros(1, int), global_mask=None, global_pts=np.zeros((1, 3)))
     with pytest.raises(FreeOccError, match="single point"):
-        load_global_package(write(tmp_path / "a.pkl", point))
+        load_global_package(write_package(tmp_path / "a.pkl", point))
 
 
 def test_the_size_of_a_long_float32_grid_does_not_drift(tmp_path: Path) -> None:
@@ -98,7 +69,7 @@ def test_the_size_of_a_long_float32_grid_does_not_drift(tmp_path: Path) -> None:
     content = package(
         scene_dim=shape, global_labels=np.zeros(shape, int), global_mask=np.ones(shape), global_pts=points
     )
-    truth = load_global_package(write(tmp_path / "a.pkl", content))
+    truth = load_global_package(write_package(tmp_path / "a.pkl", content))
     assert truth.voxel_size == pytest.approx(0.08, abs=1e-6)
     assert np.abs(truth.centers() - points).max() < 4e-4
 
@@ -144,7 +115,7 @@ def bent(axis: int) -> np.ndarray:
 )  # fmt: skip
 def test_what_is_no_package_is_told(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(FreeOccError, match=message) as error:
-        load_global_package(write(tmp_path / "scene.pkl", package(**changes)))
+        load_global_package(write_package(tmp_path / "scene.pkl", package(**changes)))
     assert one_sentence(error)
     assert "scene.pkl" in str(error.value)
 
@@ -152,14 +123,16 @@ def test_what_is_no_package_is_told(tmp_path: Path, changes: dict[str, Any], mes
 def test_class_names_are_given_or_brought(tmp_path: Path) -> None:
     names = tuple(f"thing {k}" for k in range(44))
     labels = (np.arange(24).reshape(SHAPE) + 20).astype(np.uint8)
-    bare = write(tmp_path / "bare.pkl", package(global_labels=labels))
+    bare = write_package(tmp_path / "bare.pkl", package(global_labels=labels))
     assert load_global_package(bare, ("free", *names)).classes == ("free", *names)
-    few = write(tmp_path / "few.pkl", package())
+    few = write_package(tmp_path / "few.pkl", package())
     assert load_global_package(few, ("free", *names)).classes == EMBODIEDOCC_CLASSES
     with pytest.raises(FreeOccError, match=r"class 43, but only 42 .*--classes"):
         load_global_package(bare, ("free", *names[:42]))
     for key, brought in (("classes", list(names)), ("class_names", np.array(("empty", *names)))):
-        truth = load_global_package(write(tmp_path / f"{key}.pkl", package(global_labels=labels, **{key: brought})))
+        truth = load_global_package(
+            write_package(tmp_path / f"{key}.pkl", package(global_labels=labels, **{key: brought}))
+        )
         assert truth.classes[1:] == names
 
 
@@ -168,10 +141,10 @@ def data_set(folder: Path, masks: dict[str, Any], **changes: Any) -> Path:
     for place, mask in masks.items():
         split, index = place.split("/")
         frame = {"local_label": np.zeros((60, 60, 36), np.uint8), "mask_in_global": mask}
-        write(folder / "streme_occ_new_package" / split / f"scene0000_00_{index}_new.pkl", frame)
+        write_package(folder / "streme_occ_new_package" / split / f"scene0000_00_{index}_new.pkl", frame)
     paths = [f"/x/{place.split('/')[1]}.jpg" for place in masks]
     content = package(**{"valid_img_paths": paths} | changes)
-    return write(folder / "global_occ_package" / "scene0000_00.pkl", content)
+    return write_package(folder / "global_occ_package" / "scene0000_00.pkl", content)
 
 
 def test_the_frames_masks_are_united_whatever_their_form(tmp_path: Path) -> None:
@@ -196,7 +169,7 @@ def test_frames_of_other_scenes_and_unlisted_ones_do_not_count(tmp_path: Path) -
     path = data_set(tmp_path, {"train/00001": one})
     folder = tmp_path / "streme_occ_new_package"
     for stranger in ("scene0000_001_00001", "scene0000_00_1_00001", "scene0000_01_00001", "scene0000_00_00002"):
-        write(folder / "train" / f"{stranger}_new.pkl", {"mask_in_global": full})
+        write_package(folder / "train" / f"{stranger}_new.pkl", {"mask_in_global": full})
     np.testing.assert_array_equal(load_global_package(path).frames_mask, one)
     np.testing.assert_array_equal(load_frames_mask(folder, "scene0000_00", SHAPE), full)
     assert load_frames_mask(folder, "scene0000_02", SHAPE) is None
@@ -262,8 +235,8 @@ def test_a_split_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 def test_packages_are_found(tmp_path: Path) -> None:
-    beside = write(tmp_path / "room0.pkl", {})
-    inside = write(tmp_path / "global_occ_package" / "scene0000_00.pkl", {})
+    beside = write_package(tmp_path / "room0.pkl", {})
+    inside = write_package(tmp_path / "global_occ_package" / "scene0000_00.pkl", {})
     assert find_package(tmp_path, "room0") == beside
     assert find_package(tmp_path, "scene0000_00") == inside
     assert find_package(inside.parent, "scene0000_00") == inside
@@ -275,6 +248,6 @@ def test_packages_are_found(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("scene", ["../room0", "/etc/passwd", "", "..", "a/b", ".hidden", "a\\b", "room0\n", "a\0b"])
 def test_a_scene_cannot_lie_outside_the_folder(tmp_path: Path, scene: str) -> None:
-    write(tmp_path / "room0.pkl", {})
+    write_package(tmp_path / "room0.pkl", {})
     with pytest.raises(FreeOccError, match="is no name of a scene"):
         find_package(tmp_path / "inside", scene)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import data_folder
+from small_captures import data_folder
 
 from freeocc3d.core.errors import ExportError, FreeOccError
 from freeocc3d.evaluation.ground_truth import load_ground_truth, save_ground_truth

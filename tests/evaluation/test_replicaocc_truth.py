@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import data_folder, truncate, write_replica, write_seven_scenes
 from numpy.typing import NDArray
 from scenes import CAMERA
+from small_captures import data_folder, truncate, write_replica, write_seven_scenes
 
 from freeocc3d.capture import open_capture
 from freeocc3d.capture.base import Capture, Options

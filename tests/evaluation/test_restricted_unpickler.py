@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_embodiedocc import one_sentence, package, write
+from embodiedocc_packages import one_sentence, package, write_package
 
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.evaluation.embodiedocc import load_global_package
@@ -38,7 +38,7 @@ def test_arrays_and_plain_values_come_back(
         monkeypatch.setattr(numpys, "__module__", f"{core}.{module}")
     plain = {"list": [1, -2.5, "a", None, True, (3, "b")], "ordered": OrderedDict(x=1, y=2), "bytes": b"\x00\xff"}
     scalars = [np.float32(2.5), np.int64(-3), np.bool_(True), np.bool_(True)]
-    path = write(tmp_path / "package.pkl", ARRAYS | plain | {"scalars": scalars}, protocol)
+    path = write_package(tmp_path / "package.pkl", ARRAYS | plain | {"scalars": scalars}, protocol)
     assert core.encode() in path.read_bytes()
     loaded: Any = load_pickle(path)
     for name, array in ARRAYS.items():
@@ -52,7 +52,7 @@ def test_arrays_and_plain_values_come_back(
 
 def test_an_array_used_twice_is_one_array(tmp_path: Path) -> None:
     array = np.arange(1000)
-    loaded: Any = load_pickle(write(tmp_path / "a.pkl", [array, array, {"again": array}]))
+    loaded: Any = load_pickle(write_package(tmp_path / "a.pkl", [array, array, {"again": array}]))
     assert loaded[0] is loaded[1] is loaded[2]["again"]
 
 
@@ -78,14 +78,14 @@ class Call:
 )  # fmt: skip
 def test_calls_are_refused_before_they_happen(tmp_path: Path, protocol: int, function: Any, name: str) -> None:
     with pytest.raises(FreeOccError, match=name) as error:
-        load_pickle(write(tmp_path / "evil.pkl", {"global_labels": Call(function, "1")}, protocol))
+        load_pickle(write_package(tmp_path / "evil.pkl", {"global_labels": Call(function, "1")}, protocol))
     assert "evil.pkl" in str(error.value)
     assert one_sentence(error)
 
 
 def test_nothing_of_a_refused_pickle_is_executed(tmp_path: Path) -> None:
     trace = tmp_path / "trace"
-    path = write(tmp_path / "evil.pkl", package(extra=Call(os.system, f"touch {trace}")))
+    path = write_package(tmp_path / "evil.pkl", package(extra=Call(os.system, f"touch {trace}")))
     with pytest.raises(FreeOccError, match=r"system, and a package may hold only NumPy arrays"):
         load_global_package(path)
     assert not trace.exists()
@@ -125,7 +125,7 @@ def test_arrays_of_other_things_than_numbers_and_text_are_refused(
     tmp_path: Path, protocol: int, array: np.ndarray, what: str
 ) -> None:
     with pytest.raises(FreeOccError, match=f"array of.*{what}|array {what}"):
-        load_pickle(write(tmp_path / "a.pkl", array, protocol))
+        load_pickle(write_package(tmp_path / "a.pkl", array, protocol))
 
 
 def text(value: str) -> bytes:
@@ -207,18 +207,18 @@ def test_lists_nested_by_reference_stay_references(tmp_path: Path) -> None:
     laughs: list[Any] = []
     for _ in range(100):
         laughs = [laughs, laughs]
-    loaded: Any = load_pickle(write(tmp_path / "laughs.pkl", laughs))
+    loaded: Any = load_pickle(write_package(tmp_path / "laughs.pkl", laughs))
     assert loaded[0] is loaded[1]
     with pytest.raises(FreeOccError, match="holds a list in place of named arrays"):
         load_global_package(tmp_path / "laughs.pkl")
-    write(tmp_path / "laughs.pkl", package(scene_dim=[laughs, 1, 1], global_labels=laughs))
+    write_package(tmp_path / "laughs.pkl", package(scene_dim=[laughs, 1, 1], global_labels=laughs))
     with pytest.raises(FreeOccError, match=r"'scene_dim'.*three finite numbers"):
         load_global_package(tmp_path / "laughs.pkl")
 
 
 def test_shared_constants_are_not_taken_for_a_bomb(tmp_path: Path) -> None:
     size = (60, 60, 36)
-    assert load_pickle(write(tmp_path / "a.pkl", [size] * 4)) == [size] * 4
+    assert load_pickle(write_package(tmp_path / "a.pkl", [size] * 4)) == [size] * 4
 
 
 @pytest.mark.parametrize("protocol", [2, 4, 5])

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import data_folder
+from small_captures import data_folder
 
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.evaluation.ground_truth import load_ground_truth

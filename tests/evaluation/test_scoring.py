@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import refused, run
-from helpers import data_folder
+from small_captures import data_folder
 
 import freeocc3d
 from freeocc3d.cli.scores import scores_document, scores_text

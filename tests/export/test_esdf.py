@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
+from exported_maps import map_of, read_vdb
 from scenes import occupancy_of
-from test_export_frames import map_of
-from test_openvdb_files import read
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.export import esdf, export_map
@@ -67,7 +66,7 @@ def test_openvdb_holds_the_distances_of_known_voxels(tmp_path) -> None:
         distance, state, origin, size = (file[name] for name in ("distance", "state", "origin", "voxel_size"))
     at = np.argwhere(np.ones(state.shape, bool))
     shift = np.rint((origin - (0, 0, -0.05)) / size).astype(int)
-    told = read(tmp_path / "esdf.vdb", at + shift, tmp_path)
+    told = read_vdb(tmp_path / "esdf.vdb", at + shift, tmp_path)
     found, active = map(np.array, zip(*told["values"], strict=True))
     np.testing.assert_array_equal(active, (state != 255).ravel())
     np.testing.assert_array_equal(found, np.where(state != 255, distance, 0).ravel())

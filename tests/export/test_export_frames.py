@@ -1,10 +1,8 @@
 """Exports in other frames than the map's."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-from manifests import tiny_manifest
+from exported_maps import SPACE, VOXELS, map_of
 from scenes import occupancy_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
@@ -12,26 +10,6 @@ from freeocc3d.core.transforms import transform
 from freeocc3d.core.types import FREE, OCCUPIED, Occupancy
 from freeocc3d.export import export_map
 from freeocc3d.export.export_frames import place_voxels
-
-CAMERA_TO_UP = np.array([(0.0, 0, 1, 0), (-1, 0, 0, 0), (0, -1, 0, 1.52), (0, 0, 0, 1)])
-"""A level camera at 1.52 m: x right, y down, z forward to x forward, y left, z up."""
-
-
-def map_of(occupancy: Occupancy, T_gravity_map=CAMERA_TO_UP):
-    poses = np.stack([np.full((4, 4), np.nan), np.eye(4)])
-    return SimpleNamespace(
-        metric=True,
-        occupancy=occupancy,
-        manifest=tiny_manifest(),
-        vocabulary=["cup", "table"],
-        labels=lambda: (np.arange(len(occupancy.colors)) % 3).astype(np.uint8),
-        up=np.array((0.0, -1.0, 0.0)),
-        T_gravity_map=T_gravity_map,
-        trajectory=SimpleNamespace(has_pose=np.array((False, True)), T_world_cam=poses),
-    )
-
-
-VOXELS, SPACE = [(0, 14, 20), (1, 14, 20), (3, 5, 21)], [(0, 13, 20), (0, 12, 20)]
 
 
 def test_a_voxel_ahead_below_and_right_is_there_in_each_frame() -> None:
@@ -127,7 +105,7 @@ def test_a_box_holds_the_voxels_whose_centres_lie_in_it(frame) -> None:
 
 
 def test_a_box_of_a_map_of_several_sizes() -> None:
-    from test_octomap import of_several_sizes
+    from exported_maps import of_several_sizes
 
     several = of_several_sizes()
     part = place_voxels(map_of(several), "map", box=(0.0, 0.0, 0.0, 5.0, 1.0, 1.0)).occupancy

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from exported_maps import CAMERA_TO_UP
 from scenes import random_gaussians
 from scipy.spatial import cKDTree
-from test_export_frames import CAMERA_TO_UP
 
 from freeocc3d.core.errors import ExportError
 from freeocc3d.core.transforms import quats_to_rotations, transform

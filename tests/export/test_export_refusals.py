@@ -5,13 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from exported_maps import CAMERA_TO_UP, Z_UP, asked, map_of, of_several_sizes, room
 from manifests import tiny_manifest
-from scenes import gaussians, occupancy_of, wall_frame
-from test_export_frames import CAMERA_TO_UP, map_of
-from test_geojson import asked
-from test_gravity_frame import cameras
-from test_nav2 import Z_UP, room
-from test_octomap import of_several_sizes
+from scenes import cameras, gaussians, occupancy_of, wall_frame
 
 from freeocc3d.core.errors import ConfigError, ExportError, FreeOccError
 from freeocc3d.export import export_map

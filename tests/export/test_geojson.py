@@ -1,30 +1,14 @@
 """GeoJSON of what words find."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from exported_maps import asked, map_of
 from scenes import occupancy_of
-from test_export_frames import map_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.export import export_map, geojson
-from freeocc3d.query.regions import Region
-
-
-def asked(scan_map):
-    """The map with one region of all its voxels for "cup", and none for anything else."""
-    center = scan_map.occupancy.centers(scan_map.occupancy.occupied_voxels())
-    region = Region(0.8, 0.9, center.mean(axis=0), center.min(axis=0), center.max(axis=0), 8e-3, np.arange(len(center)))
-
-    def query_words(words, top_k):
-        assert top_k >= len(center)  # every region, however many there are
-        found = {"cup": SimpleNamespace(word="cup", regions=[region], note="")}
-        return [found.get(word, SimpleNamespace(word=word, regions=[], note=f"no {word}")) for word in words]
-
-    scan_map.query_words = query_words
-    return scan_map
 
 
 def test_an_outline_on_the_floor_with_its_height_and_scores(tmp_path) -> None:

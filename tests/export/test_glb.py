@@ -8,8 +8,8 @@ import subprocess
 
 import numpy as np
 import pytest
+from exported_maps import SPACE, VOXELS, map_of
 from scenes import occupancy_of
-from test_export_frames import SPACE, VOXELS, map_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.core.transforms import transform

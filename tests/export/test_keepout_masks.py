@@ -5,10 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from exported_maps import Z_UP, map_of, map_server, room
 from scenes import occupancy_of
-from test_export_frames import map_of
-from test_map_server_files import map_server
-from test_nav2 import Z_UP, room
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.export import export_map

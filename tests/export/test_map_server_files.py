@@ -1,30 +1,10 @@
 """Images and their descriptions, read by map_server's own rules."""
 
-import cv2
 import numpy as np
 import pytest
-import yaml
+from exported_maps import map_server
 
 from freeocc3d.export.map_server_files import COSTS, PLAN, CellGrid, encode_costs, write_map
-
-
-def map_server(path):
-    """The occupancy grid that map_server publishes of a map.yaml: data[row, column] of -1 or 0 to 100, row 0 at the
-    smallest y; resolution; and the position of the grid's corner. Modes of nav2_map_server's map_io."""
-    told = yaml.safe_load(path.read_text())
-    free, occupied = told["free_thresh"], told["occupied_thresh"]
-    assert occupied > free
-    image = cv2.imread(str(path.with_name(told["image"])), cv2.IMREAD_UNCHANGED)
-    height, width = image.shape
-    data = np.full((height, width), -1)
-    for y in range(height):
-        for x in range(width):
-            shade = image[y, x] / 255.0
-            p = shade if told["negate"] else 1.0 - shade
-            between = {"trinary": -1, "scale": np.rint((p - free) / (occupied - free) * 100.0)}[told["mode"]]
-            data[height - y - 1, x] = 100 if p > occupied else 0 if p < free else between
-    assert told["origin"][2] == 0
-    return data, told["resolution"], np.array(told["origin"][:2])
 
 
 def test_costs_are_read_as_they_were_written(tmp_path) -> None:

@@ -4,33 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from scenes import occupancy_of
-from test_export_frames import map_of
-from test_map_server_files import map_server
+from exported_maps import Z_UP, map_of, map_server, room
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.export import export_map
 from freeocc3d.export.export_frames import place_voxels
-
-Z_UP = np.eye(4)
-
-
-def room():
-    """A floor of 12 x 7 cells of 0.1 m at z = 0, seen free above, without what a chimney in one corner hides; a wall
-    along y with a door, a table on one leg, a lamp that hangs high, a doorstep."""
-    floor = [(i, j, 0) for i in range(12) for j in range(7)]
-    wall = [(4, j, k) for j in range(7) for k in range(1, 19) if j not in (2, 3)]
-    table = [(8, 5, k) for k in range(1, 7)] + [(7 + i, 4 + j, 7) for i in range(3) for j in range(2)]
-    lamp = [(10, 1, 18)]
-    doorstep = [(4, 2, 1)]  # a threshold, which lies below the lower height
-    hidden = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in range(1, 19)]
-    occupied = {*floor, *wall, *table, *lamp, *doorstep}
-    free = [v for v in np.ndindex(12, 7, 19) if v[2] >= 1 and v not in occupied and v not in hidden]
-    expected = np.zeros((7, 12), int)
-    expected[[j for j in range(7) if j not in (2, 3)], 4] = 100
-    expected[4:6, 7:10] = 100
-    expected[0:2, 0:2] = -1
-    return occupancy_of(sorted(occupied), free=free, origin=(-0.33, 2.0, -0.05)), expected
 
 
 def test_every_pixel_of_a_room_without_symmetry(tmp_path) -> None:

@@ -6,11 +6,11 @@ import subprocess
 
 import numpy as np
 import pytest
+from exported_maps import map_of, of_several_sizes
 from scenes import occupancy_of
-from test_export_frames import map_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
-from freeocc3d.core.types import FREE, OCCUPIED, Occupancy
+from freeocc3d.core.types import FREE, OCCUPIED
 from freeocc3d.export import export_map
 from freeocc3d.export.export_frames import place_voxels
 
@@ -26,20 +26,6 @@ def scattered(seed=0, count=1500):
     rng.shuffle(voxels)
     colors = rng.integers(0, 255, (half, 3))
     return occupancy_of(voxels[:half], colors=colors, free=np.concatenate((voxels[half:], cube)))
-
-
-def of_several_sizes():
-    rng = np.random.default_rng(3)
-    keys = np.array([(0, 0, 0), (-1, 0, 2), (2, 0, 0), (2, 1, 1), (-8, 3, 1)], np.int32)
-    state = rng.choice(np.uint8([FREE, OCCUPIED, 255]), (5, 512))
-    state[4] = FREE
-    return Occupancy(
-        0.2, np.zeros(3), keys, np.where(state == OCCUPIED, 0.8, 0.02).astype(np.float32),
-        np.zeros_like(state, np.uint16), np.zeros_like(state, np.uint16), state,
-        features=np.zeros((np.count_nonzero(state == OCCUPIED), 2), np.float16),
-        colors=rng.integers(0, 255, (np.count_nonzero(state == OCCUPIED), 3)).astype(np.uint8),
-        levels=np.uint8([0, 0, 1, 1, 2]),
-    )  # fmt: skip
 
 
 def read(path, kind=None):

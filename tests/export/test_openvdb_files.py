@@ -1,51 +1,10 @@
 """OpenVDB files, read by OpenVDB's own Python module, Debian's python3-openvdb."""
 
-import json
-import subprocess
-import sys
-
 import numpy as np
 import pytest
+from exported_maps import read_vdb
 
 from freeocc3d.export.openvdb_files import write_vdb
-
-READER = """
-import json, sys
-try:
-    import openvdb as vdb
-except ImportError:
-    import pyopenvdb as vdb
-grids, metadata = vdb.readAll(sys.argv[1])
-(grid,) = grids
-accessor = grid.getConstAccessor()
-told = {
-    "name": grid.name, "background": grid.background, "active": grid.activeVoxelCount(),
-    "world": [list(grid.transform.indexToWorld(index)) for index in ((0, 0, 0), (3, -5, 200))],
-    "metadata": {key: str(value) for key, value in grid.metadata.items()},
-    "values": [accessor.probeValue(tuple(index)) for index in json.load(open(sys.argv[2]))],
-}
-print(json.dumps(told))
-"""
-
-
-def openvdb_python() -> str:
-    """A Python that has OpenVDB, or skip the test."""
-    for python in (sys.executable, "/usr/bin/python3"):
-        for module in ("openvdb", "pyopenvdb"):
-            try:
-                if subprocess.run([python, "-c", f"import {module}"], capture_output=True).returncode == 0:
-                    return python
-            except OSError:
-                continue
-    pytest.skip("no Python has OpenVDB: apt-get install python3-openvdb")
-
-
-def read(path, indices, tmp_path):
-    (tmp_path / "asked.json").write_text(json.dumps(np.asarray(indices).tolist()))
-    command = [openvdb_python(), "-c", READER, str(path), str(tmp_path / "asked.json")]
-    run = subprocess.run(command, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    return json.loads(run.stdout)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -60,7 +19,7 @@ def test_openvdb_reads_every_voxel(tmp_path, seed) -> None:
     write_vdb(tmp_path / "a.vdb", "distance", keys, values, active, 0.04, center, {"frame": "gravity"})
     local = np.stack(np.unravel_index(np.arange(512), (8, 8, 8)), axis=1)
     indices = (keys[:, None] * 8 + local).reshape(-1, 3)
-    told = read(tmp_path / "a.vdb", indices, tmp_path)
+    told = read_vdb(tmp_path / "a.vdb", indices, tmp_path)
     assert told["name"] == "distance"
     assert told["background"] == 0
     assert told["active"] == active.sum()
@@ -74,4 +33,4 @@ def test_openvdb_reads_every_voxel(tmp_path, seed) -> None:
 def test_one_block(tmp_path) -> None:
     keys, values = np.zeros((1, 3), np.int32), np.full((1, 512), 2.5, np.float32)
     write_vdb(tmp_path / "a.vdb", "d", keys, values, values > 0, 1.0, np.zeros(3), {})
-    assert read(tmp_path / "a.vdb", [(7, 0, 7), (8, 0, 0)], tmp_path)["values"] == [[2.5, True], [0.0, False]]
+    assert read_vdb(tmp_path / "a.vdb", [(7, 0, 7), (8, 0, 0)], tmp_path)["values"] == [[2.5, True], [0.0, False]]

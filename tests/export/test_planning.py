@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from exported_maps import map_of
 from scenes import occupancy_of
-from test_export_frames import map_of
 
 from freeocc3d.core.transforms import quats_to_rotations, transform
 from freeocc3d.core.types import OCCUPIED

@@ -5,9 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scenes import gaussians, wall_frame
-from test_export_frames import CAMERA_TO_UP
-from test_gravity_frame import cameras
+from exported_maps import CAMERA_TO_UP
+from scenes import cameras, gaussians, wall_frame
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.core.transforms import invert, project, transform

@@ -8,9 +8,9 @@ import numpy as np
 import open3d as o3d
 import open3d.core as o3c
 import pytest
+from exported_maps import map_of
 from manifests import tiny_manifest
 from scenes import lifted, occupancy_of, posed, wall_frame
-from test_export_frames import map_of
 
 from freeocc3d.core.errors import ConfigError, ExportError, FreeOccError
 from freeocc3d.core.types import OCCUPIED, Occupancy

@@ -10,10 +10,10 @@ import pytest
 import tiny_models
 import torch
 from numpy.typing import NDArray
+from tiny_models import frame
 from torch.nn import functional as F
 
 from freeocc3d.core.errors import ConfigError, ModelError
-from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.language import model_packages
 from freeocc3d.language.encoders import clip
 from freeocc3d.language.model_export.checkpoint_networks import build_siglip
@@ -42,12 +42,6 @@ def encoder(folder: Path, **options: Any) -> clip.ClipEncoder:
 
 def images(height: int, width: int, batch: int = 2) -> NDArray[np.float32]:
     return np.random.default_rng(height * width).normal(size=(batch, 3, height, width)).astype(np.float32)
-
-
-def frame(height: int = 60, width: int = 92, seed: int = 0) -> Frame:
-    rgb = np.random.default_rng(seed).integers(0, 256, (height // 4 + 1, width // 4 + 1, 3), dtype=np.uint8)
-    rgb = np.ascontiguousarray(rgb.repeat(4, axis=0).repeat(4, axis=1)[:height, :width])
-    return Frame(0, 0.0, rgb, np.ones(rgb.shape[:2], np.float32), Intrinsics(width, height, width, width, 0, 0))
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiny_models
 import torch
-from test_encoder_clip import frame
+from tiny_models import frame
 from torch.nn import functional as F
 
 from freeocc3d.core.errors import ConfigError

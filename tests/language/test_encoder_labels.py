@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import SIZE, class_image, write_image, write_replica, write_seven_scenes
 from numpy.typing import NDArray
+from small_captures import SIZE, class_image, write_image, write_replica, write_seven_scenes
 
 from freeocc3d.capture import base, open_capture
 from freeocc3d.capture.base import Capture

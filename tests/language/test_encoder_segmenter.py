@@ -9,10 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers import data_folder, models_folder
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from onnx_models import COLOURS, logits, write_classifier, write_identity, write_model
+from small_captures import data_folder, models_folder
 
 import freeocc3d
 from freeocc3d.core.errors import ConfigError, FrameError, FreeOccError

@@ -10,7 +10,7 @@ import pytest
 import tiny_models
 import torch
 from numpy.typing import NDArray
-from test_encoder_clip import frame
+from tiny_models import frame
 from torch.nn import functional as F
 
 from freeocc3d.core.errors import ConfigError, ModelError

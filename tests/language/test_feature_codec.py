@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers import data_folder
 from numpy.typing import NDArray
+from small_captures import data_folder
 
 from freeocc3d.language import feature_codec as codec_module
 from freeocc3d.language.feature_codec import Codec, CodedFeatures

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_model_packages import dense_package, graph, succeed, write_manifest
+from model_folders import dense_package, graph, succeed, write_manifest
 
 from freeocc3d.cli.main import main
 from freeocc3d.core.errors import ModelError

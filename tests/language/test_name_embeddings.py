@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import models_folder
 from numpy.typing import NDArray
+from small_captures import models_folder
 
 from freeocc3d.core.errors import ConfigError
 from freeocc3d.language.name_embeddings import NameEmbeddings

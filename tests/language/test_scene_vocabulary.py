@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers import color_image
+from small_captures import color_image
 from vision_servers import chat, saying, send, serving
 
 from freeocc3d.core.errors import ConfigError

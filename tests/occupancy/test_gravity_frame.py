@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scenes import gaussians
+from scenes import cameras, gaussians
 
 from freeocc3d.core.transforms import invert, is_rigid, quats_to_rotations, transform
 from freeocc3d.occupancy.gravity_frame import compute_first_camera_frame, estimate_floor_height, estimate_gravity_frame
@@ -27,19 +27,6 @@ def room(seed=0, table=1500, floor=3000, noise=0.004):
         sheet(40, (0, 0, -1.5), (4, 6, -0.1), "z"),
     ]
     return gaussians(np.concatenate(sheets), 0.02)
-
-
-def cameras(n=30):
-    """A walk at 1.5 m that looks around and down by 37 degrees; OpenCV axes."""
-    out = []
-    for turn in np.linspace(0.3, 2 * np.pi, n):
-        forward = np.array((0.8 * np.cos(turn), 0.8 * np.sin(turn), -0.6))
-        right = np.array((np.sin(turn), -np.cos(turn), 0.0))
-        T = np.eye(4)
-        T[:3, :3] = np.stack((right, np.cross(forward, right), forward), axis=1)
-        T[:3, 3] = (2 + np.cos(turn), 3 + np.sin(turn), 1.5)
-        out.append(T)
-    return np.stack(out)
 
 
 def moved(scene, poses, seed):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import shutil
 
 import pytest
-from helpers import data_folder
 from pipeline_runs import ROOM
+from small_captures import data_folder
 
 import freeocc3d
 from freeocc3d import Map

@@ -8,8 +8,8 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from helpers import data_folder, truncate, write_scannet, write_seven_scenes
 from pipeline_runs import ROOM, listing, notices
+from small_captures import data_folder, truncate, write_scannet, write_seven_scenes
 
 import freeocc3d
 from freeocc3d.capture import open_capture

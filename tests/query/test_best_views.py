@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from scenes import CAMERA
-from test_word_query import WORDS, box, feature, occupancy
+from worded_voxels import WORDS, box, feature, occupancy
 
 from freeocc3d.core.types import Frame, Trajectory
 from freeocc3d.query.best_views import best_views

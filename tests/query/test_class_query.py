@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_word_query import CLASSES, WORDS, box, feature, occupancy
+from worded_voxels import CLASSES, WORDS, box, feature, occupancy
 
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.query.class_query import query_classes

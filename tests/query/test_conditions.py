@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_word_query import SIZE, WORDS, box, feature, occupancy
+from worded_voxels import SIZE, WORDS, box, feature, occupancy
 
 from freeocc3d.core.errors import ConfigError, FreeOccError, MapError
 from freeocc3d.core.types import BLOCK, OCCUPIED, Occupancy

@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import truncate
 from manifests import tiny_manifest
 from numpy.typing import NDArray
-from test_word_query import CUP, SOFA, box, feature, occupancy
+from small_captures import truncate
+from worded_voxels import CUP, SOFA, box, feature, occupancy
 
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.language.encoders.color import ColorEncoder, ColorWords

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scenes import occupancy_of
-from test_word_query import WORDS, box, feature, occupancy
+from worded_voxels import WORDS, box, feature, occupancy
 
 from freeocc3d.core.errors import ConfigError
 from freeocc3d.query.region_splitting import parts_of, told_apart

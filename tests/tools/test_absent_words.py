@@ -10,7 +10,7 @@ import pytest
 from benchmark import absent_words, report
 from benchmark.processes import PartFailed
 from benchmark_runs import run_benchmark
-from helpers import data_folder, models_folder
+from small_captures import data_folder, models_folder
 
 
 def test_names_of_what_is_there_in_any_words_are_not_absent() -> None:

@@ -11,7 +11,7 @@ from benchmark.comparison import describe_moves
 from benchmark.peer_rows import PEERS
 from benchmark.report import write_markdown
 from benchmark_runs import run_benchmark
-from helpers import data_folder
+from small_captures import data_folder
 
 
 def test_every_part_of_a_few_frames(tmp_path: Path) -> None:

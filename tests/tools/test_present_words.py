@@ -6,7 +6,7 @@ import json
 
 from benchmark import present_words, report
 from benchmark_runs import run_benchmark
-from helpers import data_folder
+from small_captures import data_folder
 
 
 def test_classes_of_a_real_room_are_found_by_their_names() -> None:

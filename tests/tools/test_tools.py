@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from helpers import data_folder
+from small_captures import data_folder
 
 TOOLS = Path(__file__).parents[2] / "tools"
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from benchmark import tracking_stress
-from helpers import data_folder
 from scenes import wall_frame
+from small_captures import data_folder
 
 
 def test_sequences_are_what_their_names_say() -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import data_folder, write_seven_scenes
+from small_captures import data_folder, write_seven_scenes
 
 from freeocc3d.capture import open_capture
 from freeocc3d.capture.base import Capture, Options

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import data_folder
+from small_captures import data_folder
 
 from freeocc3d.capture import open_capture
 from freeocc3d.core.transforms import invert, measure_pose_difference, quats_to_rotations

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers import data_folder
 from scenes import wall_frame
+from small_captures import data_folder
 
 from freeocc3d.capture import open_capture
 from freeocc3d.core.transforms import invert

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import data_folder
 from scenes import wall_frame
+from small_captures import data_folder
 
 from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import ConfigError

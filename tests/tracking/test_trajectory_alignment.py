@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import pose_matrix, write_seven_scenes
 from numpy.typing import NDArray
+from small_captures import pose_matrix, write_seven_scenes
 
 from freeocc3d.capture import associate, open_capture
 from freeocc3d.core.errors import FreeOccError

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from helpers import pose_matrix
 from scenes import gaussians
+from small_captures import pose_matrix
 
 from freeocc3d.core.types import Submap, Trajectory
 from freeocc3d.viewer import trajectory_picture

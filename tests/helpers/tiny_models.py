@@ -10,8 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
+from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.language.model_export.checkpoint_networks import build_clip
 from freeocc3d.language.model_export.package_writer import write_package
 from freeocc3d.language.model_export.tokenizer_files import clip_tokenizer_from
@@ -174,3 +176,9 @@ def sam(seed: int = 3) -> Any:
         )  # fmt: skip
         model.set_attn_implementation("eager")
         return lively(model)
+
+
+def frame(height: int = 60, width: int = 92, seed: int = 0) -> Frame:
+    rgb = np.random.default_rng(seed).integers(0, 256, (height // 4 + 1, width // 4 + 1, 3), dtype=np.uint8)
+    rgb = np.ascontiguousarray(rgb.repeat(4, axis=0).repeat(4, axis=1)[:height, :width])
+    return Frame(0, 0.0, rgb, np.ones(rgb.shape[:2], np.float32), Intrinsics(width, height, width, width, 0, 0))

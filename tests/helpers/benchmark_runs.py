@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-_ENTRY = Path(__file__).parents[1] / "tools" / "benchmark.py"
+_ENTRY = Path(__file__).parents[2] / "tools" / "benchmark.py"
 
 
 def run_benchmark(*arguments: object, code: int = 0) -> str:

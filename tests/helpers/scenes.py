@@ -129,3 +129,16 @@ def write_standard_ply(
     text = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{header}end_header\n"
     path.write_bytes(text.encode() + np.stack(list(columns.values()), axis=1).astype("<f4").tobytes())
     return path
+
+
+def cameras(n=30):
+    """A walk at 1.5 m that looks around and down by 37 degrees; OpenCV axes."""
+    out = []
+    for turn in np.linspace(0.3, 2 * np.pi, n):
+        forward = np.array((0.8 * np.cos(turn), 0.8 * np.sin(turn), -0.6))
+        right = np.array((np.sin(turn), -np.cos(turn), 0.0))
+        T = np.eye(4)
+        T[:3, :3] = np.stack((right, np.cross(forward, right), forward), axis=1)
+        T[:3, 3] = (2 + np.cos(turn), 3 + np.sin(turn), 1.5)
+        out.append(T)
+    return np.stack(out)

@@ -20,7 +20,7 @@ DEPTH_M = 2.0
 
 def data_folder() -> Path:
     """The folder of large captures, or skip the test."""
-    folder = Path(os.environ.get("FREEOCC3D_DATA") or Path(__file__).parents[2] / "shared" / "data")
+    folder = Path(os.environ.get("FREEOCC3D_DATA") or Path(__file__).parents[3] / "shared" / "data")
     if not folder.is_dir():
         pytest.skip(f"no captures in {folder}: set FREEOCC3D_DATA to where they are")
     return folder
