@@ -1,4 +1,4 @@
-"""INPUT: captured scans. ``open_capture`` finds the reader of a folder; ``read_ahead`` decodes on a second thread."""
+"""INPUT: captures. ``open_capture`` finds the reader of a folder; ``read_ahead`` decodes frames on a second thread."""
 
 from .base import Capture, Options
 from .opening import check_depth_scale, open_capture, select_frames

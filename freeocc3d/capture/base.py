@@ -1,8 +1,8 @@
-"""The contract of a capture: a folder of frames, or a video, of which frames are decoded one at a time.
+"""The contract of a capture: a folder of frames, or a video, that decodes one frame at a time.
 
-A reader is one file of this folder with a class ``Reader(Capture)``. It finds its files and intrinsics when it is
-constructed (cheaply: nothing is decoded), and decodes frame i when asked. Everything that is peculiar to a format
-(units, axes, file names, invalid values) ends here: what leaves a reader follows the conventions of ``types``.
+A reader is one file of ``readers/`` with a class ``Reader(Capture)``. Its constructor finds the files and intrinsics
+and decodes nothing, so it is cheap. ``reader[i]`` decodes frame i. A reader hides everything that is specific to its
+format (units, axes, file names, invalid values): its output follows the conventions of ``core.types``.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ from ..core.warnings import Notice
 from ..settings.stages import CaptureOptions as Options
 
 NOMINAL_DEPTH = 2.0
-"""The median depth that scans of unknown scale are given, as rooms have it in meters: voxels and tolerances, which are
-in meters, are then of a sensible size beside the scene."""
+"""Median depth, meters, to which scans of unknown scale are normalized. It is typical of rooms, so voxel sizes and
+tolerances, which are in meters, fit the scene."""
 
 
 class Capture(ABC):
-    """A captured scan of N frames. Constructing a reader raises CaptureError for a folder that it cannot read."""
+    """A captured scan of N frames. The constructor raises CaptureError for a folder that the reader cannot read."""
 
     format: ClassVar[str]
-    """The reader's name, the same as its file's."""
+    """The reader's name, equal to the name of its file."""
     layout: ClassVar[str]
-    """What ``recognizes`` looks for, in words, for the message about an unrecognized folder."""
+    """What ``recognizes`` looks for, in words. The message about an unknown folder shows it."""
 
     general: ClassVar[bool] = False
-    """Whether other formats' folders may look like this one's, too, so that they are looked for first."""
+    """Whether folders of other formats may match this layout too; the other formats are then tried first."""
 
     path: Path
     timestamps: NDArray[np.float64]
-    """(N,) seconds, ascending; 0, 1, 2, … where the format has none."""
+    """(N,) seconds, ascending; 0, 1, 2, … if the format has no times."""
     has_depth: bool = True
-    """Whether frames come with depth; where not, all of ``Frame.depth_m`` is 0."""
+    """Whether frames have depth; if not, ``Frame.depth_m`` is 0 everywhere."""
     intrinsics_known: bool = True
-    """Whether files or the user say what the camera is; where not, ``Frame.intrinsics`` is a usual guess."""
+    """Whether the files or the user state the intrinsics; if not, ``Frame.intrinsics`` is a guess."""
     focal_stated: bool = True
-    """Whether at least the focal length is stated, if roughly, as EXIF does; true where the intrinsics are known."""
+    """Whether the focal length is stated at least roughly, as in EXIF; true if the intrinsics are known."""
     metric_poses: bool = True
     """Whether ``pose`` is in meters."""
     warnings: tuple[Notice, ...] = ()
-    """What the user should know of what was found, such as files that are left out."""
+    """Warnings about the files, such as images that are left out."""
     classes: tuple[str, ...] = ()
-    """Names of the class images' values, index 0 = nothing; empty where the capture has no class images."""
+    """Class names of the values in the class images, index 0 = nothing; empty if there are no class images."""
 
     def __init__(self, path: Path, options: Options):
         self.path = path
@@ -57,7 +57,7 @@ class Capture(ABC):
     @classmethod
     @abstractmethod
     def recognizes(cls, path: Path) -> bool:
-        """Whether the folder ``path`` has this format's layout (cheap: looks at names only)."""
+        """Whether the folder ``path`` has this format's layout. Cheap: looks only at names."""
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -67,25 +67,25 @@ class Capture(ABC):
         """Decode frame ``index``. Thread-safe. Raises FrameError if one of its files is missing or broken."""
 
     def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
-        """(H, W) depth as stored (0 = no measurement) and its units per meter, or None where depth is not stored as
-        integers. Read by ``check_depth_scale`` alone. Raises FrameError."""
+        """(H, W) depth as stored (0 = no measurement) and its units per meter; None if depth is not stored as integers.
+        Only ``check_depth_scale`` reads it. Raises FrameError."""
         return None
 
     def name(self, index: int) -> str:
-        """File name of the frame's color image, by which other systems' poses may know it; "" where there is none."""
+        """File name of the frame's color image, "" if it has none. Pose files of other systems may refer to it."""
         return ""
 
     def turned(self, index: int) -> int:
-        """Quarter turns, counter-clockwise, by which the frame's image is turned from how the camera was held: images
-        of a scan have one size. All else (poses, pixels, pictures) is of the image as it is turned."""
+        """Counter-clockwise quarter turns of the frame's image, relative to how the camera was held. The turns give all
+        images of a scan one size. Poses, pixels and pictures refer to the turned image."""
         return 0
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
-        """(4, 4) T_world_cam that the capture states for the frame, or None. Read by the ``known`` tracker and by
-        evaluation alone."""
+        """(4, 4) T_world_cam that the capture states for the frame, or None. Only the ``known`` tracker and evaluation
+        read it."""
         return None
 
     def labels(self, index: int) -> NDArray[np.uint8] | None:
-        """(H, W) class image of the frame (values index ``classes``, 0 = nothing), or None. Read by the ``labels``
-        encoder and by evaluation alone."""
+        """(H, W) class image of the frame (values index ``classes``, 0 = nothing), or None. Only the ``labels`` encoder
+        and evaluation read it."""
         return None

@@ -1,4 +1,4 @@
-"""The built-in room: furniture as triangles with a class and a material each, and how a surface point looks."""
+"""The built-in room: furniture as triangles, each with a class and a material, and the color of a surface point."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 SIZE = (5.2, 4.2, 2.5)
-"""Extent of the room, meters; the world's origin is the middle of the floor, z is up."""
+"""Extent of the room, meters. The world origin is the middle of the floor; z points up."""
 
 CLASSES = (
     "nothing", "wall", "floor", "ceiling", "rug", "table", "cup", "chair", "sofa", "cushion", "bed", "pillow",
@@ -18,7 +18,7 @@ CLASSES = (
 )  # fmt: skip
 
 CUPS = {"red": (1.92, 0.14, 0.75), "yellow": (1.92, 0.26, 0.75)}
-"""Middle of each paper cup's foot on the table, meters, world."""
+"""Center of each paper cup's foot on the table, world, meters."""
 
 CUP_HEIGHT, CUP_FOOT, CUP_RIM = 0.09, 0.028, 0.038
 """Height and radii of a paper cup, meters."""
@@ -29,14 +29,14 @@ PLAIN, WOOD, CHECKER, BOOKS, PATCHES, PLASTER, STRIPES, PAINTING = range(8)
 Point = tuple[float, float, float]
 Color = tuple[int, int, int]
 Triangles = NDArray[np.float64]
-"""(T, 3, 3) corners, counter-clockwise seen from outside, meters, world."""
+"""(T, 3, 3) corners, world, meters, counter-clockwise as seen from outside."""
 
-_LIGHT = (0.34, -0.24, 0.91)  # unit vector towards the light; the same for all points, as of a large lamp
+_LIGHT = (0.34, -0.24, 0.91)  # unit vector toward the light, the same for all points, as for a distant lamp
 
 
 @dataclass(frozen=True)
 class Material:
-    """A procedural texture between two colors (RGB 0…255). scale: size of its features, meters."""
+    """A procedural texture between two colors (RGB 0…255). scale: feature size, meters."""
 
     color: Color
     texture: int = PLAIN
@@ -46,12 +46,12 @@ class Material:
 
 @dataclass(frozen=True)
 class Room:
-    """All objects as T triangles.
+    """All objects of the room, as T triangles.
 
     objects: class name of each object.
-    Per triangle: triangles (T, 3, 3) float32 corners, meters, world; normals (T, 3) float32, unit, outwards;
+    Per triangle: triangles (T, 3, 3) float32 corners, world, meters; normals (T, 3) float32, unit, outward;
     class_ids (T,) uint8, index into CLASSES; object_ids (T,) int32, index into ``objects``;
-    textures (T,) int32 kinds; colors (T, 2, 3) float32, the two of its material; scales (T,) float32 meters.
+    textures (T,) int32 kinds; colors (T, 2, 3) float32, the material's two colors; scales (T,) float32 meters.
     """
 
     objects: tuple[str, ...]
@@ -65,7 +65,7 @@ class Room:
 
 
 class _Builder:
-    """Collects objects, each made of parts of one material."""
+    """Collects objects. Each part of an object has one material."""
 
     def __init__(self) -> None:
         self._objects: list[str] = []
@@ -96,14 +96,14 @@ class _Builder:
 
 
 def quad(corner: ArrayLike, u: ArrayLike, v: ArrayLike) -> Triangles:
-    """(2, 3, 3) a parallelogram from its corner and two edges; it faces along u x v."""
+    """(2, 3, 3) parallelogram from a corner and two edges; it faces along u x v."""
     a, b, d = np.asarray(corner), np.add(corner, u), np.add(corner, v)
     c = np.add(b, v)
     return np.array([(a, b, c), (a, c, d)])
 
 
 def box(low: ArrayLike, high: ArrayLike) -> Triangles:
-    """(12, 3, 3) an axis-aligned box."""
+    """(12, 3, 3) axis-aligned box."""
     x, y, z = np.diag(np.subtract(high, low))
     at_low = [quad(low, y, x), quad(low, x, z), quad(low, z, y)]
     at_high = [quad(high, -x, -y), quad(high, -z, -x), quad(high, -y, -z)]
@@ -117,8 +117,8 @@ def legs(low: tuple[float, float], high: tuple[float, float], top: float, width:
 
 
 def lathe(middle: tuple[float, float], profile: list[tuple[float, float]], sides: int = 24) -> Triangles:
-    """A surface of revolution about a vertical axis. profile: (radius, height) of its rings, walked so that the outside
-    lies to the right (upwards on the outer side of a cup, then downwards on its inner side)."""
+    """A surface of revolution about a vertical axis. profile: (radius, height) of its rings, in an order that keeps the
+    outside to the right: up the outer side of a cup, then down its inner side."""
     angles = np.linspace(0, 2 * np.pi, sides + 1)
     circle = np.stack((np.cos(angles), np.sin(angles), 0 * angles), axis=1)
     rings = [np.array((*middle, z)) + r * circle for r, z in profile]
@@ -186,7 +186,7 @@ def _table_and_cups(room: _Builder) -> None:
 
 
 def _chair(room: _Builder, middle: tuple[float, float], back: tuple[int, int], material: Material) -> None:
-    """back: the side of the seat on which the back stands, a unit vector along x or y."""
+    """back: the side of the seat where the backrest stands, as a unit vector along x or y."""
     x, y = middle
     low, high = (x - 0.21, y - 0.21), (x + 0.21, y + 0.21)
     bx, by = x + 0.19 * back[0], y + 0.19 * back[1]
@@ -280,14 +280,14 @@ def _on_the_walls(room: _Builder) -> None:
 
 
 def _picture(room: _Builder, low: Point, high: Point, color: Color, second: Color, scale: float) -> None:
-    """A painting in a frame 3 cm wide; the canvas stands 5 mm out of it in front and behind, so it fits any wall."""
+    """A painting in a frame 3 cm wide. The canvas stands out 5 mm in front and behind, so it fits on any wall."""
     extent = np.subtract(high, low)
     inset = np.where(extent == extent.min(), -0.005, 0.03)
     canvas = box(np.add(low, inset), np.subtract(high, inset))
     room.add("picture", (box(low, high), _DARK_WOOD), (canvas, Material(color, PAINTING, second, scale)))
 
 
-@njit(nogil=True, cache=True)  # on one core: frames are read ahead while the tracker works on the others
+@njit(nogil=True, cache=True)  # on one core: the tracker uses the others while frames are read ahead
 def shade(
     points: NDArray[np.float32],
     triangle: NDArray[np.int32],
@@ -297,11 +297,11 @@ def shade(
     scales: NDArray[np.float32],
     normals: NDArray[np.float32],
 ) -> NDArray[np.uint8]:
-    """(P, 3) RGB of P surface points: a mix of the two colors of their triangle's material, times a fixed light, so
-    that a point looks the same from everywhere. Detail finer than a pixel fades out.
+    """(P, 3) RGB of P surface points: a mix of the material's two colors, times a fixed light. A point looks the same
+    from every direction. Detail finer than a pixel fades out.
 
-    points: (P, 3) meters, world.  triangle: (P,) its row in the arrays of ``Room``, -1 = nothing, which is black.
-    footprint: (P,) meters of surface that a pixel covers.
+    points: (P, 3) world, meters.  triangle: (P,) row in the arrays of ``Room``; -1 = nothing, which is black.
+    footprint: (P,) size of a pixel on the surface, meters.
     """
     image = np.zeros((len(points), 3), np.uint8)
     for p in range(len(points)):
@@ -326,8 +326,8 @@ def shade(
 
 @njit(cache=True)
 def _texture(kind: int, x: float, y: float, z: float, normal: NDArray[np.float32], scale: float, pixel: float) -> float:
-    """Place between a material's two colors, mostly in 0…1."""
-    # Two coordinates on the surface: those that are not along its normal.
+    """Mixing weight of a material's two colors, mostly in 0…1."""
+    # Surface coordinates: the two axes that are not along the normal.
     nx, ny, nz = abs(normal[0]), abs(normal[1]), abs(normal[2])
     if nz >= nx and nz >= ny:
         a, b = x, y
@@ -342,7 +342,7 @@ def _texture(kind: int, x: float, y: float, z: float, normal: NDArray[np.float32
     if kind == CHECKER:
         wave = math.sin(math.pi * a / scale) * math.sin(math.pi * b / scale)
         return min(max(0.5 + wave * scale / (math.pi * pixel + 1e-6), 0.0), 1.0)  # edges one pixel soft
-    if kind == BOOKS:  # each its own color, between the two and beyond
+    if kind == BOOKS:  # each book has its own color, between the two and beyond
         return 1.6 * _bands(a, scale, math.floor(z / 0.4), pixel) - 0.3
     if kind == PATCHES:
         return 1.5 * _noise(a / scale, b / scale, 0.5, 11) - 0.25
@@ -357,7 +357,7 @@ def _texture(kind: int, x: float, y: float, z: float, normal: NDArray[np.float32
 
 @njit(cache=True)
 def _bands(a: float, width: float, row: int, pixel: float) -> float:
-    """Bands across ``a``, each of its own tone in 0…1: none can be taken for the next. Edges are a pixel soft."""
+    """Bands across ``a``, each with its own tone in 0…1, so that features do not match another band. Soft edges."""
     edge = math.floor(a / width + 0.5)
     before, after = _hash(edge - 1, row, 7, 5), _hash(edge, row, 7, 5)
     return before + (after - before) * min(max((a - edge * width) / (pixel + 1e-6) + 0.5, 0.0), 1.0)
@@ -365,19 +365,19 @@ def _bands(a: float, width: float, row: int, pixel: float) -> float:
 
 @njit(cache=True)
 def _lighting(x: float, y: float, z: float, normal: NDArray[np.float32]) -> float:
-    """Ambient and Lambertian light in 0…1, darker near the room's edges, where less of the room is open to a point."""
+    """Ambient and Lambertian light in 0…1, darker near the room's edges, where surfaces block more of the light."""
     lambert = normal[0] * _LIGHT[0] + normal[1] * _LIGHT[1] + normal[2] * _LIGHT[2]
     light = 0.87 + 0.13 * lambert
     to_walls = (SIZE[0] / 2 - abs(x), SIZE[1] / 2 - abs(y), min(z, SIZE[2] - z))
     for axis in range(3):
-        if abs(normal[axis]) < 0.9:  # a surface is not darkened by the wall that it is, or lies on
+        if abs(normal[axis]) < 0.9:  # a wall does not darken itself or what lies on it
             light *= 1.0 - 0.22 * math.exp(-max(to_walls[axis], 0.0) / 0.15)
     return light
 
 
 @njit(cache=True)
 def _hash(i: int, j: int, k: int, seed: int) -> float:
-    """A number in 0…1 for each lattice point."""
+    """A pseudorandom number in 0…1 for each lattice point."""
     h = (i * 374761393 + j * 668265263 + k * 2147483647 + seed * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 2246822519) & 0xFFFFFFFF
@@ -386,7 +386,7 @@ def _hash(i: int, j: int, k: int, seed: int) -> float:
 
 @njit(cache=True)
 def _noise(x: float, y: float, z: float, seed: int) -> float:
-    """Value noise in 0…1: lattice numbers, interpolated smoothly."""
+    """Value noise in 0…1: smoothly interpolated lattice numbers."""
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
     u, v, w = x - i, y - j, z - k
     u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)

@@ -1,4 +1,4 @@
-"""Camera parameters and poses in text files: read, and refused with a sentence where they cannot be true."""
+"""Reads camera parameters and poses from text files, and refuses impossible values with a clear message."""
 
 from __future__ import annotations
 
@@ -17,36 +17,37 @@ from .base import Options
 from .image_decoding import Size
 
 ASPECT_TOLERANCE = 0.02
-"""Relative difference of two aspect ratios up to which two images are taken to show the same view (ScanNet's color and
-depth differ by 0.4 %, a 16:9 and a 4:3 image by 33 %)."""
+"""Largest relative difference of the aspect ratios of two images that show the same view. ScanNet's color and depth
+differ by 0.4 %, a 16:9 and a 4:3 image by 33 %."""
 
 MAX_SKEW_PX = 1.0
-"""Calibrations state tiny skews that no pixel notices; the camera model here has none."""
+"""Largest skew that is ignored. Calibrations state tiny skews; the camera model here has none."""
 
 
 USUAL_FOCAL = 0.85
-"""Focal length over the longer side of an image where nothing says it: between a phone's main camera (a 24 to 28 mm
-equivalent: 0.72 to 0.78 of a photograph, 0.8 to 0.95 of a video, which stabilization crops) and the 0.82 to 0.96 of
-depth cameras' color images; within a fifth of all of them, from where it can be estimated."""
+"""Default focal length over the longer side of an image. A phone's main camera (24 to 28 mm equivalent) has 0.72 to
+0.78 in photographs and 0.8 to 0.95 in videos, which stabilization crops. The color cameras of depth sensors have 0.82
+to 0.96. The default is within a fifth of all of them, close enough for an estimate to start from."""
 
 
 DIAGONAL_35MM = 43.27
-"""Of the 36 x 24 mm frame, millimeters."""
+"""Diagonal of the 36 x 24 mm frame, millimeters."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """fx, fy, cx, cy in pixels, the image size that they are meant for (None = that of the images found), and where
-    they were read, for messages."""
+    """Stated intrinsics. values: fx, fy, cx, cy, pixels.  size: the image size that they refer to; None = the size of
+    the images found.  source: where they come from, for messages."""
 
     values: tuple[float, float, float, float]
     size: Size | None
     source: str
 
     def camera(self, size: Size) -> Intrinsics:
-        """The camera of images of ``size``. Parameters meant for another size of the same view are rescaled.
+        """The camera of images of ``size``. Parameters for another size of the same view are rescaled.
 
-        Raises CaptureError: not finite, focal length not positive, principal point outside of the image, another view.
+        Raises CaptureError: a value is not finite, a focal length not positive, the principal point outside the image,
+        or the size shows another view.
         """
         fx, fy, cx, cy = self.values
         if not np.isfinite(self.values).all() or fx <= 0 or fy <= 0:
@@ -57,42 +58,42 @@ class Calibration:
         width, height = self.size or size
         if min(width, height) <= 0 or not same_view((width, height), size):
             raise CaptureError(
-                f"{self.source} is for images of {width} x {height} pixels, but they have {size[0]} x {size[1]}: "
+                f"{self.source} is for images of {width} x {height} pixels, but the images have {size[0]} x {size[1]}: "
                 "correct it, or give capture.intrinsics."
             )
         if not (0 <= cx <= width and 0 <= cy <= height):
             raise CaptureError(
-                f"{self.source} puts the principal point at ({cx:g}, {cy:g}), outside of the {width} x {height} image, "
-                "as if it were for another resolution: correct it, or give capture.intrinsics."
+                f"{self.source} puts the principal point at ({cx:g}, {cy:g}), outside the {width} x {height} image, "
+                "so it may be for another resolution: correct it, or give capture.intrinsics."
             )
         return Intrinsics(width, height, fx, fy, cx, cy).resized(*size)
 
 
 def same_view(a: Size, b: Size) -> bool:
-    """Whether images of these sizes can show the same view, which is so if they have the same aspect ratio."""
+    """Whether images of these sizes can show the same view, that is, have the same aspect ratio."""
     return abs(a[0] * b[1] / (a[1] * b[0]) - 1.0) < ASPECT_TOLERANCE
 
 
 def rescale_camera(camera: Intrinsics, size: Size) -> Intrinsics:
-    """The camera of images of ``size`` that show the same view. Raises CaptureError if they cannot."""
+    """The camera of images of ``size`` that show the same view. Raises CaptureError for another aspect ratio."""
     if not same_view((camera.width, camera.height), size):
         raise CaptureError(
             f"One camera cannot have taken images of {camera.width} x {camera.height} and of {size[0]} x {size[1]} "
-            "pixels: color and depth need a calibration each (the scannet layout has room for both)."
+            "pixels: give color and depth a calibration each, as the scannet layout allows."
         )
     return camera.resized(*size)
 
 
 def guess_camera(size: Size) -> Intrinsics:
-    """A guess at the camera of images of ``size`` of which nothing is known."""
+    """The default camera for images of ``size`` without any calibration."""
     width, height = size
     focal = USUAL_FOCAL * max(size)
     return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def convert_35mm(focal_35mm: float, size: Size) -> Intrinsics | None:
-    """The camera of images of ``size`` whose lens is stated as the focal length in millimeters of a 35 mm camera with
-    the same view across its diagonal; None where it cannot be one."""
+    """The camera of images of ``size`` from a 35 mm equivalent focal length, millimeters, which refers to the image
+    diagonal. None if the value is out of range."""
     if not 8 <= focal_35mm <= 500:
         return None
     width, height = size
@@ -101,7 +102,7 @@ def convert_35mm(focal_35mm: float, size: Size) -> Intrinsics | None:
 
 
 def reduce_camera(camera: Intrinsics, max_size: int | None) -> Intrinsics:
-    """The camera of the same images, reduced such that their longer side has no more than ``max_size`` pixels."""
+    """The camera of the same images, reduced to at most ``max_size`` pixels on the longer side."""
     longer = max(camera.width, camera.height)
     if max_size is None or longer <= max_size:
         return camera
@@ -110,14 +111,14 @@ def reduce_camera(camera: Intrinsics, max_size: int | None) -> Intrinsics:
 
 
 def read_given_calibration(options: Options) -> Calibration | None:
-    """What ``capture.intrinsics`` says of the color camera."""
+    """The color camera that ``capture.intrinsics`` states, or None."""
     return Calibration(options.intrinsics, None, "capture.intrinsics") if options.intrinsics else None
 
 
 def read_intrinsics(path: Path) -> Calibration:
-    """From a text file with K (3 x 3, or 4 x 4 with K in its corner), or an Open3D camera file (``.json``).
+    """Read a text file with K (3 x 3, or 4 x 4 with K in its corner), or an Open3D camera file (``.json``).
 
-    Raises CaptureError naming the file.
+    Raises CaptureError with the file's name.
     """
     if path.suffix == ".json":
         return _open3d_intrinsics(path)
@@ -128,7 +129,7 @@ def read_intrinsics(path: Path) -> Calibration:
 
 
 def read_rigid(path: Path) -> NDArray[np.float64]:
-    """(4, 4) rigid transform. Raises CaptureError naming the file."""
+    """Read a (4, 4) rigid transform. Raises CaptureError with the file's name."""
     matrix = read_matrix(path)
     if matrix is None or not is_rigid(matrix):
         raise CaptureError(f"{path} must hold a rigid transform of 4 x 4 numbers: correct or remove it.")
@@ -136,15 +137,15 @@ def read_rigid(path: Path) -> NDArray[np.float64]:
 
 
 def read_pose(path: Path) -> NDArray[np.float64] | None:
-    """(4, 4) T_world_cam, or None if there is no such file or what it holds is not a rigid transform (ScanNet writes
-    -inf where tracking was lost)."""
+    """Read (4, 4) T_world_cam; None if the file is missing or holds no rigid transform. ScanNet writes -inf where
+    tracking was lost."""
     matrix = read_matrix(path) if path.is_file() else None
     return matrix if matrix is not None and is_rigid(matrix) else None
 
 
 def read_matrix(path: Path) -> NDArray[np.float64] | None:
-    """The (rows, columns) numbers of a text file, or None if it holds anything else. Raises CaptureError if it cannot
-    be read at all."""
+    """Read a text file of (rows, columns) numbers; None if it holds anything else. Raises CaptureError if the file
+    cannot be read."""
     rows = [line.replace(",", " ").split() for line in read_text(path).splitlines() if line.strip()]
     try:
         return np.array(rows, np.float64, ndmin=2)
@@ -153,7 +154,7 @@ def read_matrix(path: Path) -> NDArray[np.float64] | None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object. Raises CaptureError naming the file."""
+    """Read a JSON object. Raises CaptureError with the file's name."""
     try:
         content = json.loads(read_text(path))
     except ValueError as error:
@@ -164,7 +165,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file. Raises CaptureError."""
+    """Read the text of a file. Raises CaptureError."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:

@@ -1,11 +1,11 @@
-"""Files of class names, and of what the names of one taxonomy are called in another.
+"""Reads files of class names, and of maps from the names of one taxonomy to those of another.
 
     classes: [ceiling, floor, wall]     # in the order of their numbers
-    map:                                # optional: other names -> one of these, or null: none of them
+    map:                                # optional: other name -> one of these classes, or null for none
       carpet: floor
       ceiling lamp: null
 
-as YAML or JSON, or a bare list of names, in YAML, in JSON or one a line. Names are compared without regard to case.
+The file is YAML or JSON, or a bare list of names: YAML, JSON, or one name per line. Case does not matter.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from ..settings.presets import find_preset
 from ..settings.registry import nearest
 
 CLASSES_JSON = "classes.json"
-"""The file of a capture's folder that names the values of its class images."""
+"""The file in a capture's folder that names the values of its class images."""
 
 _MOST_CLASSES = 65536
 _MOST_IN_BYTES = 255
-"""Names that the class images of a capture, which are uint8, can tell apart."""
+"""Largest number of classes: the class images of a capture are uint8."""
 
 
 @dataclass(frozen=True)
 class ClassFile:
-    """What a class file says.
+    """The content of a class file.
 
-    names: of the classes, in their order.  targets: other name, in lower case -> one of ``names``, None = none of them.
+    names: class names in order.  targets: other name, in lower case -> one of ``names``; None = none of them.
     """
 
     path: Path
@@ -44,8 +44,8 @@ class ClassFile:
     targets: dict[str, str | None]
 
     def grouping(self, names: Sequence[str]) -> NDArray[np.float32]:
-        """(T, C) 1 where the c-th of other classes counts as the t-th of the file's. A class that ``targets`` does not
-        name must have the name of one of the file's. Raises ConfigError."""
+        """(T, C) matrix: 1 where class c of ``names`` counts as class t of the file. A class that is not in ``targets``
+        must have the name of a class of the file. Raises ConfigError."""
         row = {name.lower(): t for t, name in enumerate(self.names)}
         matrix = np.zeros((len(self.names), len(names)), np.float32)
         for c, name in enumerate(names):
@@ -62,58 +62,59 @@ class ClassFile:
 
 
 def read_class_file(path: Path) -> ClassFile:
-    """What a file says, or a preset by its name, such as ``nyu40_to_embodiedocc``.
+    """Read a class file, or a preset by its name, such as ``nyu40_to_embodiedocc``.
 
-    Raises ConfigError: no such preset. Raises CaptureError: no such file, not of this form, a name that becomes none of
-    the classes.
+    Raises ConfigError for an unknown preset, CaptureError for a file that is missing, has another form, or maps a name
+    to an unknown class.
     """
     path = find_preset(path, "classes")
     content = _content(path)
     if isinstance(content, list):
         content = {"classes": content}
     if not isinstance(content, dict) or "classes" not in content:
-        raise CaptureError(f"The class file {path} must hold 'classes', a list of names, and perhaps 'map'.")
+        raise CaptureError(f"The class file {path} must hold 'classes', a list of names, and may hold 'map'.")
     if path.suffix != ".json" and (strange := set(content) - {"classes", "map"}):
         raise CaptureError(
-            f"The class file {path} must hold 'classes', a list of names, and perhaps 'map', but not '{strange.pop()}'."
+            f"The class file {path} must hold 'classes', a list of names, and may hold 'map', but not "
+            f"'{strange.pop()}'."
         )
     classes, mapped = content["classes"], content.get("map") or {}
     if not isinstance(classes, list) or not classes or not all(isinstance(name, str) for name in classes):
         raise CaptureError(f"'classes' of {path} must hold a list of names (quote a name like \"no\").")
     if len(classes) > _MOST_CLASSES:
-        raise CaptureError(f"{path} names {len(classes)} classes: more than {_MOST_CLASSES} cannot be told apart.")
+        raise CaptureError(f"{path} names {len(classes)} classes, but at most {_MOST_CLASSES} are possible.")
     if not isinstance(mapped, dict) or not all(isinstance(name, str) for name in mapped):
-        raise CaptureError(f"'map' of {path} must read 'name: class', a name a line.")
+        raise CaptureError(f"'map' of {path} must hold lines of the form 'name: class'.")
     names = tuple(name.strip() for name in classes)
     spelled = {name.lower(): name for name in names}
     targets: dict[str, str | None] = {}
     for name, target in mapped.items():
         if target is not None and str(target).strip().lower() not in spelled:
-            raise CaptureError(f"{path} maps '{name}' to '{target}', which is none of its classes.")
+            raise CaptureError(f"{path} maps '{name}' to '{target}', which is not one of its classes: correct it.")
         targets[name.strip().lower()] = None if target is None else spelled[str(target).strip().lower()]
     return ClassFile(path, names, targets)
 
 
 def read_class_names(path: Path) -> tuple[str, ...]:
-    """The names of a class file, of which there must be two: what is nothing, and a class. Raises CaptureError."""
+    """Read the names of a class file: at least two, "nothing" and a class. Raises CaptureError."""
     names = read_class_file(path).names
     if len(names) < 2:
-        raise CaptureError(f"{path} must name at least 2 classes.")
+        raise CaptureError(f"{path} must name at least 2 classes, the first for nothing.")
     return names
 
 
 def capture_class_names(folder: Path) -> tuple[str, ...]:
-    """The names in ``classes.json`` of a capture's folder, the first meaning nothing; none where there is no such file.
+    """The names in ``classes.json`` of a capture's folder, the first one for nothing; empty if the file is missing.
     Raises CaptureError."""
     path = folder / CLASSES_JSON
     names = read_class_file(path).names if path.is_file() else ()
     if len(names) > _MOST_IN_BYTES:
-        raise CaptureError(f"{path} must hold at most {_MOST_IN_BYTES} classes, which a byte can tell apart.")
+        raise CaptureError(f"{path} must hold at most {_MOST_IN_BYTES} classes, because class images are 8-bit.")
     return names
 
 
 def _content(path: Path) -> Any:
-    """What the file holds, as plain data."""
+    """The content of the file, as plain data."""
     try:
         text = path.read_text(encoding="utf-8")
         if path.suffix == ".json":

@@ -1,4 +1,4 @@
-"""COLMAP's models (cameras, images, points3D, as .bin or .txt): where they lie, how they are read, their lenses."""
+"""Finds and reads COLMAP models (cameras, images, points3D, as .bin or .txt) and their lenses."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 def colmap_folder(folder: Path) -> Path | None:
-    """Where the COLMAP model of a folder lies: in itself, ``sparse/0``, ``sparse`` or ``0``; None if it has none."""
+    """The folder of the COLMAP model: ``folder`` itself, ``sparse/0``, ``sparse`` or ``0``; None if there is none."""
     models = (folder, folder / "sparse" / "0", folder / "sparse", folder / "0")
     return next((m for m in models if any((m / name).is_file() for name in ("images.bin", "images.txt"))), None)
 
 
 def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
-    """The model whose files lie in a folder. Raises CaptureError."""
+    """Read the model in a folder. Raises CaptureError."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -34,15 +34,15 @@ def read_colmap_model(folder: Path) -> pycolmap.Reconstruction:
     except (RuntimeError, ValueError, IndexError, MemoryError, OSError) as error:
         said = " ".join(str(error).split())[:160].rstrip(".")
         raise CaptureError(
-            f"{folder} is no COLMAP model: it needs cameras, images and points3D, all .txt or all .bin, and whole "
-            f"({said})."
+            f"{folder} holds no readable COLMAP model: it needs complete cameras, images and points3D, all .txt or "
+            f"all .bin ({said})."
         ) from error
     return model
 
 
 def colmap_lens(camera: pycolmap.Camera, source: str) -> Lens:
     """The lens of a model's camera. COLMAP's pixel coordinates start at the corner of the first pixel, ours at its
-    center. source: where the model is from, for messages. Raises CaptureError for a camera model that is not read."""
+    center. source: where the model comes from, for messages. Raises CaptureError for an unsupported camera model."""
     names = [name.strip() for name in camera.params_info.split(",")]
     values = dict(zip(names, np.asarray(camera.params, np.float64).tolist(), strict=True))
     fx = values.pop("fx", values.pop("f", 0.0))

@@ -1,10 +1,12 @@
 """Brings the color and the depth images of one rig to one pixel grid.
 
-Three cases. The cameras are the same: nothing is done. They share a viewpoint but not their size or intrinsics: color
-is resampled to the depth camera's pixels (areas are averaged where it shrinks), depth is left alone but for pixels
-that the color image does not reach, which become 0. They stand apart: color is resized to the smaller of the two
-sizes and each depth pixel is moved there as a patch that covers what the pixel covered, the nearest patch winning.
-Depth is never interpolated: every value that comes out was measured, if from another viewpoint.
+There are three cases:
+1. Same camera: nothing changes.
+2. Same viewpoint, but other size or intrinsics: color is resampled to the depth camera's pixels, with area averages
+   where it shrinks. Depth stays, except that pixels outside the color image become 0.
+3. Different viewpoints: color is resized to the smaller of the two sizes. Each depth pixel moves there as a patch that
+   covers the area of the pixel; the nearest patch wins.
+Depth is never interpolated: every output value is a measured one, possibly from another viewpoint.
 """
 
 from __future__ import annotations
@@ -17,23 +19,23 @@ from ..core.transforms import back_project
 from ..core.types import Intrinsics
 
 SAME_PX = 0.25
-"""Two cameras whose pixels differ by less than this everywhere are the same camera."""
+"""Two cameras are the same if their pixels differ by less than this everywhere."""
 
 SAME_M = 1e-4
-"""Extrinsics whose entries differ from the identity by less than this (meters; radians) are the identity."""
+"""Extrinsics are the identity if all entries differ from it by less than this (meters, radians)."""
 
 OVERLAP_PX = 0.25
-"""A patch is grown by this much on each side, so that no cracks open between patches where a surface is slanted."""
+"""Each patch grows by this much on each side, so that slanted surfaces have no cracks between patches."""
 
 
 class PixelGrid:
     """The common pixel grid of a color and a depth camera.
 
-    color, depth: the two cameras.  T_color_depth: (4, 4) depth to color camera frame, None if they coincide.
+    color, depth: the two cameras.  T_color_depth: (4, 4) depth to color camera frame; None if they coincide.
     """
 
     intrinsics: Intrinsics
-    """Of what comes out."""
+    """The camera of the output images."""
 
     def __init__(self, color: Intrinsics, depth: Intrinsics, T_color_depth: NDArray[np.float64] | None = None):
         self._patches: DepthPatches | None = None
@@ -48,16 +50,16 @@ class PixelGrid:
         self._reach = None if self._color_from_grid is None else _reached(self._color_from_grid, self.intrinsics)
 
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) of the color camera to (h, w, 3)."""
+        """Resample a color image (H, W, 3) to the grid (h, w, 3)."""
         shrinks = image.shape[0] >= self.intrinsics.height and image.shape[1] >= self.intrinsics.width
         return self._resample(image, cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR, cv2.INTER_LINEAR)
 
     def classes(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W) class image of the color camera to (h, w), each pixel the class of the nearest one."""
+        """Resample a class image (H, W) of the color camera to the grid (h, w), by the nearest pixel."""
         return self._resample(image, cv2.INTER_NEAREST_EXACT, cv2.INTER_NEAREST)
 
     def depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) meters of the depth camera to (h, w) meters; may change its argument."""
+        """Bring depth (H, W), meters, to the grid (h, w), meters. May change its argument."""
         if self._patches is not None:
             return self._patches.move(depth_m)
         if self._reach is not None:
@@ -77,10 +79,10 @@ class PixelGrid:
 
 
 class DepthPatches:
-    """Forward warp of depth images into another camera with a z-buffer.
+    """Warps depth images forward into another camera, with a z-buffer.
 
-    A depth pixel is a square patch that faces the camera; its size in the target is that of the pixel, times the ratio
-    of the focal lengths (the cameras of a rig are centimeters apart, so that the ratio of their depths is near 1).
+    A depth pixel is a square patch that faces the camera. Its size in the target is the pixel size times the ratio of
+    the focal lengths: the cameras of a rig are centimeters apart, so the ratio of their depths is near 1.
     """
 
     def __init__(self, depth: Intrinsics, target: Intrinsics, T_target_depth: NDArray[np.float64]):
@@ -92,7 +94,7 @@ class DepthPatches:
         self._offset = T_target_depth[:3, 3].astype(np.float32)
 
     def move(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) meters to (h, w) meters in the target camera; 0 where no patch falls."""
+        """Warp depth (H, W), meters, to (h, w), meters, in the target camera; 0 where no patch lands."""
         width, height = self._target.width, self._target.height
         flat = depth_m.reshape(-1)
         measured = np.flatnonzero(flat)
@@ -112,15 +114,15 @@ class DepthPatches:
 def _covered(
     center: NDArray[np.float32], half: float, length: int
 ) -> list[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
-    """The pixels 0…length-1 whose centers lie in ``center ± half``: their first, second, … for all centers at once,
-    each with a mask of those that there are."""
+    """The pixels 0…length-1 with centers in ``center ± half``: a list of the first, second, … pixel for all centers at
+    once, each with a mask of the pixels that exist."""
     first = np.ceil(np.clip(center - half, -1.0, length)).astype(np.int64)
     pixels = (first + step for step in range(int(2 * half) + 1))
     return [(pixel, (pixel >= 0) & (pixel < length) & (pixel <= center + half)) for pixel in pixels]
 
 
 def _pixel_map(grid: Intrinsics, color: Intrinsics) -> NDArray[np.float64] | None:
-    """(2, 3) map of grid pixels to pixels of a color image of the same size and viewpoint, None if they coincide."""
+    """(2, 3) map from grid pixels to pixels of a color image of the same size and viewpoint; None if they coincide."""
     ax, ay = color.fx / grid.fx, color.fy / grid.fy
     to_color = np.array([[ax, 0.0, color.cx - ax * grid.cx], [0.0, ay, color.cy - ay * grid.cy]])
     corners = np.array([[0.0, 0.0], [grid.width - 1.0, grid.height - 1.0]])
@@ -129,7 +131,7 @@ def _pixel_map(grid: Intrinsics, color: Intrinsics) -> NDArray[np.float64] | Non
 
 
 def _reached(color_from_grid: NDArray[np.float64], grid: Intrinsics) -> tuple[slice, slice]:
-    """Rows and columns of the grid that lie inside of the color image."""
+    """Rows and columns of the grid that lie inside the color image."""
     spans = []
     for axis, length in ((1, grid.height), (0, grid.width)):
         position = color_from_grid[axis, axis] * np.arange(length) + color_from_grid[axis, 2]

@@ -1,4 +1,4 @@
-"""A capture whose color camera has another focal length than its files say: color is brought to depth's pixels."""
+"""Corrects a capture whose color camera has another focal length than its files state."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from .depth_registration import PixelGrid
 
 
 class Reregistered(Capture):
-    """``capture`` with color and class images resampled as those of a camera at the same place whose focal length is
-    ``color_focal`` times the depth camera's. Depth, poses and intrinsics stay as they are."""
+    """``capture`` with color and class images resampled to the depth image's pixels, for a color camera at the same
+    place with ``color_focal`` times the depth camera's focal length. Depth, poses and intrinsics stay unchanged."""
 
     def __init__(self, capture: Capture, color_focal: float):
         super().__init__(capture.path, capture.options)

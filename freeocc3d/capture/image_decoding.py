@@ -1,7 +1,7 @@
-"""Decodes color, depth and class images (PNG, JPEG): whole or an error.
+"""Decodes color, depth and class images (PNG, JPEG), and raises an error for incomplete files.
 
-A cut-off file is told from a whole one by its end marker, because some decoders return the part of a JPEG that is
-there, and gray for the rest.
+The end marker shows whether a file is complete: some decoders return the existing part of a cut-off JPEG, and gray for
+the rest.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Size = tuple[int, int]
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 TAIL_BYTES = 4096
-"""Cameras may append bytes after the end marker; it is looked for in this many last bytes."""
+"""The end marker may stand this many bytes before the end, because cameras may append bytes to it."""
 
 SATURATED = np.iinfo(np.uint16).max
-"""What sensors and renderers store where the depth does not fit into 16 bits."""
+"""The value that sensors and renderers store for a depth that exceeds 16 bits."""
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB, as stored: an EXIF orientation is not applied, for depth and intrinsics know nothing of it.
+    """Read (H, W, 3) uint8 RGB as stored. The EXIF orientation is not applied, because depth and intrinsics ignore it.
 
     Raises FrameError if the file is missing, cut off or not an image.
     """
@@ -38,7 +38,7 @@ def read_color(path: Path) -> NDArray[np.uint8]:
 
 
 def read_depth(path: Path) -> NDArray[np.uint16]:
-    """(H, W) uint16 depth as stored. Raises FrameError, also for an image that is not 16-bit gray."""
+    """Read (H, W) uint16 depth as stored. Raises FrameError, also for an image that is not 16-bit gray."""
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype != np.uint16:
         raise FrameError(f"{path} is not a depth image: expected 16-bit gray, got {_kind(image)}.")
@@ -46,20 +46,20 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
 
 
 def read_classes(path: Path, count: int) -> NDArray[np.uint8]:
-    """(H, W) class image with values below ``count``; 255, which many programs write for "nothing", becomes 0 unless it
-    has a name. Raises FrameError, also for a value that has no class."""
+    """Read an (H, W) class image with values below ``count``. Many programs write 255 for "nothing"; it becomes 0
+    unless it has a name. Raises FrameError, also for a value without a class."""
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"{path} is not a class image: expected 8- or 16-bit gray, got {_kind(image)}.")
     if count <= 255:
         image[image == 255] = 0
     if (largest := int(image.max())) >= count:
-        raise FrameError(f"{path} holds class {largest}, but only {count} classes are named (0…{count - 1}).")
+        raise FrameError(f"{path} holds class {largest}, but only {count} classes have names (0…{count - 1}).")
     return image.astype(np.uint8, copy=False)
 
 
 def convert_to_meters(raw: NDArray[np.uint16], units_per_meter: float, max_depth: float) -> NDArray[np.float32]:
-    """Stored depth to float32 meters; saturated values and those beyond ``max_depth`` meters become 0."""
+    """Convert stored depth to float32 meters. Saturated values and those beyond ``max_depth`` meters become 0."""
     depth_m = raw.astype(np.float32)
     depth_m *= np.float32(1.0 / units_per_meter)
     limit = min(max_depth, (SATURATED - 0.5) / units_per_meter)
@@ -67,7 +67,7 @@ def convert_to_meters(raw: NDArray[np.uint16], units_per_meter: float, max_depth
 
 
 def image_size(path: Path) -> Size:
-    """Width and height from the header of a PNG or JPEG; nothing is decoded. Raises FrameError."""
+    """Width and height from the header of a PNG or JPEG, without decoding. Raises FrameError."""
     data = _read(path)
     if data.startswith(PNG_START) and len(data) >= 24:
         return struct.unpack(">II", data[16:24])
@@ -95,7 +95,7 @@ def _read(path: Path) -> bytes:
 
 
 def _jpeg_size(data: bytes) -> Size | None:
-    """From the start-of-frame segment (ITU T.81, B.2.2), which follows segments that state their own length."""
+    """Size from the start-of-frame segment (ITU T.81, B.2.2), which follows segments of stated length."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]

@@ -1,8 +1,8 @@
-"""What the readers of numbered color and depth files share: pairing them by number, and decoding a pair.
+"""Pairs numbered color and depth files by number, and decodes the pairs; the readers of such files share it.
 
-Where a few frames lack one of their two files (at most ``capture.max_broken`` of them), these frames are broken, and
-reading one raises FrameError; where more do, the capture is not usable and the constructor raises CaptureError. With
-``capture.depth=false`` there are color files alone, and no depth file is looked at.
+A frame that lacks one of its two files is broken, and reading it raises FrameError. If more than the share
+``capture.max_broken`` of the frames are broken, the constructor raises CaptureError. With ``capture.depth=false`` only
+color files count, and no depth file is read.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from .image_decoding import Size, convert_to_meters, image_size, read_classes, r
 
 @dataclass(frozen=True)
 class Pairs:
-    """Color and depth files of N frames, ascending by number. A missing file is None; so are all of depth where depth
-    is not to be read, and the depth images' size is color's then.
+    """Color and depth files of N frames, ascending by number. A missing file is None. If depth is not read, all depth
+    files are None and ``depth_size`` equals ``color_size``.
 
-    numbers: the frames' numbers in the file names.  color_size, depth_size: of the first readable image of each kind.
+    numbers: frame numbers in the file names.  color_size, depth_size: of the first readable image of each kind.
     """
 
     numbers: tuple[int, ...]
@@ -37,9 +37,9 @@ class Pairs:
 
 
 def pair_files(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Path, options: Options) -> Pairs:
-    """Pair the files by their numbers, or take color's alone if ``options.depth`` is false.
+    """Pair the files by number, or take only color files if ``options.depth`` is false.
 
-    Raises CaptureError: no color, no depth, more than ``max_broken`` of the frames lack a file, no readable image.
+    Raises CaptureError: there is no color, no depth or no readable image, or too many frames lack a file.
     """
     if not color:
         raise CaptureError(f"{folder} holds no color images of this format.")
@@ -49,7 +49,7 @@ def pair_files(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Pat
         return Pairs(tuple(numbers), tuple(color[n] for n in numbers), (None,) * len(numbers), size, size)
     if not depth:
         raise CaptureError(
-            f"{folder} holds {len(color)} color images but no depth: add it, or map color alone with "
+            f"{folder} holds {len(color)} color images but no depth: add depth, or map color only with "
             "capture.depth=false."
         )
     numbers = sorted(color.keys() | depth.keys())
@@ -59,7 +59,7 @@ def pair_files(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Pat
         missing = "depth" if incomplete[0] in color else "color"
         raise CaptureError(
             f"{folder} holds {len(color)} color and {len(depth)} depth images, and {len(incomplete)} frames lack one "
-            f"of the two, the first being frame {incomplete[0]} ({alone.name} has no {missing} image): complete the "
+            f"of the two. The first is frame {incomplete[0]} ({alone.name} has no {missing} image). Complete the "
             "capture, or raise capture.max_broken."
         )
     return Pairs(
@@ -75,7 +75,7 @@ class ImagePairs(Capture):
     """A capture of numbered color and depth files; a reader finds the files and the cameras."""
 
     def __init__(self, path: Path, options: Options, pairs: Pairs, grid: PixelGrid, units_per_meter: float):
-        """units_per_meter: of the stored depth, unless ``options.depth_scale`` says otherwise."""
+        """units_per_meter: of the stored depth, unless ``options.depth_scale`` is set."""
         super().__init__(path, options)
         self._pairs = pairs
         self._grid = grid
@@ -102,7 +102,7 @@ class ImagePairs(Capture):
         return None if path is None else (self._stored_depth(path), self._units_per_meter)
 
     def _class_image(self, path: Path | None) -> NDArray[np.uint8] | None:
-        """The class image at ``path`` on the frames' pixel grid. Raises FrameError if it is there but not usable."""
+        """The class image at ``path`` on the frames' pixel grid. Raises FrameError if the file is unusable."""
         if path is None or not self.classes:
             return None
         image = read_classes(path, len(self.classes))
@@ -110,13 +110,13 @@ class ImagePairs(Capture):
         return self._grid.classes(image)
 
     def _files(self, index: int) -> tuple[Path, Path | None]:
-        """Color and, if depth is read, depth file of a frame."""
+        """The color file of a frame and, if depth is read, its depth file."""
         if not 0 <= index < len(self):
             raise IndexError(f"Frame {index} of a capture of {len(self)} frames.")
         color, depth = self._pairs.color[index], self._pairs.depth[index]
         if color is None or (depth is None and self.has_depth):
             alone, missing = (color, "depth") if color else (depth, "color")
-            raise FrameError(f"Frame {self._pairs.numbers[index]} has no {missing} image beside {alone}.")
+            raise FrameError(f"Frame {self._pairs.numbers[index]} has no {missing} image for {alone}.")
         return color, depth
 
     def _stored_color(self, path: Path) -> NDArray[np.uint8]:
@@ -136,10 +136,10 @@ def _first_size(paths: Iterable[Path], folder: Path) -> Size:
             return image_size(path)
         except FrameError:
             continue
-    raise CaptureError(f"No image of {folder} can be read: all are damaged, or neither PNG nor JPEG.")
+    raise CaptureError(f"No image of {folder} can be read: all are damaged, or are not PNG or JPEG.")
 
 
 def _check_size(image: NDArray[np.generic], size: Size, path: Path) -> None:
     if image.shape[1::-1] != size:
         height, width = image.shape[:2]
-        raise FrameError(f"{path} has {width} x {height} pixels, other frames have {size[0]} x {size[1]}.")
+        raise FrameError(f"{path} has {width} x {height} pixels, but other frames have {size[0]} x {size[1]}.")

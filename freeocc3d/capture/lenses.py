@@ -1,4 +1,4 @@
-"""Lenses: the camera models of COLMAP, OpenCV and nerfstudio as one type, and images without their distortion.
+"""Represents the camera models of COLMAP, OpenCV and nerfstudio as one type, and undistorts images.
 
 Sources: COLMAP's "Camera models", nerfstudio's "Data conventions", OpenCV's "Camera calibration and 3D reconstruction"
 and "Fisheye camera model". The radial models of all three are OpenCV's.
@@ -20,19 +20,19 @@ from .camera_files import reduce_camera
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 BROWN_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Radial and tangential distortion, of which the models name some coefficients or all eight."""
+"""Radial and tangential distortion. Each model has some of the eight coefficients, or all."""
 FISHEYE_MODELS = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 MODELS = (*PINHOLE_MODELS, *BROWN_MODELS, *FISHEYE_MODELS)
 
 _BROWN_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_BROWN_COUNTS = (0, 4, 5, 8)  # of coefficients that OpenCV takes
+_BROWN_COUNTS = (0, 4, 5, 8)  # numbers of coefficients that OpenCV accepts
 _FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera and its distortion in OpenCV's order: k1 k2 p1 p2 and, where there are more, k3 k4 k5 k6; of a fisheye
-    k1 k2 k3 k4. All zero, or none, is a pinhole camera, unless it is a fisheye's."""
+    """A camera and its distortion, in OpenCV's order: k1 k2 p1 p2, then k3 k4 k5 k6 if used; for a fisheye k1 k2 k3 k4.
+    Without coefficients, or with all zero, it is a pinhole camera, unless it is a fisheye."""
 
     camera: Intrinsics
     distortion: tuple[float, ...] = ()
@@ -40,14 +40,14 @@ class Lens:
 
 
 def lens_of(model: str, camera: Intrinsics, coefficients: Mapping[str, float], source: str) -> Lens:
-    """A lens by the name of its camera model and its coefficients by name (``k`` is ``k1``); what is absent is 0.
+    """The lens of a named camera model with named coefficients (``k`` means ``k1``); missing coefficients are 0.
 
-    source: the file that states it, for messages. Raises CaptureError for a model that is none of ``MODELS``, or a
-    coefficient that the model does not have.
+    source: the file that states them, for messages. Raises CaptureError for a model that is not in ``MODELS``, or for a
+    coefficient that the model lacks.
     """
     if model not in MODELS:
         raise CaptureError(
-            f"{source} states the camera model {model}, which is not read: undistort the images first (colmap "
+            f"{source} states the camera model {model}, which is not supported: undistort the images first (colmap "
             f"image_undistorter), or use one of {', '.join(MODELS)}."
         )
     order = _FISHEYE_ORDER if model in FISHEYE_MODELS else _BROWN_ORDER if model in BROWN_MODELS else ()
@@ -65,10 +65,10 @@ def lens_of(model: str, camera: Intrinsics, coefficients: Mapping[str, float], s
 
 
 class Rectified:
-    """Resamples images of a lens. What comes out has the lens's aspect ratio and holds seen pixels alone: of barrel
-    distortion the corners are cut.
+    """Undistorts the images of a lens. The output has the lens's aspect ratio and holds only pixels that the lens sees;
+    with barrel distortion, the corners are cut off.
 
-    intrinsics: of what comes out.
+    intrinsics: camera of the output.
     """
 
     intrinsics: Intrinsics
@@ -86,14 +86,14 @@ class Rectified:
             self.intrinsics = Intrinsics(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) of the lens to (h, w, 3), areas averaged where it shrinks."""
+        """Undistort color (H, W, 3) to (h, w, 3), with area averages where it shrinks."""
         if image.shape[1::-1] != self.size:
             shrinks = image.shape[1] >= self.size[0]
             image = cv2.resize(image, self.size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
         return self._moved(image, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
     def depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) meters of the lens, of any size, to (h, w); each pixel has the depth measured nearest to it."""
+        """Undistort depth (H, W), meters, of any size, to (h, w), meters, by the nearest measured pixel."""
         if depth_m.shape[1::-1] != self.size:
             depth_m = cv2.resize(depth_m, self.size, interpolation=cv2.INTER_NEAREST_EXACT)
         return self._moved(depth_m, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
@@ -103,7 +103,7 @@ class Rectified:
 
 
 def _pinhole(K: NDArray[np.float64], lens: Lens, size: tuple[int, int]) -> NDArray[np.float64]:
-    """The camera matrix of an image of the same size that shows nothing beyond the lens's."""
+    """(3, 3) matrix of the pinhole camera of the same size that sees nothing beyond the lens's image."""
     distortion = np.array(lens.distortion, np.float64)
     if lens.fisheye:
         return np.asarray(

@@ -1,4 +1,4 @@
-"""Files of a folder that are numbered by frame, as their names say."""
+"""Lists the files of a folder that have frame numbers in their names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..core.errors import CaptureError
 
 
 def list_numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """Files of ``folder`` whose whole name matches ``pattern``, by the number in its first group.
+    """The files of ``folder`` with names that fully match ``pattern``, keyed by the number in its first group.
 
     Raises CaptureError if two files have the same number.
     """
@@ -25,6 +25,6 @@ def list_numbered(folder: Path, pattern: str) -> dict[int, Path]:
 
 
 def has_file(folder: Path, pattern: str) -> bool:
-    """Whether a file of ``folder`` has a name that matches ``pattern``."""
+    """Whether ``folder`` holds a file with a name that fully matches ``pattern``."""
     expression = re.compile(pattern, re.IGNORECASE)
     return folder.is_dir() and any(expression.fullmatch(path.name) for path in folder.iterdir())

@@ -1,4 +1,4 @@
-"""Finds the reader of a capture, and says when what it reads cannot be a room."""
+"""Finds the reader of a capture, and warns if its depth does not look like a room."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from ..settings import registry
 from .base import Capture, Options
 
 VIDEO = "video"
-"""The reader of files; all others read folders."""
+"""The reader of video files; all others read folders."""
 
 VIDEO_SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"}
-"""By which a folder that is no capture is looked through for a file that may be one."""
+"""Suffixes of files that may be a capture, for the hint about an unrecognized folder."""
 
 BUILTIN = "builtin:"
-"""Paths that start with this name something that is rendered, not a folder."""
+"""Prefix of paths that name a rendered scene, not a folder."""
 
 USUAL_UNITS = (1.0, 100.0, 1000.0, 5000.0, 6553.5, 10000.0)
-"""Depth units per meter that formats use."""
+"""Common depth units per meter."""
 
 INDOOR_MEDIAN_M = 0.1, 20.0
-"""The median depth of an indoor scan lies between these."""
+"""Range of the median depth of an indoor scan, meters."""
 
 TYPICAL_MEDIAN_M = 2.0
 
@@ -35,18 +35,18 @@ TYPICAL_MEDIAN_M = 2.0
 def open_capture(
     path: str | Path, options: Options | None = None, backend_options: Mapping[str, Mapping[str, Any]] | None = None
 ) -> Capture:
-    """The capture at ``path``, by the reader that ``options.format`` names or, if that is "auto", that recognizes it.
+    """Open the capture at ``path`` with the reader ``options.format``; "auto" picks the one that recognizes the folder.
 
-    backend_options: reader name -> its own options; readers that are not used are ignored.
-    Raises CaptureError (no such folder, unknown layout, what the reader finds missing), ConfigError (unknown format,
-    option out of range), DependencyError.
+    backend_options: reader name -> its own options; those of other readers are ignored.
+    Raises CaptureError (missing folder, unknown layout, missing files), ConfigError (unknown format, option out of
+    range), DependencyError.
     """
     options = options or Options()
     if str(path).startswith(BUILTIN):
         return _construct("synthetic", Path(path), options, backend_options or {})
     folder = Path(path).expanduser()
     if not folder.exists():
-        raise CaptureError(f"There is no folder {folder}, nor a video of that name: check the path of the capture.")
+        raise CaptureError(f"There is no folder or video {folder}: check the path of the capture.")
     is_video = options.format == VIDEO or (options.format == "auto" and folder.is_file())
     if folder.is_file() != is_video:
         raise CaptureError(
@@ -61,22 +61,22 @@ def open_capture(
 
 
 def select_frames(capture: Capture) -> range:
-    """Indices of the frames that ``start``, ``stop`` and ``stride`` select. Raises CaptureError if there are none."""
+    """Indices of the frames that ``start``, ``stop`` and ``stride`` select. Raises CaptureError if there is none."""
     options = capture.options
     frames = range(len(capture))[options.start : options.stop : options.stride]
     if not frames:
         raise CaptureError(
-            f"No frame of {capture.path} is used: it has {len(capture)}, and capture.start = {options.start}, "
-            f"capture.stop = {options.stop} select none of them."
+            f"No frame of {capture.path} is selected: it has {len(capture)} frames, and capture.start = "
+            f"{options.start}, capture.stop = {options.stop} select none of them. Change these options."
         )
     return frames
 
 
 def check_depth_scale(capture: Capture, samples: int = 5) -> Notice | None:
-    """A warning if depth seems to be stored in other units than assumed, or None.
+    """A warning if depth seems to be stored in other units than assumed; else None.
 
-    Looks at some frames spread over the capture, before depth is clipped at ``max_depth``, because depth that is read
-    1000 times too large would be clipped away entirely.
+    Samples frames across the capture, before depth is clipped at ``max_depth``: clipping would remove all depth that is
+    read 1000 times too large.
     """
     median_units, within, units_per_meter = _sample_depth(capture, samples)
     if median_units is None:
@@ -91,13 +91,13 @@ def check_depth_scale(capture: Capture, samples: int = 5) -> Notice | None:
         advice = "check capture.depth_scale and capture.max_depth"
     return Notice(
         "depth-scale-doubtful",
-        f"The median depth of {capture.path} is {median_m:.3g} m and {within:.0%} of it lies within "
-        f"capture.max_depth = {capture.options.max_depth:g} m, which does not look like a room: {advice}.",
+        f"The depth of {capture.path} does not look like a room: its median is {median_m:.3g} m, and {within:.0%} of "
+        f"it lies within capture.max_depth = {capture.options.max_depth:g} m; {advice}.",
     )
 
 
 def _sample_depth(capture: Capture, samples: int) -> tuple[float | None, float, float]:
-    """Median of the stored depth (None if there is none), the share of it within ``max_depth``, units per meter."""
+    """Median of the stored depth (None without depth), its share within ``max_depth``, and the units per meter."""
     values, units_per_meter = [], 1.0
     for index in np.unique(np.linspace(0, len(capture) - 1, samples).astype(int)).tolist():
         try:
@@ -120,19 +120,19 @@ def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mappin
     opened: Capture = module.Reader(path, options, *([] if extra is None else [extra]))
     if options.scale is not None and opened.has_depth:
         raise ConfigError(
-            f"capture.scale is for scans without depth, but {path} has depth, which says how large everything is: "
-            "leave it out, or give capture.depth=false."
+            f"capture.scale is for scans without depth, but {path} has depth, which gives the scale: "
+            "leave capture.scale out, or set capture.depth=false."
         )
     return opened
 
 
 def _recognize(folder: Path) -> str:
-    """Name of the one reader that recognizes the folder. Raises CaptureError if none does, or several."""
+    """Name of the reader that recognizes the folder. Raises CaptureError if none does, or several do."""
     readers = _readers()
     found = [name for name, reader in readers.items() if not reader.general and reader.recognizes(folder)]
     found = found or [name for name, reader in readers.items() if reader.general and reader.recognizes(folder)]
     if len(found) > 1:
-        raise CaptureError(f"{folder} looks like {' and like '.join(found)}: name one with capture.format.")
+        raise CaptureError(f"{folder} may be of the format {' or '.join(found)}: choose one with capture.format.")
     if found:
         return found[0]
     raise CaptureError(
@@ -143,13 +143,13 @@ def _recognize(folder: Path) -> str:
 
 
 def _readers() -> dict[str, type[Capture]]:
-    """Readers by name; those whose packages are not installed cannot recognize anything."""
+    """Readers by name, without those that need a missing package."""
     names = [name for name, backend in registry.backends("capture.readers").items() if not backend.missing]
     return {name: registry.load("capture.readers", name).Reader for name in names}
 
 
 def _below(folder: Path, readers: Mapping[str, type[Capture]]) -> str:
-    """A hint at the first subfolder that is a capture, for data sets that hold several, or at a video."""
+    """A hint at the first subfolder that is a capture, as in data sets of several, or at the first video."""
     for child in sorted(folder.iterdir()):
         if child.is_dir() and any(reader.recognizes(child) for reader in readers.values()):
             return f", but {child} is: give that folder"

@@ -1,4 +1,4 @@
-"""Point clouds that came with a capture or its trajectory: PLY, PCD or XYZ."""
+"""Reads the point cloud of a capture or trajectory: PLY, PCD or XYZ."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ..core.ply_files import read_ply_header
 
 
 def read_points(path: Path) -> NDArray[np.float64]:
-    """(P, 3) finite points, in the file's unit. Raises CaptureError: no such file, no points, damaged."""
+    """Read (P, 3) finite points, in the file's unit. Raises CaptureError: no such file, no points, or damaged."""
     import open3d as o3d
 
     if not path.is_file():
-        raise CaptureError(f"There is no point cloud {path}.")
+        raise CaptureError(f"There is no point cloud {path}: check the path.")
     if path.suffix.lower() == ".ply":
         try:
             read_ply_header(path)
@@ -25,5 +25,5 @@ def read_points(path: Path) -> NDArray[np.float64]:
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         cloud = o3d.io.read_point_cloud(str(path), remove_nan_points=True, remove_infinite_points=True)
     if not len(cloud.points):
-        raise CaptureError(f"{path} holds no points, or is no point cloud that can be read (PLY, PCD or XYZ).")
+        raise CaptureError(f"{path} holds no points, or is not a readable point cloud (PLY, PCD or XYZ).")
     return np.asarray(cloud.points, np.float64).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""What the readers of reconstructions share: images with poses and lenses, and depth where there is some."""
+"""Images with poses and lenses, and optional depth; the readers of reconstructions share it."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from .image_decoding import convert_to_meters, read_color, read_depth
 from .lenses import Lens, Rectified
 
 UNITS_PER_METER = 1000.0
-"""Of stored depth, unless ``capture.depth_scale`` says otherwise."""
+"""Units per meter of stored depth, unless ``capture.depth_scale`` is set."""
 
 _SAMPLES = 20_000
 
 
 @dataclass(frozen=True)
 class PosedImage:
-    """An image's file, its depth's if there is one, the lens, and (4, 4) T_world_cam."""
+    """An image file, its depth file or None, its lens, and (4, 4) T_world_cam."""
 
     image: Path
     depth: Path | None
@@ -36,11 +36,11 @@ class PosedImage:
 
 
 class PosedImages(Capture):
-    """Images as those of pinhole cameras: lens distortion is taken out, and they are reduced to ``capture.max_size``.
-    Cameras may differ from image to image."""
+    """Undistorts images to pinhole cameras and reduces them to ``capture.max_size``. Each image may have its own
+    camera."""
 
     def __init__(self, path: Path, options: Options, posed: Sequence[PosedImage], units_in_meters: float | None):
-        """units_in_meters: of the poses; None = unknown, so that they are left as they are."""
+        """units_in_meters: meters per unit of the poses; None = unknown, and the poses stay unchanged."""
         super().__init__(path, options)
         if len(posed) < 2:
             raise CaptureError(f"{path} holds {len(posed)} images with poses: a scan needs many.")
@@ -61,12 +61,12 @@ class PosedImages(Capture):
         color = read_color(view.image)
         lens = view.lens
         size = color.shape[1], color.shape[0]
-        if size != (lens.camera.width, lens.camera.height):  # the same images, stored smaller or larger
+        if size != (lens.camera.width, lens.camera.height):  # the stored image is smaller or larger
             try:
                 lens = replace(lens, camera=rescale_camera(lens.camera, size))
             except CaptureError as error:
                 raise FrameError(
-                    f"{view.image} has {size[0]} x {size[1]} pixels, its camera {lens.camera.width} x "
+                    f"{view.image} has {size[0]} x {size[1]} pixels, but its camera has {lens.camera.width} x "
                     f"{lens.camera.height}."
                 ) from error
         rectified = self._rectified(lens)
@@ -90,7 +90,7 @@ class PosedImages(Capture):
 
 
 def compute_nominal_scale(posed: Sequence[PosedImage], points: NDArray[np.float64]) -> float | None:
-    """What brings the median depth of (P, 3) points, where images show them, to ``NOMINAL_DEPTH``; None without any."""
+    """Factor that brings the median depth of (P, 3) points seen in images to ``NOMINAL_DEPTH``; None without any."""
     points = points[:: max(1, len(points) // _SAMPLES)]
     depths = []
     for view in posed:
@@ -103,10 +103,10 @@ def compute_nominal_scale(posed: Sequence[PosedImage], points: NDArray[np.float6
 
 
 def resolve_inside(folder: Path, name: str, stated_by: Path) -> Path:
-    """A file that another one names, within the folder. Raises CaptureError for one that is outside."""
+    """The path of a file that ``stated_by`` names. Raises CaptureError if it lies outside ``folder``."""
     path = Path(os.path.normpath(folder / name))
     if not path.is_relative_to(os.path.normpath(folder)):
-        raise CaptureError(f"{stated_by} names {name}, which lies outside of {folder}: correct it.")
+        raise CaptureError(f"{stated_by} names {name}, which lies outside {folder}: correct it.")
     return path
 
 

@@ -1,4 +1,4 @@
-"""Decodes frames on a second thread while the first one works on the frames before them."""
+"""Decodes frames on a second thread while the first thread processes earlier frames."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from .base import Capture
 
 
 def read_ahead(capture: Capture, indices: Iterable[int], depth: int = 4) -> Generator[tuple[int, Frame | FrameError]]:
-    """Yield ``(index, frame)`` in the order of ``indices``, or ``(index, error)`` for a frame that is broken.
+    """Yield ``(index, frame)`` in the order of ``indices``, or ``(index, error)`` for a broken frame.
 
-    depth: how many frames are decoded ahead of use, and so how many are held in memory besides the one in use.
-    Raises what the capture raises, other than FrameError, at the frame concerned. When the generator is left early, by
-    ``break`` or an exception, the thread finishes the frame it is at and ends.
+    depth: number of frames to decode ahead; memory holds these and the one in use.
+    Raises any other error of the capture at the frame concerned. If the generator ends early, by ``break`` or an
+    exception, the thread finishes its current frame and ends.
     """
     pending: deque[Future[tuple[int, Frame | FrameError]]] = deque()
     executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="read-ahead")
@@ -35,4 +35,4 @@ def _read(capture: Capture, index: int) -> tuple[int, Frame | FrameError]:
     try:
         return index, capture[index]
     except FrameError as error:
-        return index, error.with_traceback(None)  # it would hold on to the bytes of the file
+        return index, error.with_traceback(None)  # the traceback would keep the bytes of the file in memory

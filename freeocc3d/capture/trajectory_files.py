@@ -1,7 +1,7 @@
-"""Trajectories from other systems' files, and which of their poses belong to which frame of a capture.
+"""Reads trajectory files of other systems, and assigns their poses to the frames of a capture.
 
-Every format is brought to camera-to-world poses in OpenCV axes here. A pose is known by its time (TUM), by its image's
-name (COLMAP, nerfstudio, 7-Scenes), or by its place in the file alone (KITTI, Replica, Open3D's .log).
+All formats become camera-to-world poses in OpenCV axes. A pose is matched by its time (TUM), by the name of its image
+(COLMAP, nerfstudio, 7-Scenes), or by its position in the file (KITTI, Replica, Open3D's .log).
 
 Sources: J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012 (TUM's form, association by
 time); A. Geiger et al., KITTI's odometry development kit; the format pages of COLMAP, nerfstudio and Open3D.
@@ -24,23 +24,23 @@ from ..core.transforms import invert, is_rigid
 from .base import Capture
 
 SAME_TIME_S = 0.02
-"""Poses whose timestamps differ by no more belong together: the tolerance of the TUM RGB-D benchmark."""
+"""Largest difference of timestamps that match, as in the TUM RGB-D benchmark."""
 
 FORMS = (
-    "TUM (timestamp, position, quaternion xyzw), KITTI or Replica (12 or 16 numbers a line), Open3D's .log, COLMAP's "
-    "images.txt or images.bin, nerfstudio's transforms.json, or a folder of 7-Scenes' *.pose.txt"
+    "TUM (timestamp, position, quaternion xyzw), KITTI or Replica (12 or 16 numbers per line), Open3D's .log, "
+    "COLMAP's images.txt or images.bin, nerfstudio's transforms.json, or a folder of 7-Scenes' *.pose.txt"
 )
-"""What can be read, in words."""
+"""The supported formats, in words."""
 
 _LARGEST_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
 class PoseFile:
-    """M poses of a file, as they stand there.
+    """The M poses of a file.
 
-    T_world_cam: (M, 4, 4); NaN where a line states none.  timestamps: (M,) seconds, or None.
-    names: of the M images, or empty.
+    T_world_cam: (M, 4, 4); NaN where the file has none.  timestamps: (M,) seconds, or None.
+    names: M image names, or empty.
     """
 
     path: Path
@@ -49,8 +49,8 @@ class PoseFile:
     names: tuple[str, ...] = ()
 
     def times(self) -> NDArray[np.float64]:
-        """(M,) seconds; where the file has none, the number in the image's name or the place in the file, as captures
-        without times count theirs."""
+        """(M,) seconds. Without times, the number in the image's name or the position in the file; captures without
+        times count the same way."""
         if self.timestamps is not None:
             return self.timestamps
         numbers = [_number(name) for name in self.names]
@@ -59,9 +59,9 @@ class PoseFile:
         return np.arange(len(self.T_world_cam), dtype=np.float64)
 
     def of_frames(self, capture: Capture, tolerance_s: float = SAME_TIME_S) -> NDArray[np.float64]:
-        """(N, 4, 4) poses of a capture's N frames, NaN where the file has none.
+        """(N, 4, 4) poses of a capture's N frames; NaN where the file has none.
 
-        Images are matched by name, else by the number in their name; times by the nearest within the tolerance.
+        Images match by name, else by the number in the name; times match the nearest within the tolerance, seconds.
         Raises CaptureError if nothing matches.
         """
         T = np.full((len(capture), 4, 4), np.nan)
@@ -76,9 +76,7 @@ class PoseFile:
         for frame, row in rows.items():
             T[frame] = self.T_world_cam[row]
         if not np.isfinite(T).any():
-            raise CaptureError(
-                f"No pose of {self.path} belongs to a frame of {capture.path}: {self._mismatch(capture)}."
-            )
+            raise CaptureError(f"No pose of {self.path} matches a frame of {capture.path}: {self._mismatch(capture)}.")
         return T
 
     def _mismatch(self, capture: Capture) -> str:
@@ -91,30 +89,30 @@ class PoseFile:
 
 
 def read_trajectory(path: str | Path) -> PoseFile:
-    """Read any of ``FORMS``. Raises CaptureError, with the file's name, for what is none of them or damaged."""
+    """Read a file in any of ``FORMS``. Raises CaptureError for any other file, or a damaged one."""
     path = Path(path).expanduser()
     try:
         if path.is_dir():
             return _read_folder(path)
         if not path.is_file():
-            raise CaptureError(f"There is no trajectory {path}.")
+            raise CaptureError(f"There is no trajectory {path}: check the path.")
         if path.stat().st_size > _LARGEST_BYTES:
-            raise CaptureError(f"{path} is no trajectory: it has {path.stat().st_size / 1e6:.0f} MB.")
+            raise CaptureError(f"{path} is too large for a trajectory: it has {path.stat().st_size / 1e6:.0f} MB.")
         if path.name in ("images.txt", "images.bin"):
             return _read_colmap(path.parent)
         read: Callable[[Path], PoseFile] = _read_nerfstudio if path.suffix == ".json" else _read_text
         found = read(path)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CaptureError(f"{path} is no trajectory: expected {FORMS}.") from error
+        raise CaptureError(f"{path} is not a trajectory: expected {FORMS}.") from error
     return _checked(found)
 
 
 def _checked(found: PoseFile) -> PoseFile:
     finite = np.isfinite(found.T_world_cam).all(axis=(1, 2))
     if not finite.any():
-        raise CaptureError(f"{found.path} is no trajectory: it holds no pose.")
+        raise CaptureError(f"{found.path} is not a trajectory: it holds no pose.")
     if not all(is_rigid(pose) for pose in found.T_world_cam[finite]):
-        raise CaptureError(f"{found.path} holds a matrix that is no rigid camera-to-world pose.")
+        raise CaptureError(f"{found.path} holds a matrix that is not a rigid camera-to-world pose.")
     return found
 
 
@@ -146,7 +144,7 @@ def _read_text(path: Path) -> PoseFile:
 
 
 def _read_log(path: Path, rows: list[list[str]]) -> PoseFile:
-    """Open3D's .log: a line of three numbers, of which the first is the frame's, then four lines of the matrix."""
+    """Read Open3D's .log: per pose a line of three numbers, first the frame number, then four lines of the matrix."""
     if len(rows) % 5 or not rows or any(len(row) != (3 if n % 5 == 0 else 4) for n, row in enumerate(rows)):
         raise ValueError
     numbers = [int(float(row[0])) for row in rows[::5]]
@@ -171,14 +169,14 @@ def _read_colmap(folder: Path) -> PoseFile:
     model = read_colmap_model(folder)
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     if not images:
-        raise CaptureError(f"The COLMAP model {folder} holds no image with a pose.")
+        raise CaptureError(f"The COLMAP model {folder} holds no image with a pose: check the reconstruction.")
     T_cam_world = np.tile(np.eye(4), (len(images), 1, 1))
     T_cam_world[:, :3] = [image.cam_from_world().matrix() for image in images]
     return _checked(PoseFile(folder, invert(T_cam_world), names=tuple(Path(image.name).name for image in images)))
 
 
 def _by_name(names: tuple[str, ...], frames: list[str]) -> dict[int, int]:
-    """Frame -> row of the pose whose image has its name; if none has, whose last number is the same."""
+    """Frame -> row of the pose with the same image name or, if no name matches, with the same last number."""
     for key in (str, _stem, _number):
         rows = {key(name): row for row, name in enumerate(names)}
         found = {frame: rows[key(name)] for frame, name in enumerate(frames) if name and key(name) in rows}
@@ -199,8 +197,8 @@ def _number(name: str) -> str:
 def associate(
     times_a: NDArray[np.float64], times_b: NDArray[np.float64], tolerance_s: float = SAME_TIME_S
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of two ascending lists of timestamps that belong together: each of the shorter list with the nearest of the
-    longer, where they differ by no more than the tolerance."""
+    """Matching rows of two ascending lists of timestamps: each entry of the shorter list with the nearest entry of the
+    longer one, if they differ by at most the tolerance."""
     if len(times_a) > len(times_b):
         rows_b, rows_a = associate(times_b, times_a, tolerance_s)
         return rows_a, rows_b

@@ -1,1 +1,1 @@
-"""What every room uses: types, errors, transforms, voxel keys, arrays on disk, networks, progress. Imports no room."""
+"""What every room uses: types, errors, transforms, voxel keys, files, networks, progress. Imports no other room."""

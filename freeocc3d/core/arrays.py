@@ -1,5 +1,5 @@
-"""Arrays in .npz files: written whole, and read with care. Nothing is unpickled, and sizes are checked before memory is
-taken."""
+"""Writes and reads arrays in .npz files. Writing replaces the whole file. Reading unpickles nothing and checks sizes
+before it allocates memory."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ _LARGEST_ARRAY = 8 << 30
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False) -> None:
-    """Write an .npz file, in place of one that is there. Raises OSError."""
+    """Write an .npz file; an existing one is replaced. Raises OSError."""
     save = np.savez_compressed if compressed else np.savez
     replace_file(path, lambda temporary: save(temporary, **arrays))
 
 
 def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]]) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz file; each name in ``expected`` must be there with its kind of number and dimensions.
+    """Read the arrays of an .npz file.
 
-    Sizes are read from the headers before anything is unpacked. Raises MapError.
+    expected: name -> (``dtype.kind``, number of dimensions); the file must hold each of them.
+    The headers give the sizes before anything is unpacked. Raises MapError.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -37,7 +38,7 @@ def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]]) -> dict[str
                 info.filename.removesuffix(".npy"): _read_array(archive, info, path) for info in archive.infolist()
             }
     except FileNotFoundError as error:
-        raise MapError(f"{path} is missing: copy the whole folder, or map again.") from error
+        raise MapError(f"{path} is missing: copy the whole map folder again, or make the map again.") from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
         raise MapError(f"{path} is damaged: {error}.") from error
     for name, (kind, dimensions) in expected.items():
@@ -53,6 +54,6 @@ def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> 
         shape, _, dtype = read_header(stream)
         size = math.prod(shape) * dtype.itemsize
         if dtype.hasobject or size > info.file_size or size > _LARGEST_ARRAY:
-            raise MapError(f"{path} is damaged: its array {info.filename} states a size that its data do not have.")
+            raise MapError(f"{path} is damaged: its array {info.filename} is not as large as its header says.")
     with archive.open(info) as stream:
         return np.asarray(npy.read_array(stream, allow_pickle=False))

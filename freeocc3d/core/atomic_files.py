@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Writes files completely or not at all."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ _TEMPORARY = "tmp"
 
 
 def replace_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a temporary file in the folder of ``path``, with the same suffix; then give it the name
-    ``path``. A reader finds the file before or the new one, each whole. Raises OSError."""
+    """Let ``write`` fill a temporary file in the folder of ``path``, with the same suffix, then rename it to ``path``.
+    A reader always finds a complete file, the old or the new one. Raises OSError."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.{_TEMPORARY}{path.suffix}")
     try:
         write(temporary)
@@ -25,28 +25,28 @@ def replace_file(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """``replace_file`` with a text. Raises OSError."""
+    """Write a text with ``replace_file``. Raises OSError."""
     replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def is_temporary(path: Path) -> bool:
-    """Whether ``replace_file`` made it, in a process that was stopped before it was done."""
+    """Whether this is a temporary file of ``replace_file`` that an interrupted process left."""
     return path.name.startswith(".") and _TEMPORARY in path.name.split(".")
 
 
 def refuse_existing(path: Path, overwrite: bool = False) -> None:
-    """Raises ExportError if the file exists or its folder does not: before work is done that could not be written."""
+    """Raise ExportError if the file exists or its folder does not, before any work whose result cannot be written."""
     if not path.parent.is_dir():
-        raise ExportError(f"Cannot write {path}: there is no folder {path.parent}.")
+        raise ExportError(f"Cannot write {path}: there is no folder {path.parent}. Create it first.")
     if path.exists() and not overwrite:
-        raise ExportError(f"{path} exists: choose another name, or replace it with --overwrite.")
+        raise ExportError(f"{path} already exists: choose another name, or replace it with --overwrite.")
     if path.is_dir():
-        raise ExportError(f"{path} is a folder, which is never replaced: choose another name.")
+        raise ExportError(f"{path} is a folder, and a folder is never replaced: choose another name.")
 
 
 def write_whole(path: Path, write: Callable[[Path], None], overwrite: bool = False) -> None:
-    """Let ``write`` fill a file or folder of that name, with what else belongs to it, in a temporary folder beside
-    ``path``; then move everything, ``path`` last. Raises ExportError."""
+    """Let ``write`` fill a file or folder of that name, and its companion files, in a temporary folder next to it.
+    Then move everything, ``path`` last. Raises ExportError."""
     refuse_existing(path, overwrite)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{_TEMPORARY}")
     try:

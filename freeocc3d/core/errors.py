@@ -1,10 +1,10 @@
-"""The one family of errors that library code raises; each message says what, where, and what to do."""
+"""The errors that library code raises. Each message says what happened, where, and what to do."""
 
 from __future__ import annotations
 
 
 class FreeOccError(Exception):
-    """A known failure, told in one sentence that a user can act on. The command line prints it and exits with 1."""
+    """A known failure, with a message that a user can act on. The command line prints the message and exits with 1."""
 
 
 class CaptureError(FreeOccError):
@@ -16,7 +16,7 @@ class FrameError(CaptureError):
 
 
 class ConfigError(FreeOccError):
-    """A configuration names an unknown key or backend, or gives a value of the wrong type or range."""
+    """An option has an unknown name, or a value of the wrong type or out of range; or a backend is unknown."""
 
 
 class DependencyError(FreeOccError):
@@ -24,20 +24,20 @@ class DependencyError(FreeOccError):
 
 
 class ModelError(FreeOccError):
-    """A model package is missing, damaged, or not of the form that an encoder needs."""
+    """A model package is missing, damaged, or not in the form that an encoder needs."""
 
 
 class TrackingError(FreeOccError):
-    """No usable trajectory could be estimated."""
+    """The tracker cannot estimate a usable trajectory."""
 
 
 class MapError(FreeOccError):
-    """A map folder is missing, damaged, from a newer version, or in the way of a new one."""
+    """A map folder is missing, damaged or from a newer version, or it exists where a new map should go."""
 
 
 class ExportError(FreeOccError):
-    """An export cannot be written: unknown format, unusable target, nothing to export."""
+    """An export cannot be written: the format is unknown, the target unusable, or there is nothing to export."""
 
 
 class Interrupted(FreeOccError):
-    """The user stopped a run; the work done so far is kept and can be resumed."""
+    """The user stopped a run. The work done so far is kept, and the run can be resumed."""

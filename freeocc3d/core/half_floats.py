@@ -1,4 +1,4 @@
-"""Half floats to single ones in compiled code, which numba has no type for: NumPy takes four times as long."""
+"""Converts half floats to single floats in compiled code. Numba has no half float; NumPy takes four times as long."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 @njit(cache=True, nogil=True)
 def widen_halves(halves: NDArray[np.uint16], bits: NDArray[np.int32], wide: NDArray[np.float32]) -> None:
-    """Write (D,) finite float16, given by their bits, to ``wide``, whose memory ``bits`` is. Exact, for exponents are
-    smaller by 112 until they are scaled."""
+    """Write (D,) finite float16, given as bits, to ``wide``. ``bits`` is the same memory as ``wide``.
+
+    Exact: the exponents are too small by 112 until the scaling corrects them."""
     for d in range(len(halves)):
         bits[d] = (np.int32(halves[d] & 0x7FFF) << 13) | (np.int32(halves[d] >> 15) << 31)
     for d in range(len(halves)):

@@ -1,4 +1,4 @@
-"""Open-addressing hash tables of 64-bit keys for compiled code: arrays whose size is a power of two, -1 = empty."""
+"""Open-addressing hash tables of 64-bit keys for compiled code. A table is an array of 2^n keys; -1 = empty slot."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ packed_key = njit(cache=True, nogil=True)(pack_index)
 
 @njit(cache=True, nogil=True)
 def find_slot(table: NDArray[np.int64], key: int) -> int:
-    """Where ``key`` stands, or would be put."""
+    """The slot of ``key``, or the empty slot where it belongs."""
     mask = len(table) - 1
     at = (((key * -7046029254386353131) & 0x7FFFFFFFFFFFFFFF) >> 20) & mask  # Fibonacci hashing
     while table[at] != -1 and table[at] != key:
@@ -24,7 +24,7 @@ def find_slot(table: NDArray[np.int64], key: int) -> int:
 
 @njit(cache=True, nogil=True)
 def put_key(table: NDArray[np.int64], count: int, key: int) -> tuple[NDArray[np.int64], int]:
-    """Add a key to a set, which may move: (table, number of keys)."""
+    """Add a key to a set. Returns (table, number of keys); a full table is replaced by a larger one."""
     at = find_slot(table, key)
     if table[at] == key:
         return table, count
@@ -40,7 +40,7 @@ def put_key(table: NDArray[np.int64], count: int, key: int) -> tuple[NDArray[np.
 
 @njit(cache=True, nogil=True)
 def build_table(keys: NDArray[np.int64], room: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """A table from each of the keys to its row, with room for a number of keys: (table of keys, rows beside them)."""
+    """Map each key to its row: (table of keys, row in each slot), with space for ``room`` keys."""
     size = 1024
     while size < 2 * room + 1:
         size *= 2
@@ -55,6 +55,6 @@ def build_table(keys: NDArray[np.int64], room: int) -> tuple[NDArray[np.int64], 
 
 @njit(cache=True, nogil=True)
 def find_row(table: NDArray[np.int64], rows: NDArray[np.int32], key: int) -> int:
-    """Row of ``key``, -1 if it is not there."""
+    """Row of ``key``; -1 if the table does not hold it."""
     at = find_slot(table, key)
     return rows[at] if table[at] == key else -1

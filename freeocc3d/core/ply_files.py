@@ -1,7 +1,7 @@
-"""PLY files: vertices as records, read after the header is checked against the file's size, and written.
+"""Reads and writes PLY files with vertices as records. The header is checked against the file's size before reading.
 
-Source: G. Turk, The PLY Polygon File Format, 1994. Of the libraries, Open3D's readers change some properties of
-Gaussians to natural units, which ones depending on its version; plyfile's license (GPL) does not go with this one's.
+Source: G. Turk, The PLY Polygon File Format, 1994. Open3D's readers are not used for Gaussians, because they convert
+some properties to natural units, depending on the version. plyfile is not used, because its license is the GPL.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """form: such as "binary_little_endian".  elements: (name, count, lines of its properties, split into words) each.
-    length: of the header in bytes."""
+    """form: such as "binary_little_endian".  elements: (name, count, property lines, split into words) of each.
+    length: bytes of the header."""
 
     form: str
     elements: tuple[tuple[str, int, tuple[tuple[str, ...], ...]], ...]
@@ -36,7 +36,7 @@ class PlyHeader:
 
     @property
     def least_bytes(self) -> int:
-        """What the elements take at least: of a list only its length, of a number in text a digit and a space."""
+        """Lower bound of the elements' size. A list counts as its length field, a number in text as two characters."""
         total = 0
         for _, count, properties in self.elements:
             kinds = [line[1] if line[0] == "list" else line[0] for line in properties]
@@ -45,7 +45,7 @@ class PlyHeader:
 
 
 def read_ply_header(path: Path) -> PlyHeader:
-    """Raises FreeOccError: no such file, not a PLY, or the file is smaller than its header states."""
+    """Read the header. Raises FreeOccError: no such file, not a PLY file, or smaller than its header states."""
     try:
         with path.open("rb") as stream:
             text, end, _ = stream.read(_LONGEST_HEADER).partition(b"end_header")
@@ -74,19 +74,19 @@ def read_ply_header(path: Path) -> PlyHeader:
     listed = tuple((name, count, tuple(properties)) for name, count, properties in elements)
     header = PlyHeader(form, listed, len(text) + len(end) + len(ending))
     if min(count for _, count, _ in elements) < 0 or header.length + header.least_bytes > size:
-        raise FreeOccError(f"{path} is damaged: its header states more than the {size} bytes that it has.")
+        raise FreeOccError(f"{path} is damaged: its header states more data than the {size} bytes of the file.")
     return header
 
 
 def read_ply_vertices(path: Path) -> NDArray[np.void]:
-    """(N,) the vertices of a binary PLY as records of their properties. Raises FreeOccError."""
+    """(N,) vertices of a binary PLY file, as records of their properties. Raises FreeOccError."""
     header = read_ply_header(path)
     name, count, properties = header.elements[0]
     names = [line[-1] for line in properties]
     if name != "vertex" or len(set(names)) < len(names):
         raise FreeOccError(f"{path} is not a PLY file whose first element is 'vertex'.")
     if header.form not in _ORDERS or any(len(line) != 2 for line in properties):
-        raise FreeOccError(f"{path} is a PLY of the form '{header.form}'; only binary ones without lists are read.")
+        raise FreeOccError(f"{path} is a PLY file of form '{header.form}': convert it to a binary one without lists.")
     if not count:
         raise FreeOccError(f"{path} is damaged or empty: its header states 0 vertices.")
     dtype = np.dtype([(name, _ORDERS[header.form] + _TYPES[kind]) for kind, name in properties])
@@ -96,7 +96,7 @@ def read_ply_vertices(path: Path) -> NDArray[np.void]:
 def write_ply(
     path: Path, vertices: NDArray[np.void], quads: NDArray[np.int32] | None = None, comments: Sequence[str] = ()
 ) -> None:
-    """Binary little-endian PLY of (N,) records of numbers and, if given, (Q, 4) quads of their rows. Raises OSError."""
+    """Write a binary little-endian PLY file of (N,) records and, if given, (Q, 4) quads of rows. Raises OSError."""
     kinds = {name: vertices.dtype[name].str[1:] for name in vertices.dtype.names or ()}
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
     header += [f"element vertex {len(vertices)}", *(f"property {_NAMES[kind]} {name}" for name, kind in kinds.items())]

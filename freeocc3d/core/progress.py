@@ -1,16 +1,16 @@
-"""How a long job tells what it is doing: the silent twin here, the one that prints in ``cli``."""
+"""How a long job reports its progress. The class here is silent; ``cli`` has the one that prints."""
 
 from __future__ import annotations
 
 
 class Progress:
-    """Told of stages, steps and warnings; this one says nothing."""
+    """Receives stages, steps and warnings, and ignores them."""
 
     def stage(self, name: str, total: int | None = None) -> None:
         """A stage of ``total`` steps begins."""
 
     def advance(self, done: int) -> None:
-        """``done`` steps of the present stage are finished."""
+        """``done`` steps of the current stage are finished."""
 
     def warn(self, text: str) -> None:
-        """Something that the user should know."""
+        """The user should know ``text``."""

@@ -1,4 +1,4 @@
-"""How many threads this process may run at the same time."""
+"""Counts the processors that this process may use."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ _MOUNT = Path("/sys/fs/cgroup")
 
 
 def count_threads() -> int:
-    """Processors that this process may use, at least 1: those of its affinity, but no more than the CPU quota of its
-    control groups, rounded up, as containers set it (``docker run --cpus``)."""
+    """Number of processors that this process may use, at least 1: those of its affinity, limited by the CPU quota of
+    its control groups, rounded up. Containers set this quota (``docker run --cpus``)."""
     allowed = len(os.sched_getaffinity(0))
     return max(1, min([allowed, *(math.ceil(quota) for quota in _quotas(Path("/proc/self/cgroup"), _MOUNT))]))
 
 
 def _quotas(membership: Path, mount: Path) -> Iterator[float]:
-    """Processors that each control group around this process allows, where it limits them.
+    """Yield the number of processors that each control group of this process allows, if it sets a limit.
 
-    membership: lines of hierarchy:controllers:path (man 7 cgroups).  mount: where the hierarchies are mounted.
+    membership: lines of hierarchy:controllers:path (man 7 cgroups).  mount: mount point of the hierarchies.
     """
     for line in (_read(membership) or "").splitlines():
         _, _, rest = line.partition(":")

@@ -14,7 +14,7 @@ Array = NDArray[Any]
 
 
 def invert(T_a_b: Array) -> Array:
-    """Inverse of rigid transforms, (..., 4, 4) to (..., 4, 4): T_b_a."""
+    """Invert rigid transforms: (..., 4, 4) T_a_b to (..., 4, 4) T_b_a."""
     R = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
     out = np.zeros_like(T_a_b)
     out[..., :3, :3] = R
@@ -24,7 +24,7 @@ def invert(T_a_b: Array) -> Array:
 
 
 def transform(T_a_b: Array, points_b: Array) -> Array:
-    """Move points: (4, 4), (..., 3) in frame b to (..., 3) in frame a, in the points' dtype."""
+    """Transform points (..., 3) from frame b to frame a by (4, 4) T_a_b. Keeps the points' dtype."""
     T = np.asarray(T_a_b, points_b.dtype)
     return points_b @ T[:3, :3].T + T[:3, 3]
 
@@ -39,7 +39,7 @@ def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
 
 def nearest_rigid(T: Array) -> Array:
     """The rigid (4, 4) transform whose rotation is closest to that of ``T`` in the Frobenius norm. Composing estimates
-    doubles a rotation's departure from orthonormality at every frame, so an estimate is brought back before it is used.
+    doubles the orthonormality error of a rotation at every frame, so each estimate is corrected before use.
     """
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)
@@ -49,7 +49,7 @@ def nearest_rigid(T: Array) -> Array:
 
 
 def quats_to_rotations(quats_wxyz: ArrayLike) -> Array:
-    """Unit quaternions (..., 4) wxyz to rotation matrices (..., 3, 3)."""
+    """Convert unit quaternions (..., 4) wxyz to rotation matrices (..., 3, 3)."""
     w, x, y, z = np.moveaxis(np.asarray(quats_wxyz), -1, 0)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -60,8 +60,8 @@ def quats_to_rotations(quats_wxyz: ArrayLike) -> Array:
 
 
 def rotations_to_quats(R: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) to unit quaternions (..., 4) wxyz with w >= 0 (Shepperd's method: the largest of
-    the four squared components is computed first, so that nothing is divided by a small number)."""
+    """Convert rotation matrices (..., 3, 3) to unit quaternions (..., 4) wxyz with w >= 0. Shepperd's method computes
+    the largest squared component first, to avoid a division by a small number."""
     R = np.asarray(R)
     m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     squares = np.stack((1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22), -1)
@@ -98,7 +98,7 @@ def multiply_quats(a_wxyz: Array, b_wxyz: Array) -> Array:
 
 
 def project(points_cam: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
-    """Camera-frame points (..., 3) to pixels (..., 2) and depths (...,); points at or behind the camera give NaN."""
+    """Project camera-frame points (..., 3) to pixels (..., 2) and depths (...,). Pixels are NaN where z <= 0."""
     z = points_cam[..., 2]
     safe = np.where(z > 0, z, np.nan)
     u = intrinsics.fx * points_cam[..., 0] / safe + intrinsics.cx
@@ -107,23 +107,23 @@ def project(points_cam: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
 
 
 def back_project(pixels: Array, depth_m: Array, intrinsics: Intrinsics) -> Array:
-    """Pixels (..., 2) and depths (...,) in meters to camera-frame points (..., 3)."""
+    """Back-project pixels (..., 2) with depths (...,) in meters to camera-frame points (..., 3)."""
     x = (pixels[..., 0] - intrinsics.cx) / intrinsics.fx * depth_m
     y = (pixels[..., 1] - intrinsics.cy) / intrinsics.fy * depth_m
     return np.stack((x, y, depth_m), axis=-1)
 
 
 _STRAIGHT = 0.005
-"""Points whose second principal spread is a smaller share of the first lie on a line: what turns them about it is a
-trajectory's jitter, not its shape."""
+"""Points lie on a line if their second principal spread is a smaller share of the first. The rotation about that line
+would come from the jitter of the trajectory, not from its shape."""
 
 
 def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Array, Array]:
     """The similarity (s, R, t) that minimizes sum |target - (s R source + t)|^2 over (N, 3) point pairs.
 
     Source: S. Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point Patterns, PAMI 1991;
-    equation numbers below are that paper's. Raises FreeOccError for fewer than three pairs or collinear points, for
-    which the rotation is not determined.
+    equation numbers below are from that paper. Raises FreeOccError for fewer than three pairs or for collinear points,
+    which do not determine the rotation.
     """
     if len(source) < 3:
         raise FreeOccError(f"Alignment needs at least 3 matched poses, got {len(source)}: check that timestamps match.")
@@ -134,7 +134,7 @@ def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Arra
     for points in (centered_source, centered_target):
         spread = np.linalg.svd(points, compute_uv=False)
         if spread[1] <= _STRAIGHT * spread[0]:
-            raise FreeOccError("Alignment is not determined: the camera centers are identical or lie on one line.")
+            raise FreeOccError("Alignment is not determined: all camera centers lie at one point or on one line.")
     U, D, Vt = np.linalg.svd(covariance)
     S = np.eye(3)
     if np.linalg.det(U) * np.linalg.det(Vt) < 0:
@@ -145,7 +145,7 @@ def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Arra
 
 
 def measure_pose_difference(T_a: Array, T_b: Array) -> tuple[float, float]:
-    """How far two poses of one thing are from each other: meters and degrees."""
+    """Difference of two poses of the same object: meters and degrees."""
     difference = invert(T_a) @ T_b
     cosine = np.clip(0.5 * (np.trace(difference[:3, :3]) - 1.0), -1.0, 1.0)
     return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(np.arccos(cosine)))

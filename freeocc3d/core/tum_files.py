@@ -1,5 +1,5 @@
-"""Trajectories in the form of the TUM RGB-D benchmark: ``timestamp tx ty tz qx qy qz qw``, one camera-to-world pose a
-line.
+"""Reads and writes trajectories in the format of the TUM RGB-D benchmark. Each line is one camera-to-world pose:
+``timestamp tx ty tz qx qy qz qw``.
 
 Source: J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
 """
@@ -15,7 +15,7 @@ from .transforms import quats_to_rotations, rotations_to_quats
 from .types import Trajectory
 
 NUMBERS = 8
-"""Numbers on a line."""
+"""Numbers per line."""
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes, meters, seconds)"
 
@@ -34,14 +34,14 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 
 def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(M,) timestamps and (M, 4, 4) poses of a file. Raises OSError, and ValueError with what is wrong."""
+    """Read (M,) timestamps and (M, 4, 4) poses. Raises OSError, or ValueError that says what is wrong."""
     lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
     rows = [line for line in lines if line and not line[0].startswith("#")]
     return tum_poses(rows)
 
 
 def tum_poses(rows: list[list[str]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(M,) timestamps and (M, 4, 4) poses of M lines, split into words. Raises ValueError with what is wrong."""
+    """(M,) timestamps and (M, 4, 4) poses from M lines, split into words. Raises ValueError that says what is wrong."""
     if any(len(row) != NUMBERS for row in rows):
         raise ValueError(f"a line does not hold {NUMBERS} numbers")
     table = np.array(rows, np.float64).reshape(-1, NUMBERS)
@@ -50,7 +50,7 @@ def tum_poses(rows: list[list[str]]) -> tuple[NDArray[np.float64], NDArray[np.fl
     quats_wxyz = table[:, [7, 4, 5, 6]]
     lengths = np.linalg.norm(quats_wxyz, axis=1, keepdims=True)
     if (lengths == 0).any():
-        raise ValueError("a quaternion is all zeros, which is no rotation")
+        raise ValueError("a quaternion is all zeros")
     T = np.tile(np.eye(4), (len(table), 1, 1))
     T[:, :3, 3] = table[:, 1:4]
     T[:, :3, :3] = quats_to_rotations(quats_wxyz / lengths)

@@ -1,4 +1,4 @@
-"""What a user should know of a run: a code by which programs recognize it, and a text for people."""
+"""Warnings about a run: a code for programs and a text for people."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ Code = Literal[
     "vocabulary-empty-answers",
     "uncoded",
 ]
-"""What a warning is about; "uncoded" are those of maps that were made when warnings were plain texts."""
+"""What a warning is about. "uncoded" is a warning of an older map, where warnings are plain texts."""
 
 
 class Notice(NamedTuple):
-    """One warning. text: sentences that say what happened and what can be done."""
+    """One warning. text: sentences that say what happened and what to do."""
 
     code: Code
     text: str
 
     def to_dict(self) -> dict[str, str]:
-        """As report.json keeps it."""
+        """The form in report.json."""
         return {"code": self.code, "text": self.text}
 
 
 def read_notices(stored: Iterable[Any]) -> list[Notice]:
-    """The inverse of ``Notice.to_dict`` for a whole list; plain texts, which older maps hold, are "uncoded"."""
+    """The inverse of ``Notice.to_dict`` for a list. The plain texts of older maps become "uncoded"."""
     return [Notice("uncoded", one) if isinstance(one, str) else Notice(one["code"], one["text"]) for one in stored]

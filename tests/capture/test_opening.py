@@ -31,7 +31,7 @@ def test_no_folder_and_no_directory(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"There is no folder .*nowhere"):
         open_capture(tmp_path / "nowhere")
     (tmp_path / "scan.zip").write_bytes(b"")
-    with pytest.raises(CaptureError, match=r"scan\.zip is no video that can be read"):
+    with pytest.raises(CaptureError, match=r"scan\.zip is not a readable video"):
         open_capture(tmp_path / "scan.zip")
 
 
@@ -52,7 +52,7 @@ def test_the_folder_above_a_capture_points_to_it(tmp_path: Path) -> None:
 def test_a_folder_of_two_formats_has_to_be_named(tmp_path: Path) -> None:
     write_replica(tmp_path, 1)
     write_scannet(tmp_path, 1)
-    with pytest.raises(CaptureError, match=r"like replica and like scannet: name one with capture\.format"):
+    with pytest.raises(CaptureError, match=r"of the format replica or scannet: choose one with capture\.format"):
         open_capture(tmp_path)
     assert open_capture(tmp_path, Options(format="scannet")).format == "scannet"
 

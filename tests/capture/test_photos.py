@@ -167,7 +167,7 @@ def test_images_of_other_sizes_are_left_out_with_a_warning(tmp_path: Path) -> No
     (warning,) = capture.warnings
     assert warning.code == "images-left-out"
     assert "1 of the 6 images" in warning.text
-    assert "is left out, the first IMG_11.jpg of 80 x 60 pixels: the others have 64 x 48" in warning.text
+    assert "is left out, first IMG_11.jpg with 80 x 60 pixels: the others have 64 x 48" in warning.text
     assert capture[2].color.shape == (48, 64, 3)
     with pytest.raises(FrameError, match=r"IMG_12\.jpg is not a readable image"):
         capture[3]
@@ -178,7 +178,7 @@ def test_images_of_other_sizes_are_left_out_with_a_warning(tmp_path: Path) -> No
 def test_images_of_which_no_two_have_one_size_are_refused(tmp_path: Path) -> None:
     for index in range(3):
         write_photo(tmp_path / f"{index}.jpg", size=(64, 48 + 2 * index))
-    with pytest.raises(CaptureError, match=r"The 3 images of .* have as many sizes, but a scan is of one camera"):
+    with pytest.raises(CaptureError, match=r"The 3 images of .* all have different sizes, but a scan needs one camera"):
         open_capture(tmp_path)
 
 
@@ -199,11 +199,11 @@ def test_damaged_images_are_broken_frames(tmp_path: Path) -> None:
 
 def test_too_few_and_what_phones_write_are_told(tmp_path: Path) -> None:
     write_photo(tmp_path / "one" / "IMG_1.jpg")
-    with pytest.raises(CaptureError, match=r"holds one image, IMG_1\.jpg: a scan needs many"):
+    with pytest.raises(CaptureError, match=r"holds only one image, IMG_1\.jpg: a scan needs many"):
         open_capture(tmp_path / "one")
     (tmp_path / "phone").mkdir()
     (tmp_path / "phone" / "IMG_1.HEIC").write_bytes(b"")
-    with pytest.raises(CaptureError, match=r"IMG_1\.HEIC and the like, which cannot be decoded here: convert them"):
+    with pytest.raises(CaptureError, match=r"IMG_1\.HEIC and similar files, which cannot be decoded: convert them"):
         open_capture(tmp_path / "phone")
 
 

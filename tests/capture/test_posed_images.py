@@ -112,13 +112,13 @@ def broken_nerfstudio(folder: Path, key: str, value: object, frame: bool) -> Non
 @pytest.mark.parametrize(
     ("key", "value", "frame", "said"),
     [
-        ("camera_model", "EQUIRECTANGULAR", False, "camera model EQUIRECTANGULAR, which is not read"),
-        ("fl_x", "wide", False, "intrinsics that are no numbers"),
+        ("camera_model", "EQUIRECTANGULAR", False, "camera model EQUIRECTANGULAR, which is not supported"),
+        ("fl_x", "wide", False, "intrinsics that are not numbers"),
         ("fl_x", None, False, "states no focal length"),
         ("k4", 0.1, False, "states k4"),
-        ("file_path", "../../elsewhere.png", True, "lies outside of"),
-        ("transform_matrix", [[1, 2], [3, 4]], True, "is no trajectory"),
-        ("frames", [], False, "no trajectory|holds 0 images"),
+        ("file_path", "../../elsewhere.png", True, "lies outside "),
+        ("transform_matrix", [[1, 2], [3, 4]], True, "is not a trajectory"),
+        ("frames", [], False, "not a trajectory|holds 0 images"),
     ],
 )
 def test_what_nerfstudio_files_lack_is_told(tmp_path: Path, key: str, value: object, frame: bool, said: str) -> None:
@@ -135,7 +135,7 @@ def test_an_image_that_is_missing_or_does_not_fit_its_camera_is_a_broken_frame(t
     capture = open_capture(tmp_path)
     with pytest.raises(FrameError, match=r"Cannot read .*frame_0\.png"):
         capture[0]
-    with pytest.raises(FrameError, match=r"frame_1\.png has 24 x 32 pixels, its camera 32 x 24"):
+    with pytest.raises(FrameError, match=r"frame_1\.png has 24 x 32 pixels, but its camera has 32 x 24"):
         capture[1]
     assert capture[2].intrinsics == Intrinsics(32, 24, 32.0, 32.0, 15.5, 11.5).resized(16, 12)
 
@@ -167,16 +167,16 @@ def test_true_poses_of_a_reconstruction_are_those_of_the_numbers_in_its_names(tm
 
 def test_damaged_models_and_cameras_that_are_not_read_are_told(tmp_path: Path) -> None:
     write_colmap(tmp_path / "fov", 2, camera="FOV 32 24 30 30 16 12 0.5")
-    with pytest.raises(CaptureError, match="model FOV, which is not read: undistort"):
+    with pytest.raises(CaptureError, match="model FOV, which is not supported: undistort"):
         open_capture(tmp_path / "fov")
     write_colmap(tmp_path / "cut", 2)
     (tmp_path / "cut" / "sparse" / "0" / "cameras.txt").unlink()
-    with pytest.raises(CaptureError, match="is no COLMAP model"):
+    with pytest.raises(CaptureError, match="holds no readable COLMAP model"):
         open_capture(tmp_path / "cut")
     write_colmap(tmp_path / "outside", 2)
     images = tmp_path / "outside" / "sparse" / "0" / "images.txt"
     images.write_text(images.read_text().replace("view1.png", "../../../view1.png"))
-    with pytest.raises(CaptureError, match="lies outside of"):
+    with pytest.raises(CaptureError, match="lies outside "):
         open_capture(tmp_path / "outside")
 
 

@@ -105,7 +105,7 @@ def test_parameters_for_another_size_of_the_same_view_are_rescaled(tmp_path: Pat
         ({"fx": 0.0}, "unusable intrinsics"),
         ({"cy": float("nan")}, "unusable intrinsics"),
         ({"fx": "wide"}, "all numbers"),
-        ({"w": 32, "h": 32}, "for images of 32 x 32 pixels, but they have 32 x 24"),
+        ({"w": 32, "h": 32}, "for images of 32 x 32 pixels, but the images have 32 x 24"),
         ({"w": float("nan")}, "w and h"),
         ({"scale": 0}, "scale must be a positive"),
     ],
@@ -129,7 +129,7 @@ def test_a_parameter_file_of_another_kind_is_named(tmp_path: Path, content: str)
 def test_without_parameters_the_options_can_state_them(tmp_path: Path) -> None:
     write_replica(tmp_path / "office0", 1)
     (tmp_path / "office0" / "cam_params.json").unlink()
-    with pytest.raises(CaptureError, match=r"no cam_params\.json in .* or beside it"):
+    with pytest.raises(CaptureError, match=r"no cam_params\.json in .* or its parent folder"):
         Reader(tmp_path / "office0", Options())
     frame = Reader(tmp_path / "office0", Options(intrinsics=(32.0, 32.0, 15.5, 11.5)))[0]
     assert frame.depth_m.max() == pytest.approx(2.0, abs=1e-4)

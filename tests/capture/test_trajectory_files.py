@@ -137,18 +137,22 @@ def test_names_are_matched_by_their_numbers_where_they_differ(scan) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("a.txt", "", "is no trajectory"),
-        ("a.txt", "1 2 3\n", "is no trajectory"),
-        ("a.txt", "0 0 0 0 0 0 0 0\n", "is no trajectory"),
-        ("a.txt", "0 1 2 nan 0 0 0 1\n", "is no trajectory"),
-        ("a.txt", "2 " * 16, "no rigid"),
-        ("a.txt", "\x00\xff", "is no trajectory"),
-        ("a.log", "-1 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "is no trajectory"),
-        ("a.log", "99999999999 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "is no trajectory"),
-        ("transforms.json", "{}", "is no trajectory"),
-        ("transforms.json", "[1, 2]", "is no trajectory"),
-        ("transforms.json", '{"frames": [{"file_path": "a.png", "transform_matrix": [[1, 2]]}]}', "is no trajectory"),
-        ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n", "no COLMAP model"),
+        ("a.txt", "", "is not a trajectory"),
+        ("a.txt", "1 2 3\n", "is not a trajectory"),
+        ("a.txt", "0 0 0 0 0 0 0 0\n", "is not a trajectory"),
+        ("a.txt", "0 1 2 nan 0 0 0 1\n", "is not a trajectory"),
+        ("a.txt", "2 " * 16, "not a rigid"),
+        ("a.txt", "\x00\xff", "is not a trajectory"),
+        ("a.log", "-1 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "is not a trajectory"),
+        ("a.log", "99999999999 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "is not a trajectory"),
+        ("transforms.json", "{}", "is not a trajectory"),
+        ("transforms.json", "[1, 2]", "is not a trajectory"),
+        (
+            "transforms.json",
+            '{"frames": [{"file_path": "a.png", "transform_matrix": [[1, 2]]}]}',
+            "is not a trajectory",
+        ),
+        ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n", "no readable COLMAP model"),
     ],
 )
 def test_what_is_no_trajectory_is_told_in_a_sentence(tmp_path, name, text, said) -> None:
@@ -158,7 +162,7 @@ def test_what_is_no_trajectory_is_told_in_a_sentence(tmp_path, name, text, said)
 
 
 def test_missing_files_and_folders_without_poses(tmp_path) -> None:
-    with pytest.raises(CaptureError, match="There is no trajectory"):
+    with pytest.raises(CaptureError, match="There is not a trajectory"):
         read_trajectory(tmp_path / "absent.txt")
     with pytest.raises(CaptureError, match="holds no trajectory"):
         read_trajectory(tmp_path)
@@ -226,7 +230,7 @@ def test_options_are_checked(scan, tmp_path) -> None:
     with pytest.raises(CaptureError, match="no point cloud"):
         file.load(file.Options(path=path, points=str(tmp_path / "absent.ply")), scan)
     (tmp_path / "bad.ply").write_text("hello")
-    with pytest.raises(CaptureError, match="holds no points"):
+    with pytest.raises(CaptureError, match="is not a PLY file"):
         file.load(file.Options(path=path, points=str(tmp_path / "bad.ply")), scan)
 
 

@@ -111,16 +111,16 @@ def test_ascending_reading_decodes_each_frame_once(tmp_path: Path, monkeypatch: 
 def test_what_is_no_video_is_told_in_a_sentence(tmp_path: Path) -> None:
     notes = tmp_path / "notes.mp4"
     notes.write_text("no video at all\n" * 50)
-    with pytest.raises(CaptureError, match=r"notes\.mp4 is no video that can be read"):
+    with pytest.raises(CaptureError, match=r"notes\.mp4 is not a readable video"):
         open_capture(notes)
     (tmp_path / "empty.mp4").touch()
-    with pytest.raises(CaptureError, match=r"empty\.mp4 is no video that can be read"):
+    with pytest.raises(CaptureError, match=r"empty\.mp4 is not a readable video"):
         open_capture(tmp_path / "empty.mp4")
     cut = write_video(tmp_path / "cut.mp4")  # its list of frames, which mp4 has at the end, is lost
     truncate(cut)
-    with pytest.raises(CaptureError, match=r"cut\.mp4 is no video that can be read"):
+    with pytest.raises(CaptureError, match=r"cut\.mp4 is not a readable video"):
         open_capture(cut)
-    with pytest.raises(CaptureError, match=r"one\.mp4 is no video that can be used: it holds 1 frame\. Is it cut off"):
+    with pytest.raises(CaptureError, match=r"one\.mp4 is not a usable video: it holds 1 frame\. Is it cut off"):
         open_capture(write_video(tmp_path / "one.mp4", count=1))
 
 

@@ -23,7 +23,7 @@ def test_tum_poses_come_back(tmp_path) -> None:
     ("line", "said"),
     [
         ("1 2 3", "8 numbers"),
-        ("0 0 0 0 0 0 0 0", "no rotation"),
+        ("0 0 0 0 0 0 0 0", "a quaternion is all zeros"),
         ("0 0 0 nan 0 0 0 1", "not finite"),
         ("a " * 8, "convert"),
     ],

@@ -207,7 +207,7 @@ def test_truth_and_maps_that_do_not_fit_are_told_in_a_sentence(bedroom: Path, tm
     assert run("evaluate", bedroom, "--grid", truth, code=2).stderr
     assert run("evaluate", code=2).stderr
     (tmp_path / "zero.txt").write_text("".join(f"{i} {i} {i * i} 0 0 0 0 0\n" for i in range(20)))
-    assert "is no trajectory" in refused("evaluate", bedroom, "--poses", tmp_path / "zero.txt")
+    assert "is not a trajectory" in refused("evaluate", bedroom, "--poses", tmp_path / "zero.txt")
     assert "There is no" in refused("evaluate", "--gaussians", tmp_path / "absent.ply", "--ground-truth", truth)
     assert "there is no folder" in refused("evaluate", bedroom, "--html", tmp_path / "absent" / "page.html")
     arrays = dict(np.load(truth))

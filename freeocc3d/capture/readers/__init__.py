@@ -1,1 +1,1 @@
-"""Readers of captures, one file for each format; ../base.py is their contract."""
+"""Readers of captures, one file per format; ``../base.py`` defines their contract."""

@@ -1,4 +1,4 @@
-"""COLMAP project folders: images/ with a model in sparse/0, sparse or the folder itself, instead of running COLMAP."""
+"""Reads COLMAP project folders: images/ with an existing model in sparse/0, sparse, 0 or the folder itself."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ REQUIRES: tuple[str, ...] = ("pycolmap",)
 
 
 class Reader(PosedImages):
-    """The registered images, in the natural order of their names. There is no depth.
+    """The registered images, in natural order of their names. There is no depth.
 
-    The model's unit is arbitrary: ``capture.scale`` says how many meters it is; without it, the model is scaled such
-    that the sparse points have a median depth of ``NOMINAL_DEPTH``. Raises CaptureError: a damaged model, a camera that
-    cannot be undistorted.
+    The unit of the model is arbitrary. ``capture.scale`` gives meters per unit; without it, the scale gives the sparse
+    points a median depth of ``NOMINAL_DEPTH``. Raises CaptureError for a damaged model or an unsupported camera.
     """
 
     format = "colmap_model"
@@ -30,7 +29,7 @@ class Reader(PosedImages):
     def __init__(self, path: Path, options: Options):
         folder = colmap_folder(path)
         if folder is None:
-            raise CaptureError(f"{path} holds no COLMAP model: {self.layout}.")
+            raise CaptureError(f"{path} holds no COLMAP model: expected {self.layout}.")
         model = read_colmap_model(folder)
         lenses = {number: colmap_lens(camera, str(folder)) for number, camera in model.cameras.items()}
         posed = []

@@ -1,4 +1,4 @@
-"""nerfstudio folders: transforms.json with images, poses and, as exported by LiDAR apps, depth.
+"""Reads nerfstudio folders: transforms.json with images, poses and, from LiDAR apps, depth.
 
 Source: nerfstudio's "Data conventions".
 """
@@ -28,16 +28,16 @@ REQUIRES: tuple[str, ...] = ()
 TRANSFORMS = "transforms.json"
 
 _WITH_ALL_COEFFICIENTS = (*PINHOLE_MODELS, *BROWN_MODELS)
-"""nerfstudio applies whatever coefficients a file states, whatever it calls the model."""
+"""Models for which nerfstudio applies all stated coefficients, whichever of these names the file gives."""
 
 
 class Reader(PosedImages):
-    """Frames are in the natural order of their files' names. Intrinsics stand in the file or in each frame, with the
-    origin at the corner of the first pixel; poses are of OpenGL cameras; depth is 16-bit millimeters, of any size.
+    """Frames are in natural order of their file names. The file or each frame states intrinsics, with the origin at the
+    corner of the first pixel. Poses are of OpenGL cameras. Depth is 16-bit millimeters, of any size.
 
-    Poses that come with depth are in meters, whether it is read or not; others are in the file's unit, of which
-    ``capture.scale`` says how many meters it is; without it, the file's points, if it has any, are scaled to a median
-    depth of ``NOMINAL_DEPTH``. Raises CaptureError, naming the file, for what it lacks.
+    If the file names depth, poses are in meters, even if depth is not read. Otherwise ``capture.scale`` gives meters
+    per unit; without it, the file's points, if any, are scaled to a median depth of ``NOMINAL_DEPTH``. Raises
+    CaptureError that names the file and what it lacks.
     """
 
     format = "nerfstudio"
@@ -46,7 +46,7 @@ class Reader(PosedImages):
     def __init__(self, path: Path, options: Options):
         file = path / TRANSFORMS
         content = read_json(file)
-        poses = read_trajectory(file).T_world_cam  # checks that there are frames with paths and poses
+        poses = read_trajectory(file).T_world_cam  # also checks that frames have paths and poses
         posed = []
         for frame, T_world_cam in zip(content["frames"], poses, strict=True):
             image = resolve_inside(path, str(frame["file_path"]), file)
@@ -69,7 +69,7 @@ class Reader(PosedImages):
 
 
 def _points(file: Path) -> NDArray[np.float64]:
-    """(P, 3), of a PLY file; none if it is not there or damaged, for they are not needed."""
+    """(P, 3) points of a PLY file. Points are optional: a missing or damaged file gives none."""
     try:
         return read_points(file)
     except CaptureError:
@@ -77,7 +77,7 @@ def _points(file: Path) -> NDArray[np.float64]:
 
 
 def _lens(stated: Mapping[str, Any], image: Path, file: Path) -> Lens:
-    """Raises CaptureError."""
+    """The lens that a frame states. Raises CaptureError."""
     model = "OPENCV_FISHEYE" if stated.get("is_fisheye") else str(stated.get("camera_model", "OPENCV")).upper()
     model = "OPENCV" if model in _WITH_ALL_COEFFICIENTS else model
     try:
@@ -93,8 +93,8 @@ def _lens(stated: Mapping[str, Any], image: Path, file: Path) -> Lens:
         names = ("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "k3", "k4", "p1", "p2")
         coefficients = {name: float(stated.get(name, 0.0)) for name in names}
     except KeyError as error:
-        raise CaptureError(f"{file} states no focal length: it needs fl_x, or camera_angle_x.") from error
+        raise CaptureError(f"{file} states no focal length: add fl_x or camera_angle_x.") from error
     except (TypeError, ValueError, ZeroDivisionError) as error:
-        raise CaptureError(f"{file} holds intrinsics that are no numbers: correct it.") from error
+        raise CaptureError(f"{file} holds intrinsics that are not numbers: correct it.") from error
     camera: Intrinsics = Calibration((fx, fy, cx - 0.5, cy - 0.5), (width, height), str(file)).camera((width, height))
     return lens_of(model, camera, coefficients, str(file))

@@ -1,4 +1,4 @@
-"""A folder of photographs, or of a video's frames: jpg, png, tif, bmp, webp, in the natural order of their names."""
+"""Reads a folder of photographs or video frames (jpg, png, tif, bmp, webp), in natural order of their names."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ REQUIRES: tuple[str, ...] = ("PIL",)
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 UNREADABLE = {".heic", ".heif", ".dng"}
-"""What phones also write, and no decoder here reads."""
+"""Image formats of phones that no decoder here reads."""
 
 SAME_LENS = 0.05
-"""Relative spread of the focal lengths that images state up to which they are taken to be of one lens."""
+"""Largest relative spread of the stated focal lengths of images from one lens."""
 
 _EXIF, _ORIENTATION, _FOCAL, _FOCAL_35MM = 0x8769, 0x0112, 0x920A, 0xA405
 _TIME, _SUBSECONDS, _WIDTH, _PLANE_RESOLUTION, _PLANE_UNIT = 0x9003, 0x9291, 0xA002, 0xA20E, 0xA210
@@ -37,8 +37,8 @@ _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
 
 @dataclass(frozen=True)
 class Header:
-    """What an image's header says. size: upright.  orientation: EXIF's, 1…8.  focal: over the diagonal, or None.  time:
-    seconds, or None."""
+    """The header of an image. size: upright.  orientation: EXIF's, 1…8.  focal: over the diagonal, or None.
+    time: seconds, or None."""
 
     size: Size
     orientation: int
@@ -47,14 +47,15 @@ class Header:
 
 
 class Reader(Capture):
-    """The images lie in the folder or in its ``images/``; an EXIF orientation is applied, and they are reduced to
-    ``capture.max_size``. All have one camera: what it took held the other way, so that width and height are swapped, is
-    turned by a quarter to the size of most (``turned``), and images of really other sizes are left out with a warning.
-    Frames are numbered over what is left, and poses, pixels and pictures are of the images as they are turned.
+    """The images lie in the folder or in its ``images/``. The EXIF orientation is applied, and images are reduced to
+    ``capture.max_size``. All images have one camera. Images with swapped width and height are turned by a quarter to
+    the most common size (``turned``). Images of any other size are left out with a warning. Frame numbers count the
+    images that remain. Poses, pixels and pictures refer to the turned images.
 
-    The camera is ``capture.intrinsics``, for the upright size before it is reduced; else a guess with the focal length
-    that EXIF states (35 mm equivalent, or focal length and sensor resolution) for most of them: good to some percent,
-    so that ``focal_stated`` but not ``intrinsics_known``. Timestamps are EXIF's if these ascend, else 0, 1, 2, ….
+    The camera is ``capture.intrinsics``, for the upright size before reduction. Otherwise it is a guess with the focal
+    length in the EXIF data of most images (35 mm equivalent, or focal length and sensor resolution). This is accurate
+    to a few percent, so ``focal_stated`` is true and ``intrinsics_known`` false. Timestamps come from EXIF if they
+    ascend, else they are 0, 1, 2, ….
     """
 
     format = "photos"
@@ -99,8 +100,7 @@ class Reader(Capture):
         height, width = color.shape[:2]
         if (width, height) != self._size:
             raise FrameError(
-                f"{path} has {width} x {height} pixels, most of the other images have {self._size[0]} x "
-                f"{self._size[1]}."
+                f"{path} has {width} x {height} pixels, but most other images have {self._size[0]} x {self._size[1]}."
             )
         if (width, height) != (camera.width, camera.height):
             color = cv2.resize(color, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
@@ -113,14 +113,14 @@ class Reader(Capture):
         header = self._headers[index]
         if header is None or header.size == self._size:
             return 0
-        if header.orientation >= 5:  # back to how it is stored, as the others are
+        if header.orientation >= 5:  # back to the stored orientation, like the others
             return 1 if header.orientation in (5, 6) else -1
-        # To portrait as phones store it, the sensor's left edge being above.
+        # To portrait, as phones store it: the sensor's left edge becomes the top.
         return 1 if self._size[0] > self._size[1] or header.orientation in (3, 4) else -1
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The images of a folder, or of its ``images/`` if it has none itself, in natural order: 2 before 10."""
+    """The images of a folder or, if it has none, of its ``images/``, in natural order: 2 before 10."""
     for place in (folder, folder / "images"):
         paths = list(place.iterdir()) if place.is_dir() else []
         found = [path for path in paths if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
@@ -130,12 +130,12 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def make_natural_key(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which numbers in names count as numbers."""
+    """Sort key that compares numbers in names as numbers."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.as_posix().lower())]
 
 
 def read_header(path: Path) -> Header | None:
-    """Size and EXIF of an image, without decoding it; None if it is none."""
+    """Size and EXIF data of an image, without decoding it; None if the file is not an image."""
     from PIL import Image
 
     try:
@@ -152,7 +152,7 @@ def read_header(path: Path) -> Header | None:
 
 
 def apply_orientation(image: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
-    """(H, W, 3) stored, to as it was seen. orientation: EXIF's (CIPA DC-008, tag 274)."""
+    """Turn a stored image (H, W, 3) upright. orientation: EXIF's (CIPA DC-008, tag 274)."""
     if orientation >= 5:
         image = image.transpose(1, 0, 2)  # 5; the others are 5 and then 2, 3 or 4
     rows, columns = {2: (1, -1), 6: (1, -1), 3: (-1, -1), 7: (-1, -1), 4: (-1, 1), 8: (-1, 1)}.get(orientation, (1, 1))
@@ -160,7 +160,7 @@ def apply_orientation(image: NDArray[np.uint8], orientation: int) -> NDArray[np.
 
 
 def _stated_focal(exif: Any, width: int, height: int) -> float | None:
-    """Focal length over the image's diagonal."""
+    """Stated focal length over the image diagonal, or None."""
     try:
         if exif.get(_FOCAL_35MM) and (camera := convert_35mm(float(exif[_FOCAL_35MM]), (width, height))):
             return camera.fx / float(np.hypot(width, height))
@@ -168,7 +168,7 @@ def _stated_focal(exif: Any, width: int, height: int) -> float | None:
         focal = float(exif[_FOCAL]) * pixels_per_mm * width / float(exif.get(_WIDTH, width))
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return None
-    # Nonsense is common: many programs keep the tag and change the image.
+    # Wrong values are common: many programs change the image but keep the tag.
     return focal / float(np.hypot(width, height)) if 0.3 < focal / max(width, height) < 20 else None
 
 
@@ -182,7 +182,7 @@ def _stated_time(exif: Any) -> float | None:
 
 
 def _times(headers: Sequence[Header | None]) -> NDArray[np.float64]:
-    """(N,) seconds since the first image, if all state when they were taken, and in this order."""
+    """(N,) seconds since the first image if all images state ascending times; else 0, 1, 2, …."""
     stated = np.array([np.nan if header is None or header.time is None else header.time for header in headers])
     if np.isfinite(stated).all() and (np.diff(stated) > 0).all():
         return np.asarray(stated - stated[0])
@@ -190,7 +190,7 @@ def _times(headers: Sequence[Header | None]) -> NDArray[np.float64]:
 
 
 def _focal(headers: Sequence[Header], size: Size) -> Intrinsics | None:
-    """The camera of the lens that most images state; None where they state none, or several."""
+    """The camera of the lens that most images state; None if they state no lens, or several."""
     stated = [header.focal for header in headers if header.focal is not None]
     if 2 * len(stated) <= len(headers):
         return None
@@ -199,10 +199,10 @@ def _focal(headers: Sequence[Header], size: Size) -> Intrinsics | None:
 
 
 def _common_size(folder: Path, headers: Sequence[Header]) -> Size:
-    """The upright size of most images, of which those held the other way count as well. Raises CaptureError if none can
-    be read, or no two are of one size."""
+    """The most common upright size; images with swapped width and height count too. Raises CaptureError if no image is
+    readable, or no two have the same size."""
     if not headers:
-        raise CaptureError(f"No image of {folder} can be read: all are damaged, or no images at all.")
+        raise CaptureError(f"No image of {folder} can be read: all files are damaged, or are not images.")
     upright_sizes = Counter(header.size for header in headers)
     either = {
         size: count + (upright_sizes[size[::-1]] if size[0] != size[1] else 0) for size, count in upright_sizes.items()
@@ -210,7 +210,7 @@ def _common_size(folder: Path, headers: Sequence[Header]) -> Size:
     size = max(upright_sizes, key=lambda size: (either[size], upright_sizes[size]))
     if either[size] < 2 <= len(headers):
         raise CaptureError(
-            f"The {len(headers)} images of {folder} have as many sizes, but a scan is of one camera: give "
+            f"The {len(headers)} images of {folder} all have different sizes, but a scan needs one camera: give "
             "images of one size, as a camera stores them."
         )
     return size
@@ -220,17 +220,17 @@ def _left_out(folder: Path, odd: Sequence[tuple[Path, Header]], used: int, size:
     (path, header), count = odd[0], len(odd)
     return Notice(
         "images-left-out",
-        f"{count} of the {count + used} images of {folder} {'is' if count == 1 else 'are'} left out, the first "
-        f"{path.name} of {header.size[0]} x {header.size[1]} pixels: the others have {size[0]} x {size[1]}, and a scan "
-        "is of one camera.",
+        f"{count} of the {count + used} images of {folder} {'is' if count == 1 else 'are'} left out, first "
+        f"{path.name} with {header.size[0]} x {header.size[1]} pixels: the others have {size[0]} x {size[1]}, and a "
+        "scan needs images of one camera.",
     )
 
 
 def _too_few(path: Path, found: Sequence[Path]) -> str:
     if found:
-        return f"{path} holds one image, {found[0].name}: a scan needs many, of the same place from all around."
+        return f"{path} holds only one image, {found[0].name}: a scan needs many images of one place, from all sides."
     if raw := _unreadable(path):
-        return f"{path} holds {raw[0].name} and the like, which cannot be decoded here: convert them to JPEG."
+        return f"{path} holds {raw[0].name} and similar files, which cannot be decoded: convert them to JPEG."
     return f"{path} holds no images (jpg, png, tif, bmp, webp)."
 
 

@@ -1,4 +1,4 @@
-"""Replica as NICE-SLAM packs it: results/frame000000.jpg and depth000000.png, traj.txt, cam_params.json."""
+"""Reads Replica as NICE-SLAM packs it: results/frame000000.jpg and depth000000.png, traj.txt, cam_params.json."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ DEPTH = r"depth(\d+)\.png"
 CLASSES = r"semantic_class_(\d+)\.png"
 
 UNITS_PER_METER = 6553.5
-"""Of the published Replica renderings; where cam_params.json states ``scale``, that is used."""
+"""Depth units per meter of the published Replica renderings; ``scale`` in cam_params.json overrides it."""
 
 
 class Reader(ImagePairs):
-    """Depth is stored / ``scale`` meters. ``cam_params.json`` lies in the folder or, as in NICE-SLAM's package, beside
-    it. Poses are the lines of ``traj.txt``, row-major camera-to-world in OpenCV axes; it is optional and not opened
-    before a pose is asked for. Class images are optional: ``semantic_class/semantic_class_N.png`` hold indices into the
-    names of ``classes.json``."""
+    """Depth in meters is the stored value / ``scale``. ``cam_params.json`` lies in the folder or, as in NICE-SLAM's
+    package, in its parent folder. The lines of ``traj.txt`` are poses: row-major, camera-to-world, OpenCV axes. This
+    file is optional, and opened only when a pose is requested. Class images are optional:
+    ``semantic_class/semantic_class_N.png`` hold indices into the names of ``classes.json``."""
 
     format = "replica"
     layout = "results/frameN.jpg (or .png) with results/depthN.png and cam_params.json"
@@ -59,10 +59,10 @@ class Reader(ImagePairs):
         return has_file(path / "results", COLOR)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
-        """Raises CaptureError if traj.txt is there but its lines cannot be assigned to the frames."""
+        """As in ``Capture``. Raises CaptureError if the lines of traj.txt do not fit the frames."""
         if self._trajectory is None:
             return None
-        # Line n is frame n in the order of the files, unless files were taken out: then it is the file's number.
+        # Line n is the n-th file or, if files were removed, the file with number n.
         row = index if len(self._trajectory) == len(self) else self._pairs.numbers[index]
         T_world_cam = self._trajectory[row]
         return T_world_cam if is_rigid(T_world_cam) else None
@@ -76,7 +76,7 @@ class Reader(ImagePairs):
 
     @functools.cached_property
     def _trajectory(self) -> NDArray[np.float64] | None:
-        """(L, 4, 4), one per line of traj.txt."""
+        """(L, 4, 4) poses, one per line of traj.txt; None without this file."""
         path = self.path / "traj.txt"
         if not path.is_file():
             return None
@@ -84,20 +84,20 @@ class Reader(ImagePairs):
         try:
             poses = np.array([[float(number) for number in line.split()] for line in lines]).reshape(-1, 4, 4)
         except ValueError as error:
-            raise CaptureError(f"{path} must hold 16 numbers a line: correct or remove it.") from error
+            raise CaptureError(f"{path} must hold 16 numbers per line: correct or remove it.") from error
         if len(poses) != len(self) and len(poses) <= self._pairs.numbers[-1]:
             raise CaptureError(f"{path} holds {len(poses)} poses for {len(self)} frames: correct or remove it.")
         return poses
 
 
 def _parameters(path: Path, options: Options) -> tuple[Calibration | None, float]:
-    """Color camera, None if it is unknown and depth is not read, and depth units per meter. Raises CaptureError."""
+    """Color camera and depth units per meter. The camera may be None if depth is not read. Raises CaptureError."""
     override = read_given_calibration(options)
     file = next((f for f in (path / "cam_params.json", path.parent / "cam_params.json") if f.is_file()), None)
     if file is None:
         if override is None and options.depth:
             raise CaptureError(
-                f"There is no cam_params.json in {path} or beside it: add it, or give capture.intrinsics "
+                f"There is no cam_params.json in {path} or its parent folder: add it, or give capture.intrinsics "
                 "(and capture.depth_scale)."
             )
         return override, UNITS_PER_METER

@@ -1,4 +1,4 @@
-"""ScanNet as exported, and RealSense recordings: color/N.jpg, depth/N.png, intrinsic/, pose/N.txt where known."""
+"""Reads exported ScanNet scenes and RealSense recordings: color/N.jpg, depth/N.png, intrinsic/, optional pose/N.txt."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ..numbered_files import has_file, list_numbered
 
 REQUIRES: tuple[str, ...] = ()
 
-# One number in the name: a time stamp in seconds has two, and hidden files (._7.jpg) are not images.
+# Exactly one number in the name: a timestamp in seconds has two. Hidden files (._7.jpg) are not images.
 NUMBER = r"(?:[^.\d]\D*)?(\d+)"
 COLOR = rf"{NUMBER}\.(?:png|jpe?g)"
 IMAGE = rf"{NUMBER}\.png"
@@ -37,20 +37,20 @@ POSE = rf"{NUMBER}\.txt"
 COLOR_CAMERA = ("intrinsic/intrinsic_color.txt", "intrinsic_color.txt")
 DEPTH_CAMERA = ("intrinsic/intrinsic_depth.txt", "intrinsic_depth.txt")
 ONE_CAMERA = ("intrinsic/intrinsic.txt", "intrinsic.txt", "intrinsic.json", "camera_intrinsic.json")
-"""Where recorders put the camera if color and depth share it; the JSON files are Open3D's."""
+"""Files of a camera that color and depth share; the JSON files are Open3D's."""
 
 
 class Reader(ImagePairs):
-    """Depth is uint16 millimeters. Numbers are not zero-padded and sort as numbers. ``pose/`` is optional, camera-to-
-    world; a pose of -inf is none.
+    """Depth is uint16 millimeters. Numbers in names have no leading zeros and sort as numbers. ``pose/`` is optional
+    and holds camera-to-world poses; -inf means no pose.
 
-    The color and depth cameras are in ``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` (4 x 4 or 3 x 3);
-    a file that is missing is derived from the other where both images have the same aspect ratio.
-    ``extrinsic_color.txt`` and ``extrinsic_depth.txt`` beside them map a camera to the rig; where they differ, depth is
-    moved to the color camera, otherwise color is resampled to the depth's pixels (see ``registration``). With
-    ``capture.depth=false`` color is left as it is.
+    ``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` hold the color and depth cameras (4 x 4 or 3 x 3). If
+    one is missing, it is derived from the other, provided that the images have the same aspect ratio.
+    ``extrinsic_color.txt`` and ``extrinsic_depth.txt`` in the same folder map each camera to the rig. If they differ,
+    depth moves to the color camera; otherwise color is resampled to the depth pixels (see ``depth_registration``). With
+    ``capture.depth=false`` color stays unchanged.
 
-    With a ``classes.json`` in the folder, ``label-filt/N.png`` are class images that hold indices into its names.
+    If the folder has a ``classes.json``, ``label-filt/N.png`` are class images that hold indices into its names.
     """
 
     format = "scannet"
@@ -84,7 +84,7 @@ class Reader(ImagePairs):
 
 
 def _grid(path: Path, options: Options, pairs: Pairs) -> tuple[PixelGrid, bool]:
-    """The frames' pixel grid, and whether anything says what the color camera is. Raises CaptureError."""
+    """The frames' pixel grid, and whether the color camera is known. Raises CaptureError."""
     if options.depth:
         color, depth = _cameras(path, options, pairs)
         return PixelGrid(color, depth, _T_color_depth(path)), True
@@ -95,7 +95,7 @@ def _grid(path: Path, options: Options, pairs: Pairs) -> tuple[PixelGrid, bool]:
 
 
 def _cameras(path: Path, options: Options, pairs: Pairs) -> tuple[Intrinsics, Intrinsics]:
-    """The color and the depth camera. Raises CaptureError if nothing states either."""
+    """The color and the depth camera. Raises CaptureError if neither is stated."""
     color_file, depth_file = _first(path, (*COLOR_CAMERA, *ONE_CAMERA)), _first(path, DEPTH_CAMERA)
     color = read_given_calibration(options) or (read_intrinsics(color_file) if color_file else None)
     depth = read_intrinsics(depth_file) if depth_file else None
@@ -110,7 +110,7 @@ def _cameras(path: Path, options: Options, pairs: Pairs) -> tuple[Intrinsics, In
 
 
 def _T_color_depth(path: Path) -> NDArray[np.float64] | None:
-    """Depth to color camera frame, or None where no extrinsics are given and the two coincide."""
+    """(4, 4) depth to color camera frame; None without extrinsics, because the two then coincide."""
     color, depth = (
         _first(path, (f"intrinsic/extrinsic_{camera}.txt", f"extrinsic_{camera}.txt")) for camera in ("color", "depth")
     )

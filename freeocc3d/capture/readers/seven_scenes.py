@@ -1,4 +1,4 @@
-"""7-Scenes: frame-000000.color.png (or .jpg), .depth.png and .pose.txt in one folder."""
+"""Reads 7-Scenes: frame-000000.color.png (or .jpg), .depth.png and .pose.txt in one folder."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ COLOR = r"frame-(\d+)\.color\.(?:png|jpe?g)"
 DEPTH = r"frame-(\d+)\.depth\.png"
 
 KINECT = Calibration((585.0, 585.0, 320.0, 240.0), (640, 480), "the Kinect calibration of 7-Scenes")
-"""What the data set's page states; a camera-intrinsics.txt in the folder takes its place."""
+"""The calibration on the data set's page; a camera-intrinsics.txt in the folder overrides it."""
 
 
 class Reader(ImagePairs):
-    """Depth is uint16 millimeters, 0 and 65535 invalid, and as large as color. Both have the same intrinsics: the data
-    set registers them only roughly and says no more: they are the depth camera's, so that without depth they are only
-    a guess. Poses are camera-to-world and optional."""
+    """Depth is uint16 millimeters, with 0 and 65535 invalid, and has the size of color. Color and depth share the depth
+    camera's intrinsics, because the data set registers them only roughly and states no others. Without depth, these
+    intrinsics are a guess. Poses are optional and camera-to-world."""
 
     format = "seven_scenes"
     layout = "frame-N.color.png (or .jpg) with frame-N.depth.png"

@@ -1,4 +1,4 @@
-"""The built-in room, rendered: exact poses, class images and occupancy truth; needs no download."""
+"""Renders the built-in room, with exact poses, class images and ground truth of occupancy. Needs no download."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ REQUIRES: tuple[str, ...] = ("open3d",)
 PATH = "builtin:room"
 
 _RATE_HZ = 30.0
-_FOCAL_PER_WIDTH = 0.82  # 63 degrees across
+_FOCAL_PER_WIDTH = 0.82  # a field of view of 63 degrees
 _NEAREST_M = 0.3  # a depth camera measures nothing nearer
-_EDGE = 0.05  # relative step of depth at which the sensor's two views disagree
-_GRAZING = 0.10, 0.22  # cosine of incidence at which every, and the first, pixel is lost
+_EDGE = 0.05  # relative depth step at which the sensor's two views disagree
+_GRAZING = 0.10, 0.22  # cosines of incidence below which all, and the first, pixels are lost
 
 
 class Options(TypedOptions, frozen=True):
     """The walk and the camera."""
 
     frames: PositiveInt = 240
-    """Frames of one round through the room; fewer are a faster walk."""
+    """Frames of one round through the room; fewer frames mean a faster walk."""
     width: PositiveInt = 320
     """Image width, pixels."""
     height: PositiveInt = 240
     """Image height, pixels."""
     noise: bool = True
-    """Whether depth and color are disturbed as by a sensor; false = exact."""
+    """Whether depth and color have sensor noise; false = exact."""
     seed: NotNegativeInt = 0
     """Seed of the noise."""
 
@@ -52,8 +52,8 @@ class Options(TypedOptions, frozen=True):
 class _View:
     """What each pixel of a frame sees, exactly.
 
-    depth_m: (H, W), 0 = nothing.  triangle: (H, W) row in the room's arrays, -1 = nothing.
-    points: (H, W, 3) world, meters.  cosine: (H, W) of the angle of incidence, 0…1.
+    depth_m: (H, W) meters, 0 = nothing.  triangle: (H, W) row in the room's arrays, -1 = nothing.
+    points: (H, W, 3) world, meters.  cosine: (H, W) cosine of the angle of incidence, 0…1.
     """
 
     depth_m: NDArray[np.float32]
@@ -63,10 +63,10 @@ class _View:
 
 
 class Reader(base.Capture):
-    """A hand-held walk through the furnished room of ``room.py``, at 30 Hz. A frame is the same whenever, and from
-    whichever thread, it is asked for. The world's z points up, its origin is the middle of the floor.
+    """A hand-held walk through the furnished room of ``builtin_room.py``, at 30 Hz. A frame is always the same, at any
+    time and from any thread. The world's z axis points up; its origin is the middle of the floor.
 
-    Raises CaptureError for another path than ``builtin:room``, DependencyError where Open3D is not installed.
+    Raises CaptureError for any path but ``builtin:room``, DependencyError if Open3D is not installed.
     """
 
     format = "synthetic"
@@ -75,7 +75,7 @@ class Reader(base.Capture):
     def __init__(self, path: Path, options: base.Options, own: Options):
         super().__init__(path, options)
         if str(path) != PATH:
-            raise CaptureError(f"There is no built-in capture '{path}': the one there is is called {PATH}.")
+            raise CaptureError(f"There is no built-in capture '{path}': use {PATH}.")
         self.own = own
         self.has_depth = options.depth
         self.timestamps = np.arange(own.frames) / _RATE_HZ
@@ -88,7 +88,7 @@ class Reader(base.Capture):
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
-        return False  # it is named, never found
+        return False  # the user names it
 
     def __getitem__(self, index: int) -> Frame:
         view = self._view(index)
@@ -108,12 +108,12 @@ class Reader(base.Capture):
         return np.where(triangle >= 0, self._room.class_ids[triangle], np.uint8(0))
 
     def object_image(self, index: int) -> NDArray[np.int32]:
-        """(H, W) which object each pixel shows, as index into ``objects``; -1 = none."""
+        """(H, W) index into ``objects`` of the object at each pixel; -1 = none."""
         triangle = self._view(index).triangle
         return np.where(triangle >= 0, self._room.object_ids[triangle], np.int32(-1))
 
     def exact_depth(self, index: int) -> NDArray[np.float32]:
-        """(H, W) meters, without noise or limit of range; 0 where nothing is hit."""
+        """(H, W) meters, without noise or range limit; 0 where nothing is hit."""
         return self._view(index).depth_m
 
     @property
@@ -122,17 +122,17 @@ class Reader(base.Capture):
         return self._room.objects
 
     def ground_truth(self, voxel_size: float = 0.08) -> dict[str, Any]:
-        """Occupancy truth from the room's exact surfaces and what the used frames of the walk see of them (paper,
+        """Ground truth of occupancy, from the room's exact surfaces and the parts that the selected frames see (paper,
         supplement, "Benchmark Details": every second frame, majority vote per voxel).
 
-        A voxel is occupied if seen surface lies in it, with the class of most of that; free if no surface lies in it
-        and its center is seen before what the depth images end at; all else, such as the inside of a cupboard, is
-        unknown. Returns labels (X, Y, Z) uint8 (0 free, k class, 255 unknown), origin (3,) lower corner of voxel
-        (0, 0, 0) in meters, voxel_size, classes: the keys of the captures' ``ground_truth.npz``. Memory grows with
-        1 / voxel_size³: 2 cm takes about a gigabyte.
+        A voxel with visible surface is occupied, and takes the class of most of that surface. A voxel is free if it
+        holds no surface and a frame sees its center in front of the depth. All others are unknown, such as the inside
+        of a cupboard. Returns the keys of the captures' ``ground_truth.npz``: labels (X, Y, Z) uint8 (0 free, k class,
+        255 unknown), origin (3,) lower corner of voxel (0, 0, 0), meters, voxel_size, classes. Memory grows with 1 /
+        voxel_size³: 2 cm takes about a gigabyte.
         """
         points, normals, classes = self._surface(voxel_size / 6)
-        # Walls and furniture stand on whole centimeters: shifted like this, none lies on a face between two voxels.
+        # Walls and furniture stand on whole centimeters. The shift keeps them off the faces between voxels.
         origin = points.min(axis=0).astype(np.float64) - 0.37 * voxel_size
         voxels = np.floor((points - origin) / voxel_size).astype(np.int32)
         shape = tuple(int(n) for n in voxels.max(axis=0) + 1)
@@ -143,7 +143,7 @@ class Reader(base.Capture):
         labels = np.where(center_seen, FREE, UNKNOWN).astype(np.uint8)
         labels[flat] = UNKNOWN
         votes, counts = np.unique(flat[surface_seen] * len(self.classes) + classes[surface_seen], return_counts=True)
-        votes = votes[np.argsort(counts, kind="stable")]  # of several classes in a voxel the last written wins
+        votes = votes[np.argsort(counts, kind="stable")]  # of several classes in a voxel, the last one written wins
         labels[votes // len(self.classes)] = votes % len(self.classes)
         return {
             "labels": labels.reshape(shape),
@@ -173,7 +173,7 @@ class Reader(base.Capture):
 
     @functools.cached_property
     def _directions_cam(self) -> NDArray[np.float32]:
-        """(H, W, 3) rays with z = 1, so that a ray's parameter is the depth."""
+        """(H, W, 3) ray directions with z = 1, so the ray parameter is the depth."""
         v, u = np.mgrid[: self.camera.height, : self.camera.width]
         pixels = np.stack((u, v), axis=-1).astype(np.float32)
         return back_project(pixels, np.ones(u.shape, np.float32), self.camera).astype(np.float32)
@@ -184,7 +184,7 @@ class Reader(base.Capture):
         T_world_cam = self.pose(index).astype(np.float32)
         directions = self._directions_cam @ T_world_cam[:3, :3].T
         rays = np.concatenate((np.broadcast_to(T_world_cam[:3, 3], directions.shape), directions), axis=-1)
-        with self._lock:  # the first cast builds the scene's tree, and Open3D does not say that casting is thread-safe
+        with self._lock:  # the first cast builds the scene's tree, and Open3D does not guarantee thread safety
             hit = self._scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)))
         depth_m = hit["t_hit"].numpy()
         seen = np.isfinite(depth_m)
@@ -202,7 +202,8 @@ class Reader(base.Capture):
         return builtin_room.shade(*flat, r.textures, r.colors, r.scales, r.normals).reshape(*view.depth_m.shape, 3)
 
     def _surface(self, spacing: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-        """Random points on all triangles, one per ``spacing``² m²: (P, 3) world, (P, 3) normals, (P,) class ids."""
+        """Random points on all triangles, one per ``spacing``² m²: (P, 3) world points, (P, 3) normals, (P,) class
+        ids."""
         rng = np.random.default_rng(0)
         a, b, c = self._room.triangles.astype(np.float64).transpose(1, 0, 2)
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -213,8 +214,8 @@ class Reader(base.Capture):
         return points.astype(np.float32), self._room.normals[which], self._room.class_ids[which]
 
     def _seen(self, points: NDArray[np.float32], normals: NDArray[np.float32] | None) -> NDArray[np.bool_]:
-        """(P,) whether any second one of the used frames sees each world point, from the front if it has a normal, at
-        or before the exact depth and within the sensor's range."""
+        """(P,) whether any of every second selected frame sees the world point: at or before the exact depth, within
+        the sensor's range, and from the front if the point has a normal."""
         seen = np.zeros(len(points), bool)
         facing = np.zeros((0, 3), np.float32) if normals is None else normals
         used = range(len(self))[self.options.start : self.options.stop : self.options.stride]
@@ -227,8 +228,8 @@ class Reader(base.Capture):
 
 
 def camera_on_the_walk(phase: float) -> NDArray[np.float64]:
-    """(4, 4) T_world_cam on a closed hand-held walk; phase 0…1 is one round. It turns left while it goes round to the
-    right: close to the table and the door it faces them, along the other two walls it looks across the room."""
+    """(4, 4) T_world_cam on a closed hand-held walk; phase 0…1 is one round. The walk goes clockwise while the camera
+    turns left: it faces the table and the door from near, and looks across the room along the other two walls."""
     angle = 2 * math.pi * phase
     sway = [math.sin(k * angle + k) for k in (5, 7, 11)]
     position = np.array((0.12 + 0.95 * math.cos(angle), -0.85 * math.sin(angle) - 0.05, 1.5))
@@ -250,8 +251,8 @@ def camera_on_the_walk(phase: float) -> NDArray[np.float64]:
 def disturbed_depth(
     depth_m: NDArray[np.float32], cosine: NDArray[np.float32], rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """(H, W) exact depth as a sensor gives it: jagged at edges, with axial noise, whole millimeters, and holes (0) at
-    edges, at grazing incidence and nearer than 0.3 m. cosine: (H, W) of the angle of incidence."""
+    """Add sensor errors to (H, W) exact depth: jagged edges, axial noise, rounding to millimeters, and holes (0) at
+    edges, at grazing incidence and nearer than 0.3 m. cosine: (H, W) cosine of the angle of incidence."""
     height, width = depth_m.shape
     shift = rng.integers(-1, 2, (2, height, width)) * (rng.random((2, height, width), np.float32) < 0.2)
     rows = np.clip(np.arange(height)[:, None] + shift[0], 0, height - 1)
@@ -265,17 +266,17 @@ def disturbed_depth(
 
 
 def _disturbed_color(color: NDArray[np.uint8], index: int, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Noise of two gray levels, and an exposure that changes slowly by 4 %."""
+    """Add noise of two gray levels, and an exposure that varies slowly by 4 %."""
     exposure = np.float32(1.0 + 0.04 * math.sin(0.05 * index))
     noisy = color * exposure + 2.0 * rng.standard_normal(color.shape, np.float32)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
 def _edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(H, W) pixels on either side of a step in depth."""
+    """(H, W) whether a pixel lies next to a depth step."""
     edges = np.zeros(depth_m.shape, bool)
     for axis in (0, 1):
-        # Views: what is written to along_axis lands in edges.
+        # Views: writing to along_axis changes edges.
         along_axis, depths = np.moveaxis(edges, axis, 0), np.moveaxis(depth_m, axis, 0)
         step = np.abs(np.diff(depths, axis=0)) > _EDGE * np.minimum(depths[:-1], depths[1:])
         along_axis[:-1] |= step
@@ -292,8 +293,8 @@ def _mark_seen(
     depth_m: NDArray[np.float32],
     seen: NDArray[np.bool_],
 ) -> None:
-    """Set ``seen`` (P,) for points (P, 3) of the world that a depth image (H, W) does not hide. normals: (P, 3) of the
-    surface that the points lie on, which must face the camera; (0, 3) = the points lie on none."""
+    """Set ``seen`` (P,) for world points (P, 3) that a depth image (H, W) does not hide. normals: (P, 3) surface
+    normals, which must face the camera; (0, 3) = the points lie on no surface."""
     height, width = depth_m.shape
     R, t = T_cam_world[:3, :3], T_cam_world[:3, 3]
     for p in prange(len(points)):
@@ -317,6 +318,6 @@ def _mark_seen(
             cosine = facing / math.sqrt(cx * cx + cy * cy + cz * cz)
             if cosine <= 0:
                 continue
-            tolerance = 0.75 * cz / K[0, 0] / max(cosine, 0.1)  # how far depth changes within a pixel of the surface
+            tolerance = 0.75 * cz / K[0, 0] / max(cosine, 0.1)  # change of the surface's depth within a pixel
         if cz <= depth_m[row, column] + tolerance and depth_m[row, column] > 0:
             seen[p] = True

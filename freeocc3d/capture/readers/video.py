@@ -1,8 +1,8 @@
-"""A video file (mp4, mov, mkv, webm, avi, …): upright, at its own times, each frame by its index.
+"""Reads a video file (mp4, mov, mkv, webm, avi, …): upright frames by index, with the file's own times.
 
-The file is read through once when it is opened, without decoding, so that every frame's time is known and none has to
-be counted to. A frame is decoded from where the decoder stands if that is on the way, else from the last key frame
-before it: reading in ascending order, with any stride, passes through the file once.
+Opening reads the whole file once, without decoding, to know the time of every frame. Decoding a frame continues from
+the decoder's position or starts at the last key frame before the frame, whichever is nearer. So reading in ascending
+order, with any stride, passes through the file once.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from ..image_decoding import Size
 REQUIRES: tuple[str, ...] = ("av",)
 
 FOCAL_35MM = "focal_length.35mm_equivalent"
-"""How the tag ends in which phones state the lens (com.apple.quicktime.camera.…)."""
+"""End of the tag in which phones state the lens (com.apple.quicktime.camera.…)."""
 
 _LEAST_FRAMES = 2
 _NEVER = -(1 << 62)
 
 
 class Reader(Capture):
-    """Timestamps are the file's own, in seconds, of constant or variable rate. A rotation that the file states is
-    applied, pixels that are not square are made so, and images are reduced to ``capture.max_size``.
+    """Timestamps are the file's own, in seconds, at a constant or variable rate. The stated rotation is applied, pixels
+    become square, and images are reduced to ``capture.max_size``.
 
-    The camera is ``capture.intrinsics``, for the size that the upright video has before it is reduced; else a guess,
-    from the lens that a phone may state. Raises CaptureError: not a video, nothing decodes, a codec that is not there.
+    The camera is ``capture.intrinsics``, for the upright size before reduction; else a guess, based on the lens if the
+    file states it. Raises CaptureError: not a video, no decodable frame, or a missing codec.
     """
 
     format = "video"
@@ -71,10 +71,10 @@ class Reader(Capture):
 
 
 class _Decoder:
-    """One video stream. Not thread-safe.
+    """Decodes one video stream. Not thread-safe.
 
-    keys: (N,) int64 presentation times in units of ``time_base``, ascending.  upright_size: of the frames with square
-    pixels, after their rotation.
+    keys: (N,) int64 presentation times in units of ``time_base``, ascending.  upright_size: size of the frames with
+    square pixels, after rotation.
     """
 
     def __init__(self, path: Path):
@@ -83,8 +83,8 @@ class _Decoder:
         keys, starts = self._read_through()
         if len(keys) < _LEAST_FRAMES:
             raise CaptureError(
-                f"{path} is no video that can be used: it holds {len(keys)} frame{'s' if len(keys) != 1 else ''}. Is "
-                "it cut off, or an image? Images are read as a folder of many."
+                f"{path} is not a usable video: it holds {len(keys)} frame{'s' if len(keys) != 1 else ''}. Is it cut "
+                "off, or an image? Give images as a folder of many."
             )
         self.keys, self._starts = keys, starts
         self.time_base = self._stream.time_base
@@ -98,7 +98,7 @@ class _Decoder:
 
     @property
     def focal_35mm(self) -> float:
-        """Focal length in millimeters of a 35 mm camera with the same view; 0 where nothing states it."""
+        """35 mm equivalent focal length, millimeters; 0 if not stated."""
         tags = {**self._container.metadata, **self._stream.metadata}
         stated = (value for name, value in tags.items() if name.lower().endswith(FOCAL_35MM))
         try:
@@ -107,7 +107,7 @@ class _Decoder:
             return 0.0
 
     def image(self, index: int, size: Size) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 RGB of a frame, upright, resampled to ``size``. Raises FrameError."""
+        """(H, W, 3) uint8 RGB of an upright frame, resampled to ``size``. Raises FrameError."""
         import av
 
         try:
@@ -123,7 +123,7 @@ class _Decoder:
         return np.ascontiguousarray(np.rot90(color, self._turns))
 
     def _frame(self, key: int) -> Any:
-        """The frame of that time; None if the file has it in its list, but nothing decodes to it."""
+        """The frame at that time; None if the file lists it but it does not decode."""
         if self._last is not None and _key(self._last) == key:
             return self._last
         start = self._starts[max(int(np.searchsorted(self._starts, key, side="right")) - 1, 0)]
@@ -136,7 +136,7 @@ class _Decoder:
         raise StopIteration
 
     def _seek(self, start: int) -> None:
-        """To a key frame; to the beginning where a container goes beyond what it is asked for."""
+        """Go to a key frame, or to the beginning if the container jumps past the requested time."""
         self._last = None
         self._container.seek(start, stream=self._stream)
         frames = self._decoded()
@@ -148,7 +148,7 @@ class _Decoder:
         self._frames = itertools.chain((first,), frames)
 
     def _decoded(self) -> Iterator[Any]:
-        """Frames from where the file stands; what does not decode is left out."""
+        """Decode frames from the current position; skip packets that do not decode."""
         import av
 
         for packet in self._container.demux(self._stream):
@@ -156,7 +156,7 @@ class _Decoder:
                 yield from packet.decode()
 
     def _first_frame(self) -> Any:
-        """The first that decodes, by which a file that does not decode at all is told when it is opened."""
+        """The first frame that decodes. Raises CaptureError on opening if none does."""
         import av
 
         try:
@@ -165,31 +165,32 @@ class _Decoder:
             return self._last
         except (av.error.FFmpegError, StopIteration) as error:
             raise CaptureError(
-                f"{self.path} cannot be decoded ({self._stream.codec_context.name}): no frame comes out of it. Convert "
-                "it, for example with ffmpeg, to H.264 in mp4."
+                f"No frame of {self.path} can be decoded ({self._stream.codec_context.name}). Convert the video to "
+                "H.264 in mp4, for example with ffmpeg."
             ) from error
 
     def _open(self) -> None:
-        """Raises CaptureError."""
+        """Open the file. Raises CaptureError."""
         import av
 
         try:
             self._container = av.open(str(self.path))
         except (av.error.FFmpegError, OSError) as error:
             raise CaptureError(
-                f"{self.path} is no video that can be read ({error.strerror}): a capture is a folder of frames, or a "
-                "video file that is whole."
+                f"{self.path} is not a readable video ({error.strerror}): a capture is a folder of frames, or a "
+                "complete video file."
             ) from error
         streams = [stream for stream in self._container.streams.video if stream.codec_context is not None]
         pictured = [stream for stream in streams if not stream.disposition & av.stream.Disposition.attached_pic]
         if not pictured:
-            raise CaptureError(f"{self.path} holds no video, or of a kind that this build of FFmpeg cannot decode.")
+            raise CaptureError(
+                f"{self.path} holds no video that this build of FFmpeg can decode: convert it to H.264 in mp4."
+            )
         self._stream = pictured[0]
         self._stream.thread_type = "AUTO"
 
     def _read_through(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Times of all frames and of those that decoding can start at, ascending. What a file that is cut off still
-        holds is taken."""
+        """Times of all frames and of the key frames, ascending. Of a cut-off file, the existing part is used."""
         import av
 
         keys, starts = [], []
@@ -206,6 +207,6 @@ class _Decoder:
 
 
 def _key(timed: Any) -> int:
-    """When a packet or a frame is shown; where a container (AVI) does not say it, when it is decoded."""
+    """Presentation time of a packet or frame; its decoding time if the container (AVI) does not state it."""
     stated = timed.dts if timed.pts is None else timed.pts
     return _NEVER if stated is None else int(stated)
