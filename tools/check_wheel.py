@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Builds the wheel, installs it into an empty environment, and runs its demo there: python tools/check_wheel.py
 
-The dependencies come from this interpreter's environment, by a path in the new environment's site-packages, so that
+A path in the site-packages of the new environment points to the dependencies of this interpreter's environment, so
 nothing is downloaded. freeocc3d itself can only come from the wheel: the new processes start outside the repository.
 """
 
@@ -23,7 +23,7 @@ PICTURES = ("map.png", "query_red_cup.png", "query_blue_chair.png", "query_green
 
 
 def build_wheel(folder: Path) -> Path:
-    """The wheel, built of a copy of the sources, which holds nothing of earlier builds."""
+    """The wheel, built from a copy of the sources without earlier builds."""
     sources = folder / "sources"
     sources.mkdir()
     for name in SOURCES:
@@ -38,7 +38,7 @@ def build_wheel(folder: Path) -> Path:
 
 
 def install(wheel: Path, folder: Path) -> Path:
-    """The folder of programs of a new environment that holds the wheel, and finds the dependencies of this one."""
+    """The folder of programs of a new environment that holds the wheel and finds the dependencies of this one."""
     venv.create(folder, with_pip=False)
     python = folder / "bin" / "python"
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "--python", str(python)]
@@ -50,7 +50,7 @@ def install(wheel: Path, folder: Path) -> Path:
 
 
 def run(command: list[str], folder: Path) -> str:
-    """What a command prints to stdout, started in a folder that has nothing to do with the repository."""
+    """The stdout of a command that starts in a folder outside the repository."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     if done.returncode:

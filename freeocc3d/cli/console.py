@@ -1,4 +1,4 @@
-"""What commands have in common: arguments, and progress on stderr."""
+"""What all commands share: arguments, and progress on stderr."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..core.progress import Progress
 
 
 def flag(name: str, help_text: str) -> Any:
-    """An option that is given or not, for ``Annotated[bool, …]``; its help names no kind of value."""
+    """A switch, for ``Annotated[bool, …]``. Its help shows no type."""
     return typer.Option(name, metavar="", help=help_text)
 
 
@@ -28,8 +28,8 @@ Overwrite = Annotated[bool, flag("--overwrite", "Replace what exists.")]
 
 
 class ConsoleProgress(Progress):
-    """Progress on stderr: one line that is redrawn on a terminal, a line per stage and warning elsewhere. Used as a
-    context, it ends its line in any case."""
+    """Progress on stderr: on a terminal one line that is redrawn, elsewhere a line per stage and warning. As a context
+    manager, it always ends its line."""
 
     def __init__(self) -> None:
         self._name, self._total, self._start, self._drawn = "", None, 0.0, 0.0  # type: tuple[str, int | None, float, float]
@@ -56,7 +56,7 @@ class ConsoleProgress(Progress):
         print(f"warning: {text}", file=sys.stderr)
 
     def close(self) -> None:
-        """End the present stage's line."""
+        """End the line of the current stage."""
         if self._name:
             self._clear()
             seconds = time.monotonic() - self._start

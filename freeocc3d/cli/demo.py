@@ -1,4 +1,4 @@
-"""``freeocc3d demo``: the built-in room, mapped, asked and drawn."""
+"""``freeocc3d demo``: maps the built-in room, asks three words, and draws pictures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .map_summary import summary_text
 from .query_answers import answers_text
 
 WORDS = "red cup", "blue chair", "green plant"
-"""What the demo asks."""
+"""The words that the demo asks."""
 
 
 def demo(

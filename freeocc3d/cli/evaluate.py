@@ -1,4 +1,4 @@
-"""``freeocc3d evaluate``: scores of maps, or of what other systems made."""
+"""``freeocc3d evaluate``: scores maps, or the results of other systems."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Scored:
     grid: Annotated[Path | None, typer.Option("--grid", metavar="NPZ", help="A finished voxel grid.")] = None
     frames: Annotated[
         Path | None,
-        typer.Option("--frames", metavar="FOLDER", help="Gaussians of single frames, which true poses put together."),
+        typer.Option("--frames", metavar="FOLDER", help="Gaussians of single frames; true poses join them."),
     ] = None
     trajectory: Annotated[
         Path | None,
@@ -54,7 +54,7 @@ class Truth:
             "--poses",
             metavar="FILE|CAPTURE",
             help="True poses; repeat it for each map.",
-            show_default="the poses of the capture that the map was made of",
+            show_default="the poses of the capture that the map was made from",
         ),
     ] = None
 

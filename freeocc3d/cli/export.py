@@ -23,7 +23,7 @@ def export(
         typer.Option(
             "--frame",
             metavar="FRAME",
-            help="map, gravity (z up, floor at 0) or first-camera (z up, origin there).",
+            help="map, gravity (z up, floor at 0) or first-camera (z up, origin at that camera).",
             show_default="the format's own",
         ),
     ] = None,

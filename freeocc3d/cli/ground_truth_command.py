@@ -28,7 +28,7 @@ def ground_truth(
     from ..evaluation.ground_truth import save_ground_truth
 
     if protocol != "replicaocc":
-        raise typer.BadParameter(f"'{protocol}' is not a protocol; there is replicaocc.", param_hint="--protocol")
+        raise typer.BadParameter(f"'{protocol}' is not a protocol: use replicaocc.", param_hint="--protocol")
     refuse_existing(output, overwrite)
     with ConsoleProgress() as progress:
         truth = replicaocc_truth.build_truth(capture, overrides or [], progress)
@@ -37,7 +37,7 @@ def ground_truth(
 
 
 def truth_text(truth: GroundTruth, path: Path) -> str:
-    """What was built, for people."""
+    """A summary for people."""
     import numpy as np
 
     from ..core.types import FREE, UNKNOWN

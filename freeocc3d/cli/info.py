@@ -9,7 +9,7 @@ from .map_summary import summary_document, summary_text
 
 
 def info(map_path: MapPath, as_json: Json = False) -> None:
-    """Say what is in a map and how it was made."""
+    """Show what is in a map and how it was made."""
     from ..query.scan_map import load_map
 
     loaded = load_map(map_path)

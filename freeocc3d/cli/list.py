@@ -22,7 +22,7 @@ def list_backends(
     as_json: Json = False,
     as_yaml: Annotated[bool, flag("--yaml", "Print a configuration file that explains every key.")] = False,
     advanced: Annotated[
-        bool, flag("--advanced", "Show also the options that only comparisons with other methods need.")
+        bool, flag("--advanced", "Also show the options that only comparisons with other methods need.")
     ] = False,
 ) -> None:
     """List readers, trackers, encoders and exporters with their options."""
@@ -43,7 +43,7 @@ def list_backends(
 
 
 def _facts(backend: Backend) -> dict[str, object]:
-    """What JSON says of a backend; all options are in it."""
+    """The JSON document of a backend, with all its options."""
     options = {
         o.name: {"type": o.type, "default": o.default, "doc": o.doc, "advanced": o.advanced} for o in backend.options
     }

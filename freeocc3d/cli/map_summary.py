@@ -67,7 +67,7 @@ def summary_text(loaded: Map) -> str:
         f"encoder    {said['encoder']}, which knows {said['encoder_knows']}",
         *([_vocabulary_text(said["vocabulary"])] if said["vocabulary"] else []),
         f"time       {sum(said['seconds'].values()):.1f} s: {seconds}",
-        f"memory     {said['peak_memory_bytes'] / 1e9:.2f} GB at most",
+        f"memory     {said['peak_memory_bytes'] / 1e9:.2f} GB at peak",
     ]
     if said["submaps"] > 1:
         lines += [
@@ -87,7 +87,7 @@ def _frames_text(said: dict[str, Any]) -> str:
 
 def _refined_text(refined: dict[str, Any]) -> str:
     return (
-        f"refined    {'a box of ' if 'box' in refined else 'from '}{refined['map']}, whose frames and times these are"
+        f"refined    {'a box of ' if 'box' in refined else 'from '}{refined['map']}, which has these frames and times"
     )
 
 
@@ -102,7 +102,7 @@ def _scale_text(scale: dict[str, Any]) -> str:
     if not scale["metric"]:
         return "scale      unknown: lengths are not meters"
     told = {"given": "as given", "length": "by a known length", "camera height": "by the cameras' height"}
-    times = "" if scale["factor"] == 1 else f", {scale['factor']:.4g} of them per unit of what was tracked"
+    times = "" if scale["factor"] == 1 else f", {scale['factor']:.4g} per unit of the tracker"
     return f"scale      meters, {told.get(scale['by'], 'by the poses')}{times}"
 
 

@@ -1,4 +1,4 @@
-"""``freeocc3d models``: the networks that encoders are made of."""
+"""``freeocc3d models``: the networks that encoders use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .option_groups import grouped
 
 Precision = Literal["fp32", "fp16", "int8"]
 
-app = typer.Typer(help="Fetch, export, list and verify the networks that encoders are made of.", no_args_is_help=True)
+app = typer.Typer(help="Fetch, export, list and verify the networks that encoders use.", no_args_is_help=True)
 
 
 @app.command("pull")
@@ -31,7 +31,7 @@ def models_pull(
     with ConsoleProgress() as progress:
         folder = model_hub.pull_package(name, revision, progress)
     if folder.parent.name == model_hub.CHECKPOINTS:
-        print(f"{folder}: a checkpoint, to be exported: freeocc3d models export {folder} -o {folder.name}")
+        print(f"{folder}: a checkpoint; export it: freeocc3d models export {folder} -o {folder.name}")
     else:
         print(folder)
 
@@ -99,7 +99,7 @@ def models_export(
     from ..language.model_export.export_checkpoint import export_checkpoint
 
     if (word_side.text is None) != (word_side.text_head is None):
-        raise typer.BadParameter("--text and --text-head belong together.")
+        raise typer.BadParameter("give --text and --text-head together.")
     made = export_checkpoint(
         checkpoint, output, precision, word_side.tokenizer, word_side.text, word_side.text_head, license_name
     )
@@ -128,7 +128,7 @@ def models_list(as_json: Json = False) -> None:
         else:
             print(
                 f"{name:<24} {package.kind:<9} {package.dimension:>5} dimensions  {package.precision}  "
-                f"{package.bytes / 1e6:8.1f} MB  licence {package.licence}, from {package.source}"
+                f"{package.bytes / 1e6:8.1f} MB  license {package.licence}, from {package.source}"
             )
     if not found:
         print(f"There are no models in {model_packages.find_models_folder()}.")
@@ -154,6 +154,6 @@ def models_verify(
         except ModelError as error:
             damaged.append(str(error))
         else:
-            print(f"{folder}: {len(package.files)} files are as they should be")
+            print(f"{folder}: {len(package.files)} files match their hashes")
     if damaged:
         raise ModelError(" ".join(damaged))

@@ -13,9 +13,8 @@ from typer.models import OptionInfo
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """The command as Typer reads it: each parameter that is a dataclass gives way to the fields of the dataclass, which
-    are ``Annotated`` options or arguments. The first line of the dataclass's docstring names the group on the help
-    page."""
+    """The command for Typer: the fields of a dataclass, which are ``Annotated`` options or arguments, replace the
+    parameter of that type. The first line of the dataclass's docstring names the group on the help page."""
     hints = get_type_hints(command, include_extras=True)
     records: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     flat: list[inspect.Parameter] = []

@@ -40,7 +40,7 @@ class Asked:
         typer.Option("--class", metavar="NAME", help="All voxels of a class of the map's vocabulary; repeatable."),
     ] = None
     image: Annotated[
-        Path | None, typer.Option("--image", metavar="FILE", help="What a picture shows, if the map's encoder can.")
+        Path | None, typer.Option("--image", metavar="FILE", help="Find what a picture shows, if the encoder can.")
     ] = None
     image_box: Annotated[
         tuple[int, int, int, int] | None,
@@ -54,7 +54,7 @@ class Asked:
 
     @property
     def questions(self) -> int:
-        """How many answers there will be."""
+        """The number of answers."""
         return len(self.words or ()) + len(self.class_names or ()) + (self.image is not None)
 
 
@@ -145,7 +145,7 @@ def query(map_path: MapPath, asked: Asked, place: Place, ranking: Ranking, answe
     if asked.list_classes:
         print("\n".join(load_map(map_path).vocabulary))
         return
-    _refuse_what_does_not_go_together(asked, answer, closer)
+    _refuse_conflicts(asked, answer, closer)
     for target in answer.files:
         refuse_existing(target, answer.overwrite)
     question = _question(asked, place, ranking)
@@ -154,7 +154,7 @@ def query(map_path: MapPath, asked: Asked, place: Place, ranking: Ranking, answe
         _answer_lines(loaded, question, answer)
         return
     results = ask(loaded, question)
-    with tempfile.TemporaryDirectory() as folder:  # for a map that nobody keeps
+    with tempfile.TemporaryDirectory() as folder:  # for a refined map without -o
         if closer.refine_to is not None and results[0].matched:
             output = closer.output or Path(folder) / "refined"
             loaded = _refined(loaded, results[0].regions[0], closer.refine_to, output, answer.overwrite)
@@ -163,7 +163,7 @@ def query(map_path: MapPath, asked: Asked, place: Place, ranking: Ranking, answe
         print(_answer(map_path, loaded, results, answer))
 
 
-def _refuse_what_does_not_go_together(asked: Asked, answer: Answer, closer: Closer) -> None:
+def _refuse_conflicts(asked: Asked, answer: Answer, closer: Closer) -> None:
     """Raises BadParameter, which names what to leave out or to add."""
     if asked.interactive == bool(asked.questions):
         raise typer.BadParameter("give words to look for, --class or --image, or --interactive without any.")
@@ -172,17 +172,17 @@ def _refuse_what_does_not_go_together(asked: Asked, answer: Answer, closer: Clos
             "--interactive answers in text or JSON: leave out --ply, --picture, --html and --refine."
         )
     if asked.image_box is not None and asked.image is None:
-        raise typer.BadParameter("--box is a part of a picture: give --image, too.")
+        raise typer.BadParameter("--box selects a part of a picture: give --image, too.")
     if asked.negative and asked.questions > len(asked.words or ()):
         raise typer.BadParameter("--not narrows what words mean: leave it out with --class and --image.")
     if closer.output is not None and closer.refine_to is None:
         raise typer.BadParameter("-o keeps the map that --refine makes: give --refine METERS.")
     if answer.views and not answer.as_json:
-        raise typer.BadParameter("--views adds to the document of --json: give both.")
+        raise typer.BadParameter("--views adds to the document of --json: give --json, too.")
     if closer.refine_to is not None and asked.questions > 1:
         raise typer.BadParameter("--refine looks around the best match of one word.")
     if len(set(answer.files)) < len(answer.files):
-        raise typer.BadParameter("--ply, --picture and --html are different files: give each another name.")
+        raise typer.BadParameter("give --ply, --picture and --html different file names.")
 
 
 def _question(asked: Asked, place: Place, ranking: Ranking) -> Question:
@@ -233,9 +233,8 @@ def _answer(map_path: Path, loaded: Map, results: Sequence[QueryResult], answer:
 
 
 def _answer_lines(loaded: Map, question: Question, answer: Answer) -> None:
-    """Answer each line of the standard input until it ends. A line that cannot be answered gives one sentence on
-    stderr, or with --json a document with "error" in place of "results", so that each line that is not empty has its
-    document."""
+    """Answer each line of the standard input until it ends. A line without an answer gives one sentence on stderr, or
+    with --json a document with "error" in place of "results": each line that is not empty has its document."""
     from dataclasses import replace
 
     from ..query.questions import ask

@@ -17,7 +17,8 @@ def answers_document(
     more: Callable[[Region], dict[str, Any]] | None = None,
     metric: bool = True,
 ) -> dict[str, Any]:
-    """Plain values: meters (if ``metric``) in the map frame, fractions 0 to 1. more: gives further keys of a region."""
+    """Plain values: meters (if ``metric``) in the map frame, fractions 0 to 1. more: returns further keys of a
+    region."""
     return {
         "version": __version__,
         "map": str(map_path),
@@ -49,7 +50,7 @@ def _region(region: Region) -> dict[str, Any]:
 
 
 def answers_text(results: Sequence[QueryResult], metric: bool = True) -> str:
-    """A table for people, in meters and liters, or in the map's units where these are not ``metric``."""
+    """A table for people, in meters and liters, or in the map's units if not ``metric``."""
     length, volume, per_unit3, digits = ("m", "l", 1000, 1) if metric else ("units", "units^3", 1, 5)
     lines = []
     for result in results:

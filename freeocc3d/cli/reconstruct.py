@@ -1,4 +1,4 @@
-"""``freeocc3d reconstruct``: a captured scan becomes a map."""
+"""``freeocc3d reconstruct``: turns a captured scan into a map."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def reconstruct(
     overwrite: Overwrite = False,
     device: Annotated[
         str | None,
-        typer.Option("--device", metavar="DEVICE", help="Processor to compute on: cpu or cuda:0.", show_default="cpu"),
+        typer.Option("--device", metavar="DEVICE", help="Device to compute on: cpu or cuda:0.", show_default="cpu"),
     ] = None,
     scale: Annotated[
         float | None,
@@ -51,12 +51,11 @@ def reconstruct(
 
 
 def _move(settings: Settings, device: str) -> Settings:
-    """The same with a device for what can run on one. Raises ConfigError where nothing can."""
+    """The settings with a device for the backends that can use one. Raises ConfigError if there is none."""
     movable = [section for section in _MOVABLE if settings.has_backend_option(section, "device")]
     if device != "cpu" and not movable:
         raise ConfigError(
-            f"Nothing that is chosen runs on {device}: it needs fitting.rasterizer=gsplat, or "
-            "tracking.backend=odometry."
+            f"No chosen backend runs on {device}: choose fitting.rasterizer=gsplat or tracking.backend=odometry."
         )
     for section in movable:
         settings = settings.with_backend(section, device=device)

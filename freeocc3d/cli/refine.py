@@ -1,4 +1,4 @@
-"""``freeocc3d refine``: a map with finer voxels."""
+"""``freeocc3d refine``: makes a map with finer voxels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def refine(
         typer.Option(
             "--box",
             metavar="X0 Y0 Z0 X1 Y1 Z1",
-            help="Make a map of this box only, and all its voxels fine: lower and upper corner, map frame, meters.",
+            help="Refine all voxels of this box, and leave out the rest: lower and upper corner, map frame, meters.",
             show_default="the whole map, with finer voxels only where they show more",
         ),
     ] = None,

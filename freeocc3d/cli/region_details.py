@@ -1,4 +1,4 @@
-"""What ``query --json`` says of a region beyond what the query found: its box, keyframes, and where to see it from."""
+"""What ``query --json`` adds to a region: its oriented box, keyframes, and where to see it from."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 def describe_regions(
     scan_map: Map, results: Sequence[QueryResult], views: bool = False
 ) -> Callable[[Region], dict[str, Any]]:
-    """What gives further keys of a region, for ``answers_document``.
+    """Returns a function that gives the further keys of a region, for ``answers_document``.
 
     oriented_box: extent (meters along its own axes), yaw (radians, gravity frame), T_map_box (4 x 4).
-    views: also keyframes and stand. keyframes: frame, pixel box x0 y0 x1 y1 and visible share of those that show the
-    region best. stand: the nearest place x y z on the floor where a robot could stand and see it; null where there is
-    none, or where lengths are not meters.
+    views: also keyframes and stand. keyframes: frame, pixel box x0 y0 x1 y1 and visible share of the region in those
+    that show it best. stand: the nearest place x y z on the floor where a robot could stand and see it; null if there
+    is none, or if lengths are not meters.
     """
     regions = [region for result in results for region in result.regions]
     if not regions:

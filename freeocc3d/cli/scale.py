@@ -1,4 +1,4 @@
-"""``freeocc3d scale``: meters for a map whose scale is unknown."""
+"""``freeocc3d scale``: gives meters to a map whose scale is unknown."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def scores_document(evaluation: Evaluation) -> dict[str, Any]:
-    """Plain values: fractions 0 to 1, meters, seconds. Of several scenes ``scenes`` holds the document of each."""
+    """Plain values: fractions 0 to 1, meters, seconds. For several scenes, ``scenes`` holds the document of each."""
     alone = evaluation.scenes[0] if len(evaluation.scenes) == 1 else None
     document: dict[str, Any] = {
         "version": __version__,
@@ -39,7 +39,7 @@ def scores_document(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _figures(evaluation: Evaluation) -> dict[str, Any]:
-    """IoU and mIoU, over which classes and under which masks."""
+    """IoU and mIoU, with their classes and masks."""
     from ..evaluation.scoring import PRIMARY_MASK
 
     scores = evaluation.scores
@@ -101,7 +101,7 @@ def scores_text(evaluation: Evaluation) -> str:
 
 
 def _lists_of_classes(evaluation: Evaluation) -> list[str]:
-    """mIoU over the lists of classes that are usually given."""
+    """mIoU over the usual lists of classes."""
     lines, lacking = [], []
     for name, names in evaluation.miou_over.items():
         if names is None:
@@ -114,7 +114,7 @@ def _lists_of_classes(evaluation: Evaluation) -> list[str]:
     named = [name for name in lacking if not name.startswith("top_")]
     top = [name for name in lacking if name.startswith("top_")]
     if named:
-        lines.append(f"  not available  {', '.join(named)} (the classes are other ones: map them with --classes)")
+        lines.append(f"  not available  {', '.join(named)} (the classes differ: map them with --classes)")
     if top:
         count = len(evaluation.scores.present)
         lines.append(f"  not available  {', '.join(top)} (the truth holds {count} classes)")
@@ -126,7 +126,7 @@ def _trajectory(scene: ScoredScene, how: str) -> list[str]:
     if errors is None:
         return []
     first = (
-        f"ATE        {100 * errors.ate_rmse_m:.2f} cm RMSE, {100 * errors.errors_m.max():.2f} cm at most, "
+        f"ATE        {100 * errors.ate_rmse_m:.2f} cm RMSE, {100 * errors.errors_m.max():.2f} cm maximum, "
         f"{len(errors.errors_m)} frames, aligned by {how}"
         + (f" (scale {scene.alignment.scale:.4f})" if how == "sim3" else "")
     )

@@ -1,10 +1,10 @@
-"""One map of several voxel sizes: coarse where the surface is flat and of one kind, fine where it is not.
+"""A map with several voxel sizes: coarse where the surface is flat and of one kind, fine elsewhere.
 
-A block of 8 x 8 x 8 voxels is cut into eight of half its voxels' size where one voxel would hide something: where the
-surface leaves its plane by a tenth of a voxel, and by more than the depth's noise, or where the meaning of neighboring
-Gaussians differs; but never to voxels smaller than that noise. What lies in such blocks is lifted again from the
-keyframes, in cells half as large, and looked at again, until the smallest size is reached. Every block is projected
-from the Gaussians of its own size.
+A block of 8 x 8 x 8 voxels is split into eight blocks of half its voxel size where one voxel would hide something:
+where the surface leaves its plane by a tenth of a voxel and by more than the depth noise, or where the meanings of
+neighboring Gaussians differ. Voxels never become smaller than the depth noise. The content of the split blocks is
+lifted again from the keyframes, in cells of half the size, and tested again, until the smallest size is reached. Every
+block is projected from the Gaussians of its own size.
 """
 
 from __future__ import annotations
@@ -36,25 +36,26 @@ from ..storage.writer import MapParts, write_changed_map
 from .box_refinement import SMALLEST_VOXEL_M, lift_features_again, lift_gaussians, read_settings
 
 _CUBE = 2
-"""Voxels along the edge of the cubes in which the surface is compared with a plane: 4 x 4 Gaussians on a flat one."""
-_FEWEST = 5  # Gaussians in a cube that tell whether they lie in a plane
+"""Edge in voxels of the cubes in which the surface is compared with a plane: a flat surface has 4 x 4 Gaussians in
+one."""
+_FEWEST = 5  # Gaussians that a cube needs to be compared with a plane
 _UNEVEN = 0.1
-"""Root mean square distance to the plane, in voxels, from which a surface is not flat: a step of a quarter of a voxel,
-a corner of a room, or a ball of five voxels' radius."""
+"""Root-mean-square distance to the plane, in voxels, above which a surface is not flat: a step of a quarter of a voxel,
+a corner of a room, or a ball with a radius of five voxels."""
 _NEIGHBORS, _ALIKE = 6, 0.8
-"""Gaussians around each whose features are compared with its own, and the cosine below which both are not alike."""
+"""Number of nearest Gaussians whose features are compared, and the cosine below which two meanings differ."""
 _ROWS = 16384
 
 
 def count_halvings(voxel_size: float, finest: float) -> int:
-    """How often ``voxel_size`` is halved to reach ``finest``, meters. Raises MapError if it never is."""
+    """The number of halvings from ``voxel_size`` to ``finest``, meters. Raises MapError if halving does not reach
+    it."""
     count = round(math.log2(voxel_size / finest)) if 0 < finest <= voxel_size else -1
     if count < 0 or finest < SMALLEST_VOXEL_M or abs(voxel_size / 2**count / finest - 1) > 1e-6:
         sizes = [voxel_size / 2**n for n in range(1, 9) if voxel_size / 2**n >= SMALLEST_VOXEL_M]
-        offered = ", ".join(f"{size:g}" for size in sizes) or "none is large enough"
+        offered = ", ".join(f"{size:g}" for size in sizes) or "none"
         raise MapError(
-            f"Voxels of {voxel_size:g} m are cut by halves, never to {finest:g} m: take one of {offered} as the "
-            "smallest."
+            f"Halving voxels of {voxel_size:g} m never gives {finest:g} m; possible smallest sizes (m): {offered}."
         )
     return count
 
@@ -70,11 +71,11 @@ def build_adaptive(
     finest: float,
     progress: Progress,
 ) -> Occupancy:
-    """The map ``base`` of one voxel size, with smaller voxels down to ``finest`` meters where they show more.
+    """The map ``base``, which has one voxel size, with voxels down to ``finest`` meters where they show more.
 
-    gaussians, features: the N Gaussians that it was made of, and what they mean, (N, D).  posed: gives the keyframes,
-    each time that it is called.  T_world_keyframe: (K, 4, 4).  encode: layer 3 for further Gaussians.  settings: the
-    map's configuration.  Raises MapError for a size that halving does not reach.
+    gaussians, features: the N Gaussians of the map, and their (N, D) features.  posed: yields the keyframes at each
+    call.  T_world_keyframe: (K, 4, 4).  encode: computes layer 3 of further Gaussians.  settings: the map's
+    configuration. Raises MapError for a size that halving does not reach.
     """
     count = count_halvings(base.voxel_size, finest)
     changing = _changing(gaussians.means, features)
@@ -122,15 +123,14 @@ def build_adaptive(
 def refine_where_needed(
     scan_map: Map, finest: float, output: str | Path, *, overwrite: bool = False, progress: Progress | None = None
 ) -> Map:
-    """Write the whole of a map, with smaller voxels down to ``finest`` meters where they show more, to the folder
-    ``output``. Raises FreeOccError: a size that halving does not reach, a map that has several already, a folder that
-    exists."""
+    """Write a map to the folder ``output``, with voxels down to ``finest`` meters where they show more. Raises
+    FreeOccError for a size that halving does not reach, a map that has several sizes already, or an existing folder."""
     progress = progress or Progress()
     base = scan_map.occupancy
     if base.deepest:
-        raise MapError(f"{scan_map.path} has voxels of several sizes already: refine the map that it was made of.")
+        raise MapError(f"{scan_map.path} already has voxels of several sizes: refine the map that it was made from.")
     if not count_halvings(base.voxel_size, finest):
-        raise MapError(f"{scan_map.path} has voxels of {finest:g} m already: give a smaller size.")
+        raise MapError(f"{scan_map.path} already has voxels of {finest:g} m: give a smaller size.")
     work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
     settings, trajectory = read_settings(scan_map).changed("occupancy", finest=finest), scan_map.trajectory
 
@@ -168,7 +168,7 @@ def _detailed(
     origin: NDArray[np.float64],
     voxel_size: float,
 ) -> NDArray[np.int64]:
-    """Those of the blocks, ascending packed keys, in which the surface is not flat or of several kinds.
+    """The blocks, ascending packed keys, in which the surface is not flat or has several meanings.
 
     gaussians: N of the blocks' size.  changing: (N,) whether the meaning changes at each.
     """
@@ -187,13 +187,13 @@ def _detailed(
     noise = np.bincount(cube, compute_sensor_sigma(np.abs(gaussians.anchor_cam[:, 2]))) / n
     uneven = (n >= _FEWEST) & (off_plane > np.hypot(_UNEVEN * voxel_size, noise))
     uneven |= np.bincount(cube, changing) > 0
-    uneven &= noise <= 0.5 * voxel_size  # smaller voxels than that would show the noise
+    uneven &= noise <= 0.5 * voxel_size  # smaller voxels would show the noise
     of_block = pack_voxels(index[first[uneven]].astype(np.int64) // (BLOCK // _CUBE))
     return np.intersect1d(blocks, of_block)
 
 
 def _changing(means: NDArray[np.float32], features: NDArray[np.float16]) -> NDArray[np.bool_]:
-    """(N,) whether one of the nearest Gaussians means something else; what nothing is known of means nothing else."""
+    """(N,) whether one of the nearest Gaussians has another meaning. Gaussians without features have none."""
     changing = np.zeros(len(means), bool)
     count = min(_NEIGHBORS, len(means) - 1)
     if count < 1 or not features.shape[1]:
@@ -210,7 +210,7 @@ def _changing(means: NDArray[np.float32], features: NDArray[np.float16]) -> NDAr
 
 
 class Blocks:
-    """A set of cubes of one lattice, given by packed keys: a region, as a ``refine.Box`` is one.
+    """A set of cubes of one lattice, given by packed keys: a part of space, as ``box_refinement.Box`` is.
 
     edge: of a cube, meters.
     """
@@ -220,8 +220,8 @@ class Blocks:
         self._table, self._rows = build_table(packed, len(packed))
 
     def contains(self, points: NDArray[np.floating], margin: float) -> NDArray[np.bool_]:
-        """(P,) whether each of (P, 3) points is inside, or no farther outside than the margin along any axis; the
-        margin is at most half an edge."""
+        """(P,) whether each of (P, 3) points is inside, or no farther outside than the margin along any axis. The
+        margin must not exceed half an edge."""
         local = (np.asarray(points, np.float64) - self.origin) / self.edge
         return np.asarray(_inside(local, margin / self.edge, self._table, self._rows))
 

@@ -1,7 +1,7 @@
-"""A box of a saved map at finer voxels: lifted again from the keyframes that see it, in finer cells.
+"""A box of a saved map with finer voxels: it is lifted again, in finer cells, from the keyframes that see it.
 
-The Gaussians of a map are as coarse as its voxels, so that what lies between two of them (a cup beside another) is not
-in them, but in the keyframes, which the map keeps. What comes out is a map of the box alone, in the same frame.
+The Gaussians of a map are as coarse as its voxels. What lies between two of them (the gap between two cups) is not in
+them, but in the keyframes, which the map keeps. The result is a map of the box alone, in the same frame.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from ..storage.writer import MapParts, write_changed_map
 
 SMALLEST_VOXEL_M = 0.001
 _MOST_BLOCKS = 1 << 18  # 13 bytes a voxel: 1.7 GB
-_LOOK_STRIDE = 2  # pixels from which it is decided whether a keyframe sees the box
+_LOOK_STRIDE = 2  # every n-th pixel decides whether a keyframe sees the box
 AROUND = 3.0
-"""Voxels of the box's new size around it, from where Gaussians reach into it."""
+"""Margin around the box, in new voxels, from which Gaussians reach into it."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class Box:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.low).all() and np.isfinite(self.high).all() and (self.low < self.high).all()):
             raise MapError(
-                "A box has a lower and an upper corner, x0 y0 z0 x1 y1 z1 in meters, each of the first three less than "
-                f"its counterpart; got {' '.join(f'{value:g}' for value in (*self.low, *self.high))}."
+                "A box has a lower and an upper corner, x0 y0 z0 x1 y1 z1 in meters, with x0 < x1, y0 < y1 "
+                f"and z0 < z1; got {' '.join(f'{value:g}' for value in (*self.low, *self.high))}."
             )
 
     def contains(self, points: NDArray[np.floating], margin: float) -> NDArray[np.bool_]:
@@ -60,7 +60,7 @@ class Box:
 
 
 def enclose_region(region: Region, voxel_size: float) -> Box:
-    """The box of what a query found, and two of the map's voxels around it."""
+    """The bounding box of a query's region, enlarged by two voxels of the map on every side."""
     return Box(region.box_min - 2 * voxel_size, region.box_max + 2 * voxel_size)
 
 
@@ -75,21 +75,21 @@ def refine_box(
 ) -> Map:
     """Write a map of a box of another map, with voxels of ``voxel_size`` meters, to the folder ``output``.
 
-    The box is widened to whole blocks of 8 voxels. Raises FreeOccError: the box is empty, or holds more than can be
-    kept, no keyframe sees a surface in it, or the folder exists.
+    The box is widened to whole blocks of 8 voxels. Raises FreeOccError if the box is empty or too large, if no keyframe
+    sees a surface in it, or if the folder exists.
     """
     progress = progress or Progress()
     if not SMALLEST_VOXEL_M <= voxel_size <= scan_map.manifest.voxel_size_m:
         raise MapError(
-            f"Voxels of {voxel_size:g} m cannot be had: give from {SMALLEST_VOXEL_M:g} up to the map's own "
-            f"{scan_map.manifest.voxel_size_m:g}."
+            f"Voxels of {voxel_size:g} m are not possible: choose a size from {SMALLEST_VOXEL_M:g} m to the map's own "
+            f"{scan_map.manifest.voxel_size_m:g} m."
         )
     blocks = tuple(math.ceil(edge - 1e-6) for edge in (box.high - box.low) / (BLOCK * voxel_size))
     if math.prod(blocks) > _MOST_BLOCKS:
         edge = BLOCK * voxel_size * _MOST_BLOCKS ** (1 / 3)
         raise MapError(
-            f"The box holds {math.prod(blocks) * BLOCK**3:,} voxels of {voxel_size:g} m, more than can be kept: take "
-            f"one of up to {edge:.1f} m an edge, or larger voxels."
+            f"The box holds {math.prod(blocks) * BLOCK**3:,} voxels of {voxel_size:g} m, which are too many: choose "
+            f"edges of at most {edge:.1f} m, or larger voxels."
         )
     work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
     settings = read_settings(scan_map).changed("occupancy", voxel_size=voxel_size)
@@ -102,7 +102,7 @@ def refine_box(
 
     gaussians = lift_gaussians(posed, box, voxel_size, settings, poses, progress)
     if not len(gaussians):
-        raise MapError(f"No keyframe of {scan_map.path} shows a surface in the box: nothing can be refined there.")
+        raise MapError(f"No keyframe of {scan_map.path} shows a surface in the box: choose another box.")
     features = lift_features_again(scan_map, seeing, poses, gaussians, settings, progress)
     progress.stage("occupancy", len(seeing))
     occupancy = build.build_occupancy(
@@ -129,12 +129,12 @@ def refine_box(
 
 
 def read_settings(scan_map: Map) -> Settings:
-    """The map's own; on the processor wherever the map was made."""
+    """The map's own settings, with layer 4 on the CPU."""
     return scan_map.settings.changed("occupancy", device="cpu")
 
 
 def _seeing(scan_map: Map, box: Box, margin: float, progress: Progress) -> tuple[Keyframes, Trajectory]:
-    """The keyframes that show something in the box, and the trajectory with these."""
+    """The keyframes that show something in the box, and the trajectory with only these."""
     trajectory, keyframes = scan_map.trajectory, scan_map.keyframes
     progress.stage("keyframes", len(keyframes))
     seen = np.zeros(len(keyframes), bool)
@@ -148,7 +148,8 @@ def _seeing(scan_map: Map, box: Box, margin: float, progress: Progress) -> tuple
 def _points(
     frame: Frame, T_world_cam: NDArray[np.float64], stride: int = 1
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(P, 2) measured pixels u, v, and (P, 3) where they are in the world; every n-th pixel in both directions."""
+    """(P, 2) pixels u, v with depth, and their (P, 3) points in the world; every ``stride``-th pixel in both
+    directions."""
     v, u = stride * np.stack(np.nonzero(frame.depth_m[::stride, ::stride]))
     pixels = np.stack((u, v), axis=1)
     points = back_project(pixels, frame.depth_m[v, u], frame.intrinsics)
@@ -170,9 +171,9 @@ def lift_gaussians(
     T_world_keyframe: NDArray[np.float64],
     progress: Progress,
 ) -> Gaussians:
-    """Layer 2 of what lies in a part of space, in cells of half a voxel, from keyframes with (K, 4, 4) poses.
+    """Layer 2 of a part of space, in cells of half a voxel, from keyframes with (K, 4, 4) poses.
 
-    posed: gives the keyframes, each time that it is called.
+    posed: yields the keyframes at each call.
     """
     options = settings.gaussians.changed(cell_size=None, pixel_stride=None)  # both follow the voxels
     margin = AROUND * voxel_size
@@ -197,12 +198,12 @@ def lift_features_again(
     settings: Settings,
     progress: Progress,
 ) -> NDArray[np.float16]:
-    """Layer 3 of these Gaussians; where the encoder cannot be had again, the features of the map's own nearest."""
+    """Layer 3 of these Gaussians. If the encoder cannot be loaded, the features of the map's nearest Gaussians."""
     try:
         encoder = scan_map.encoder
     except FreeOccError as error:
         name = scan_map.manifest.encoder.name
-        progress.warn(f"The encoder '{name}' cannot be used again, so features stay as coarse as the map's: {error}")
+        progress.warn(f"The encoder '{name}' cannot be loaded, so features stay as coarse as the map's: {error}")
         from scipy.spatial import cKDTree
 
         nearest = cKDTree(scan_map.gaussians.means).query(gaussians.means)[1]

@@ -1,7 +1,7 @@
-"""The scale of a map whose unit is unknown: from a length, the cameras' height, or metric poses; and the map scaled.
+"""Scales a map whose unit is unknown: by a known length, the cameras' height, or metric poses.
 
-Everything in a map is proportional to its unit, so that scaling it is exact: poses, Gaussians with their anchors,
-voxels' edges and origin, keyframes' depth. What is no length (probabilities, features, images) is copied.
+Every length in a map is proportional to its unit, so scaling is exact: poses, Gaussians with their anchors, edges and
+origin of voxels, depth of keyframes. The rest (probabilities, features, images) is copied.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ from ..viewer import render_pictures, trajectory_picture
 _NEAR_PX = 6
 _MOST_DEPTH_M = 65.535  # what 16 bits of millimeters hold
 _LEAST_VOXEL_M = 0.001
-_FITS = 0.1  # of the spread of the cameras: poses that are farther off are another scan's
+_FITS = 0.1  # of the spread of the cameras: poses with a larger error belong to another scan
 
 
 def scale_map(scan_map: Map, factor: float, by: str, output: str | Path, *, overwrite: bool = False) -> Map:
-    """Write the map with every length times ``factor``, after which lengths are meters, to the folder ``output``.
+    """Write the map with every length times ``factor`` to the folder ``output``. Its lengths are then meters.
 
-    by: where the factor is from, for the manifest. Raises MapError: no usable factor, or the folder exists.
+    by: the source of the factor, for the manifest. Raises MapError for an unusable factor or an existing folder.
     """
     if not (math.isfinite(factor) and factor > 0):
-        raise MapError(f"A map is scaled by a positive number, got {factor:g}.")
+        raise MapError(f"The scale factor must be a positive number, got {factor:g}.")
     voxel = factor * scan_map.manifest.finest_m
     farthest = factor * max((float(scan_map.keyframes.depth_m(row).max()) for row in _rows(scan_map)), default=0.0)
     if voxel < _LEAST_VOXEL_M or farthest > _MOST_DEPTH_M:
         raise MapError(
-            f"Times {factor:g}, voxels would have an edge of {voxel:.2g} m and depth would reach {farthest:.3g} m, of "
-            f"which a map holds {_LEAST_VOXEL_M:g} m and up, and up to {_MOST_DEPTH_M:.0f} m: check the length."
+            f"Times {factor:g}, voxels would have an edge of {voxel:.2g} m and depth would reach {farthest:.3g} m. A "
+            f"map holds edges from {_LEAST_VOXEL_M:g} m and depth up to {_MOST_DEPTH_M:.0f} m: check the length."
         )
     work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
     trajectory = _trajectory(scan_map.trajectory, factor)
@@ -75,20 +75,21 @@ def scale_map(scan_map: Map, factor: float, by: str, output: str | Path, *, over
 def scale_by_length(scan_map: Map, ends: Sequence[str], meters: float) -> float:
     """The factor by which two points are ``meters`` apart.
 
-    ends: two of ``FRAME:X,Y``, a pixel of a keyframe, or of a word, for the middle of the best region that it matches.
-    Raises MapError: no such keyframe, no depth near the pixel, nothing matched, one and the same point.
+    ends: each is ``FRAME:X,Y``, a pixel of a keyframe, or a word, for the centroid of the best region that it matches.
+    Raises MapError for a frame that is no keyframe, a pixel without depth near it, a word without a match, or two equal
+    points.
     """
     _require_meters(meters, "length")
     first, second = (_point(scan_map, end) for end in ends)
     length = float(np.linalg.norm(first - second))
     if length < 1e-6:
-        raise MapError(f"{ends[0]} and {ends[1]} are one point of the map: name two that are apart.")
+        raise MapError(f"{ends[0]} and {ends[1]} are the same point of the map: name two different points.")
     return meters / length
 
 
 def scale_by_camera_height(scan_map: Map, meters: float) -> float:
-    """The factor by which the keyframes are ``meters`` above the floor, half of them more. Raises MapError where the
-    map shows no floor below them."""
+    """The factor by which the median height of the keyframes above the floor is ``meters``. Raises MapError if the map
+    shows no floor below them."""
     _require_meters(meters, "camera height")
     T_gravity_map, poses = scan_map.T_gravity_map, scan_map.trajectory.T_world_keyframe
     if not is_floor_seen(T_gravity_map, poses, scan_map.gaussians):
@@ -98,8 +99,8 @@ def scale_by_camera_height(scan_map: Map, meters: float) -> float:
 
 
 def scale_by_poses(scan_map: Map, path: str) -> float:
-    """The factor by which the cameras' way is that of metric poses: a capture's, or a file's in any form that
-    ``capture.read_trajectory`` knows. Raises FreeOccError: too few that match, or another way altogether."""
+    """The factor by which the camera path fits metric poses: those of a capture, or of a file in any format that
+    ``capture.read_trajectory`` knows. Raises FreeOccError if too few poses match, or the paths differ."""
     own = select_estimated_poses(scan_map.trajectory)
     metric = _metric_poses(scan_map, path)
     found = align_trajectories(own, metric, "sim3")
@@ -109,14 +110,15 @@ def scale_by_poses(scan_map: Map, path: str) -> float:
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean())
     if off > _FITS * spread:
         raise FreeOccError(
-            f"The poses of {path} are not this map's: brought together as well as can be, half of the cameras are "
-            f"{off:.2f} m and more apart, on a way that spreads over {spread:.2f} m. Do its times or names fit?"
+            f"The poses of {path} are not this map's: after alignment, half of the cameras are at least {off:.2f} m "
+            f"apart, and the camera path spreads over {spread:.2f} m. Check its times or image names."
         )
     return found.scale
 
 
 def _metric_poses(scan_map: Map, path: str) -> Poses:
-    """Those of a file that knows images by name are matched to the capture, if it is still there."""
+    """The poses of a capture or file. If a file names images, the map's capture, which must exist, gives their
+    times."""
     if Path(path).is_file() and (found := read_trajectory(path)).names:
         T = found.of_frames(capture := scan_map.capture)
         has_pose = np.isfinite(T).all(axis=(1, 2))
@@ -131,7 +133,7 @@ def _point(scan_map: Map, end: str) -> NDArray[np.float64]:
         result = scan_map.query(end)
         if not result.regions:
             raise MapError(
-                f"'{end}' matches nothing in {scan_map.path}: name what is there, or a keyframe's pixel, FRAME:X,Y."
+                f"'{end}' matches nothing in {scan_map.path}: name something else, or a keyframe's pixel, FRAME:X,Y."
             )
         return result.regions[0].centroid
     frame, x, y = map(int, match.groups())
@@ -140,12 +142,12 @@ def _point(scan_map: Map, end: str) -> NDArray[np.float64]:
     if not len(rows):
         nearest = sorted(trajectory.keyframes.tolist(), key=lambda index: abs(index - frame))[:3]
         raise MapError(
-            f"Frame {frame} is no keyframe of {scan_map.path}; the nearest are {', '.join(map(str, sorted(nearest)))}. "
-            f"Their images are in {scan_map.path / map_files.KEYFRAMES}."
+            f"Frame {frame} is not a keyframe of {scan_map.path}; the nearest are "
+            f"{', '.join(map(str, sorted(nearest)))}. Their images are in {scan_map.path / map_files.KEYFRAMES}."
         )
     depth_m, camera = scan_map.keyframes.depth_m(int(rows[0])), scan_map.keyframes.views()[int(rows[0])][1]
     if not (x < camera.width and y < camera.height):
-        raise MapError(f"Pixel {x},{y} is outside of keyframe {frame}: {camera.width} x {camera.height} pixels.")
+        raise MapError(f"Pixel {x},{y} is outside keyframe {frame}: {camera.width} x {camera.height} pixels.")
     left, top = max(x - _NEAR_PX, 0), max(y - _NEAR_PX, 0)
     v, u = np.nonzero(depth_m[top : y + _NEAR_PX + 1, left : x + _NEAR_PX + 1])
     if not len(u):
@@ -160,7 +162,7 @@ def _point(scan_map: Map, end: str) -> NDArray[np.float64]:
 
 def _require_meters(value: float, what: str) -> None:
     if not (math.isfinite(value) and value > 0):
-        raise MapError(f"A {what} is a positive number of meters, got {value:g}.")
+        raise MapError(f"The {what} must be a positive number of meters, got {value:g}.")
 
 
 def _rows(scan_map: Map) -> range:
@@ -184,7 +186,7 @@ def _gaussians(gaussians: Gaussians, factor: float) -> Gaussians:
 
 
 def _settings(scan_map: Map, factor: float) -> Settings:
-    """The map's own, with the sizes that were chosen beside the scene."""
+    """The map's own settings, with their sizes scaled."""
     settings = scan_map.settings
     for section, key in (("occupancy", "voxel_size"), ("occupancy", "finest"), ("gaussians", "cell_size")):
         value = getattr(getattr(settings, section), key)
@@ -197,7 +199,7 @@ def _report(scan_map: Map, factor: float) -> dict[str, Any]:
     report = dict(scan_map.report)
     warnings = read_notices(report["warnings"])
     if not scan_map.metric and warnings and warnings[-1].code == "uncoded":
-        warnings.pop()  # of a map of unknown scale, the last one always said so when warnings had no codes
+        warnings.pop()  # when warnings had no codes, the last one of a map of unknown scale said so
     report["warnings"] = [notice.to_dict() for notice in warnings if notice.code != "scale-unknown"]
     if (rendering := report.get("rendering")) and rendering.get("depth_l1_m") is not None:
         report["rendering"] = {**rendering, "depth_l1_m": rendering["depth_l1_m"] * factor}
@@ -223,7 +225,7 @@ def _manifest(scan_map: Map, factor: float, by: str) -> Manifest:
 
 
 def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussians, factor: float) -> None:
-    """The pictures again, which tell lengths; of submaps only the mapped one, for the map holds no other."""
+    """Draw the pictures again, since they state lengths. The map holds only the mapped submap."""
     capture = Path(scan_map.manifest.capture.path)
     frames = np.flatnonzero(trajectory.has_pose).astype(np.int32)
     closures = [closure for submap in scan_map.report.get("submaps", [])[:1] for closure in submap["closures"]]

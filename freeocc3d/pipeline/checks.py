@@ -1,4 +1,4 @@
-"""What is checked before a run, and what its user is warned of."""
+"""The checks before a run, and the warnings that its user gets."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _FEW_TRACKED = 0.5
 
 
 def check(settings: Settings) -> None:
-    """Check before any work what a configuration asks of this machine: packages, files, devices, servers.
+    """Check, before any work, that this machine has what a configuration needs: packages, files, devices, servers.
 
-    A backend that needs more than packages has a function ``check``. Raises ConfigError, DependencyError for a backend
-    whose packages are not installed, or what ``check`` raises.
+    A backend that needs more than packages has a function ``check``. Raises ConfigError, DependencyError for a missing
+    package, or what ``check`` raises.
     """
     if settings.occupancy.finest is not None:
         adaptive_voxels.count_halvings(settings.occupancy.voxel_size, settings.occupancy.finest)
@@ -34,35 +34,35 @@ def check(settings: Settings) -> None:
 
 
 def warn_of_camera(capture: Capture) -> Notice:
-    """That nothing says what the camera is."""
-    focal = "what the images roughly state" if capture.focal_stated else "a guess"
+    """Warns that the camera is unknown."""
+    focal = "the rough value of the images" if capture.focal_stated else "a guess"
     return Notice(
         "intrinsics-unknown",
-        f"Nothing says what camera took {capture.path}: its focal length is {focal}, and what is mapped is bent as "
-        "far as that is wrong. Give capture.intrinsics, if you have them.",
+        f"The camera of {capture.path} is unknown: its focal length is {focal}, and an error in it bends the map. "
+        "Give capture.intrinsics if you know them.",
     )
 
 
 def warn_of_color_focal(capture: Capture, ratio: float) -> Notice:
-    """That the color camera's focal length is ``ratio`` times what the capture says."""
+    """Warns that the color camera's focal length is ``ratio`` times what the capture states."""
     return Notice(
         "color-focal-corrected",
-        f"Color and depth of {capture.path} fit each other only if the color camera's focal length is "
-        f"{ratio:.3f} of what its files say: color is resampled so (capture.color_focal=1 leaves it as it is).",
+        f"Color and depth of {capture.path} match only if the color camera's focal length is {ratio:.3f} of what its "
+        "files state, so color is resampled with this focal length (capture.color_focal=1 turns this off).",
     )
 
 
 def warn_of_scale() -> Notice:
-    """That lengths are not in meters."""
+    """Warns that lengths are not in meters."""
     return Notice(
         "scale-unknown",
-        "The scale of this map is unknown: its lengths, also the edge of its voxels, are in a unit in which the scene "
+        "The scale of this map is unknown: its lengths, also its voxel size, are in a unit in which the scene "
         "is about 2 deep. Give meters per unit with --scale, or scale the map by a known length: freeocc3d scale.",
     )
 
 
 def warn_of_trajectory(trajectory: Trajectory) -> Iterator[Notice]:
-    """That the map shows only part of the scan: frames that could not be read, were lost, or are submaps apart."""
+    """Warns that the map shows only part of the scan: frames are unreadable, lost, or in other submaps."""
     used = max(int(np.count_nonzero(trajectory.status != "unused")), 1)
     if broken := int(np.count_nonzero(trajectory.status == "broken")):
         text = (
@@ -72,8 +72,8 @@ def warn_of_trajectory(trajectory: Trajectory) -> Iterator[Notice]:
     if len(lost := np.flatnonzero(trajectory.status == "lost")):
         share = len(lost) / used
         text = (
-            f"Tracking lost {_frames(len(lost))} ({share:.0%}), the first is frame {lost[0]}: what only these show is "
-            "not in the map."
+            f"Tracking lost {_frames(len(lost))} ({share:.0%}), the first is frame {lost[0]}: what only these frames "
+            "show is not in the map."
         )
         if share > _FEW_TRACKED:
             text += " Most of the scan is missing: was it captured slowly, with depth in most of each image?"
@@ -81,8 +81,8 @@ def warn_of_trajectory(trajectory: Trajectory) -> Iterator[Notice]:
     if len(apart := np.flatnonzero(trajectory.status == "apart")):
         yield Notice(
             "submaps-apart",
-            f"{len(apart)} frames ({len(apart) / used:.0%}), the first is frame {apart[0]}, were tracked, but nothing "
-            "ties them to the rest: they are submaps of their own and not in the map, which is of the largest.",
+            f"{len(apart)} frames ({len(apart) / used:.0%}), the first is frame {apart[0]}, were tracked, but are not "
+            "connected to the rest: they form submaps of their own. The map shows only the largest submap.",
         )
 
 

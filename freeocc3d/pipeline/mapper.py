@@ -1,4 +1,4 @@
-"""The online engine: frames in, one by one; layers 2-4 of what was seen so far out."""
+"""The online mapper: takes frames one by one, and builds layers 2-4 of what it has seen so far."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from ..storage.keyframes import Keyframes
 from ..tracking.base import Tracked, Tracker
 
 _FINE = 0.01
-"""Edge of cells over the usual depth, where the scale is unknown: about what stereo can tell apart."""
+"""Edge of cells over the usual depth, if the scale is unknown: about the finest detail that stereo resolves."""
 
 
 class Mapper:
-    """Takes frames one by one. ``folder`` receives the keyframes; what is in memory grows with keyframes only."""
+    """Takes frames one by one. ``folder`` receives the keyframes. Memory grows with the number of keyframes only."""
 
     def __init__(self, settings: Settings, capture: Capture, folder: Path):
         self.settings = settings
@@ -42,8 +42,8 @@ class Mapper:
         self.tracker: Tracker = settings.load_backend("tracking", capture)
         if self.tracker.needs_depth and not capture.has_depth:
             raise TrackingError(
-                f"tracking.backend={settings.tracking.backend} needs depth, which {capture.path} has none of (or "
-                "capture.depth=false): estimate poses from color with tracking.backend=colmap, or give them (known, "
+                f"tracking.backend={settings.tracking.backend} needs depth, but {capture.path} has none, or "
+                "capture.depth=false: estimate poses from color with tracking.backend=colmap, or give poses (known, "
                 "file)."
             )
         self.depth: DepthSource = MeasuredDepth()
@@ -59,8 +59,8 @@ class Mapper:
         return self.tracker.offline or self.depth.offline
 
     def prepare(self, folder: Path, frames: range, progress: Progress) -> None:
-        """What the tracker and then the depth source do for the whole scan before its first frame; called if
-        ``offline``. folder: takes what lets an interrupted run go on.  frames: those that are used."""
+        """Run the work of the tracker and then of the depth source on the whole scan, before its first frame; called if
+        ``offline``. folder: receives what an interrupted run needs to resume.  frames: the used frames."""
         if self.tracker.offline:
             self.tracker.prepare(folder, frames, progress)
         if self.depth.offline:
@@ -81,13 +81,13 @@ class Mapper:
         self.refined = True
 
     def state(self, done: int) -> dict[str, NDArray[Any]]:
-        """What ``restore`` needs, once ``done`` frames were added, beyond the keyframes, which are listed on disk."""
+        """What ``restore`` needs after ``done`` frames, apart from the keyframes, whose index is saved here."""
         self.keyframes.save_index()
         counts = {"done": done, "keyframes": len(self.keyframes), "refined": self.refined}
         return {**{name: np.array(count) for name, count in counts.items()}, **self.tracker.state()}
 
     def restore(self, state: dict[str, NDArray[Any]]) -> int:
-        """Go on from a ``state``, which is used up; returns the number of frames that were added."""
+        """Continue from a ``state``, and empty it. Returns the number of frames that were added."""
         keyframes = Keyframes.load(self.keyframes.folder)
         keyframes.truncate(int(state.pop("keyframes")))
         done, self.refined = int(state.pop("done")), bool(state.pop("refined"))
@@ -100,7 +100,7 @@ class Mapper:
         return self.tracker.trajectory(self.capture.timestamps)
 
     def mapped(self, trajectory: Trajectory) -> Keyframes:
-        """The keyframes that are mapped: those of the largest submap."""
+        """The mapped keyframes: those of the largest submap."""
         return self.keyframes.only(trajectory.keyframes)
 
     def frames_used(self, trajectory: Trajectory, every: int) -> NDArray[np.int64]:
@@ -109,8 +109,8 @@ class Mapper:
         return np.union1d(trajectory.keyframes, measured[::every] if every else [])
 
     def posed(self, trajectory: Trajectory, every: int) -> Iterator[PosedFrame]:
-        """Those frames. Keyframes are read as they were kept, the others from the capture; one that cannot be decoded
-        any more is left out."""
+        """Yields the frames of ``frames_used`` with their poses: keyframes as they were saved, the others from the
+        capture. Leaves out a frame that can no longer be decoded."""
         keyframes, own = self.mapped(trajectory), trajectory.keyframes.tolist()
         between = np.setdiff1d(self.frames_used(trajectory, every), own)
         stream = read_ahead(self.capture, between.tolist())
@@ -127,7 +127,7 @@ class Mapper:
             stream.close()
 
     def anchor_gaussians(self, progress: Progress | None = None) -> Gaussians:
-        """Layer 2 as it is initialized: Gaussians anchored at the surface that the mapped frames so far show."""
+        """Layer 2 before fitting: Gaussians anchored at the surface that the mapped frames so far show."""
         progress = progress or Progress()
         trajectory = self.trajectory()
         options = self.settings.gaussians
@@ -158,7 +158,7 @@ class Mapper:
     def cell_size(self) -> float:
         """Edge in meters of the cells that hold one Gaussian each."""
         usual = 0.5 * self.settings.occupancy.voxel_size
-        if not self.tracker.metric:  # half a voxel may turn out to be much in meters
+        if not self.tracker.metric:  # half a voxel may be large in meters
             usual = min(usual, _FINE * capture_base.NOMINAL_DEPTH)
         return float(self.settings.gaussians.cell_size or usual)
 
@@ -225,5 +225,5 @@ class Mapper:
         )
 
     def _complete(self, frame: Frame) -> Frame:
-        """As the tracker knows the camera, and with depth."""
+        """The frame with the camera as the tracker knows it, and with depth."""
         return self.depth.complete(self.tracker.prepare_frame(frame))

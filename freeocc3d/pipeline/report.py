@@ -1,4 +1,4 @@
-"""What report.json holds: timings, memory, what became of the frames, warnings, submaps."""
+"""The content of report.json: timings, memory, status of the frames, warnings, submaps."""
 
 from __future__ import annotations
 

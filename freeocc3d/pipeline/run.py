@@ -1,5 +1,5 @@
-"""From a capture to a map: the mapper fed from the capture, one refinement over the whole scan, one clean pass of
-layers 2-4. The work lies in ``MAP.partial`` until it is whole, then takes the map's name."""
+"""From a capture to a map: feeds the mapper from the capture, refines the poses of the whole scan, and builds layers
+2-4 once. The work folder ``MAP.partial`` takes the map's name when the map is complete."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def reconstruct(
 ) -> Map:
     """Turn the capture in a folder into a map folder, and return the map.
 
-    settings: as ``config.load`` gives them, or any part as plain values, {"section": {"key": value}}.
-    overwrite: replace an existing map, and drop an interrupted run's work.  resume: go on with an interrupted run.
-    Raises FreeOccError; Interrupted after Ctrl-C, with the work done so far kept for ``resume``.
+    settings: from ``config.load``, or any part as plain values, {"section": {"key": value}}.
+    overwrite: replace an existing map, and drop an interrupted run's work.  resume: continue an interrupted run.
+    Raises FreeOccError; after Ctrl-C, Interrupted, and the work so far is kept for ``resume``.
     """
     progress = progress or Progress()
     resolved = config.resolve(settings or {})
@@ -51,12 +51,12 @@ def reconstruct(
             opened = _register_color(opened, resolved, progress, work)
         return _run(opened, resolved, output, work, progress)
     except TrackingError:
-        work.discard()  # nothing in it is of use
+        work.discard()  # it holds nothing useful
         raise
     except (KeyboardInterrupt, SystemError) as error:
         if not _is_interrupt(error):
             raise
-        kept = f"The work up to the last checkpoint is in {work.folder}: run the same command with --resume to go on."
+        kept = f"The work up to the last checkpoint is in {work.folder}: continue with the same command and --resume."
         raise Interrupted(
             f"Stopped. {kept if work.kept else 'There was no checkpoint yet, so nothing is kept.'}"
         ) from error
@@ -71,7 +71,7 @@ def reconstruct(
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Whether it is Ctrl-C, which leaves the call of a compiled function as a SystemError that it caused."""
+    """Whether the error is Ctrl-C, which a compiled function turns into the cause of a SystemError."""
     return isinstance(error, KeyboardInterrupt) or (error is not None and _is_interrupt(error.__cause__))
 
 
@@ -93,7 +93,7 @@ def _open(capture: str | Path, settings: Settings, progress: Progress, work: Wor
 
 
 def _register_color(capture: Capture, settings: Settings, progress: Progress, work: WorkFolder) -> Capture:
-    """The capture with color brought to the depth's pixels, if its cameras' focal lengths differ."""
+    """The capture with color registered to the depth images, if the focal lengths of its cameras differ."""
     ratio = settings.capture.color_focal
     if not capture.has_depth:
         return capture

@@ -1,5 +1,5 @@
-"""The stages of a run, in the order of the paper's layers. Each leaves what it made in the work folder, and takes it
-from there when a run is resumed whose configuration is still the same."""
+"""The stages of a run, in the order of the paper's layers. Each saves its result in the work folder; a resumed run with
+the same configuration loads it from there."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _CHECKPOINT_FRAMES = 50
 
 @dataclass
 class Run:
-    """One reconstruction: what its stages work with, and what each of them makes."""
+    """One reconstruction: the objects that its stages use, and their results."""
 
     mapper: Mapper
     encoder: Encoder
@@ -41,12 +41,12 @@ class Run:
     occupancy: Occupancy = field(init=False)
 
     def warn(self, *notices: Notice) -> None:
-        """Tell the user now, and in the map's report."""
+        """Show the notices now, and in the map's report."""
         self.work.warn(self.progress, *notices)
 
 
 def track(run: Run) -> None:
-    """Layer 1: poses of all frames that are used, with checkpoints."""
+    """Layer 1: poses of all used frames, with checkpoints."""
     mapper, work, progress = run.mapper, run.work, run.progress
     capture = mapper.capture
     if not (capture.intrinsics_known or mapper.tracker.estimates_camera):
@@ -62,13 +62,13 @@ def track(run: Run) -> None:
         _track_frames(run, frames, first)
     if len(mapper.keyframes) == 0:
         raise TrackingError(
-            f"No frame of {capture.path} could be used as a start: their depth is empty. Is it in other units "
-            "(capture.depth_scale), or all beyond capture.max_depth?"
+            f"No frame of {capture.path} has depth to start from: is it in other units (capture.depth_scale), or all "
+            "beyond capture.max_depth?"
         )
 
 
 def _track_frames(run: Run, frames: range, first: int) -> None:
-    """Those from the ``first`` one on, which are read ahead; a frame that cannot be read is left out."""
+    """Track the frames from the ``first`` on, and read ahead. Leaves out a frame that cannot be read."""
     mapper, work, progress = run.mapper, run.work, run.progress
     stream = read_ahead(mapper.capture, frames[first:])
     done = first
@@ -88,7 +88,7 @@ def _track_frames(run: Run, frames: range, first: int) -> None:
 
 
 def _leave_out(run: Run, index: int, error: FrameError, count: int) -> None:
-    """Raises CaptureError where too many of ``count`` frames are broken."""
+    """Record a broken frame. Raises CaptureError if too many of ``count`` frames are broken."""
     broken = run.work.broken
     broken[index] = str(error)
     run.progress.warn(str(error))
@@ -100,7 +100,7 @@ def _leave_out(run: Run, index: int, error: FrameError, count: int) -> None:
 
 
 def refine_poses(run: Run) -> None:
-    """Layer 1: all poses made consistent with each other."""
+    """Layer 1: make all poses consistent with each other."""
     mapper, work = run.mapper, run.work
     with work.timed("refinement"):
         run.progress.stage("refinement")
@@ -114,7 +114,8 @@ def refine_poses(run: Run) -> None:
 
 
 def name_scene(run: Run) -> None:
-    """Names of what some keyframes show, if a vision model is to be asked; the answers are kept one by one."""
+    """Ask a vision-language model, if the configuration has one, to name what some keyframes show. Saves each
+    answer."""
     mapper, progress = run.mapper, run.progress
     options = mapper.settings.vocabulary
     namer = scene_vocabulary.load_namer(options)
@@ -152,7 +153,7 @@ def lift_features(run: Run) -> None:
 
 
 def build_occupancy(run: Run) -> None:
-    """Layer 4: voxels, the smaller ones where they show more. Nothing is kept but the map, which follows at once."""
+    """Layer 4: voxels, smaller where they show more. Saves nothing, since the map follows at once."""
     with run.work.timed("occupancy"):
         occupancy = run.mapper.build_occupancy(run.gaussians, run.features, run.progress)
         occupancy = run.mapper.refine_occupancy(occupancy, run.gaussians, run.features, run.encoder, run.progress)
@@ -165,7 +166,7 @@ def build_occupancy(run: Run) -> None:
 
 
 def save_map(run: Run) -> None:
-    """The map, and what its user should know of it."""
+    """Write the map, and warn of what it lacks."""
     run.warn(*warn_of_trajectory(run.trajectory))
     if not run.mapper.tracker.metric:
         run.warn(warn_of_scale())
@@ -182,4 +183,4 @@ STAGES: dict[str, Callable[[Run], None]] = {
     "occupancy": build_occupancy,
     "saving": save_map,
 }
-"""What a run does, in this order."""
+"""The stages of a run, in this order."""

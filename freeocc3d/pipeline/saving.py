@@ -25,7 +25,7 @@ from .mapper import Mapper
 from .report import report_of
 
 _MEASURED_VIEWS = 24
-"""Keyframes, at most, that are rendered to say how well the Gaussians show what was captured."""
+"""Largest number of keyframes that are rendered to measure how well the Gaussians show the images."""
 
 
 def save(
@@ -41,7 +41,7 @@ def save(
     """Write the map of a run into its work folder."""
     capture, metric, submaps = mapper.capture, mapper.tracker.metric, mapper.tracker.submaps()
     settings = mapper.settings
-    if not metric:  # says how fine its Gaussians are when the map is put on other lattices
+    if not metric:  # states how fine its Gaussians are, for projections on other lattices
         settings = settings.changed("gaussians", cell_size=mapper.cell_size)
     with work.timed("saving"):
         facts = _facts(mapper, trajectory, gaussians, encoder, vocabulary)
@@ -89,7 +89,7 @@ def _facts(
 
 
 def _scale(mapper: Mapper) -> MapScale:
-    """Whether lengths are meters, what says so, and how many a unit of what the tracker gives is."""
+    """Whether lengths are meters, the source of the scale, and meters per unit of the tracker."""
     capture, given = mapper.capture, mapper.capture.options.scale
     if not mapper.tracker.metric:
         return MapScale(metric=False, by="none", factor=1.0)
@@ -98,7 +98,7 @@ def _scale(mapper: Mapper) -> MapScale:
 
 
 def evenly(count: int, wanted: int) -> list[int]:
-    """At most ``wanted`` of ``count`` rows, evenly spread, none at the very ends if there are enough."""
+    """Up to ``wanted`` of ``count`` rows, evenly spread, none at the very ends if there are enough."""
     return [int((n + 0.5) * count / min(wanted, count)) for n in range(min(wanted, count))]
 
 

@@ -1,6 +1,6 @@
-"""Keyframes on disk: color (JPEG), depth (16-bit PNG, millimeters), its standard deviation where it has one of its own
-(16-bit PNG, halves of them) and intrinsics, enough to build every later layer without the capture. They are written
-while the camera is tracked, and read one at a time."""
+"""Keyframes on disk: color (JPEG), depth (16-bit PNG, millimeters), the depth's standard deviation where it has one of
+its own (16-bit PNG, half millimeters), and intrinsics. Later layers need no more of the capture. Keyframes are written
+during tracking, and read one at a time."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Keyframes(Sequence[Frame]):
 
     @classmethod
     def load(cls, folder: Path) -> Keyframes:
-        """Those that a folder's index lists."""
+        """Read the index of a folder. Raises MapError."""
         keyframes = cls(folder)
         try:
             entries = json.loads((folder / INDEX).read_text(encoding="utf-8"))
             keyframes._entries = [{str(k): float(v) for k, v in entry.items()} for entry in entries]
         except (OSError, ValueError, AttributeError, TypeError) as error:
-            raise MapError(f"Cannot read the keyframes' index {folder / INDEX}: {error}.") from error
+            raise MapError(f"Cannot read the keyframe index {folder / INDEX}: {error}.") from error
         return keyframes
 
     def append(self, frame: Frame) -> None:
@@ -58,7 +58,7 @@ class Keyframes(Sequence[Frame]):
         )  # fmt: skip
 
     def copy_to(self, folder: Path, depth_factor: float = 1.0) -> None:
-        """Write them to another folder, with depth times a factor. Raises OSError, MapError."""
+        """Write the keyframes to another folder, with depth times a factor. Raises OSError, MapError."""
         folder.mkdir(parents=True, exist_ok=True)
         copied = Keyframes(folder)
         for entry in self._entries:
@@ -73,25 +73,26 @@ class Keyframes(Sequence[Frame]):
         copied.save_index()
 
     def only(self, frames: NDArray[np.integer]) -> Keyframes:
-        """Those of the given frames of the capture, in the same folder."""
+        """The keyframes among the given frames of the capture, in the same folder."""
         chosen = Keyframes(self.folder)
         wanted = set(frames.tolist())
         chosen._entries = [entry for entry in self._entries if int(entry["frame"]) in wanted]
         return chosen
 
     def truncate(self, length: int) -> None:
-        """Forget all but the first ``length``; their files are overwritten when the frames come again."""
+        """Keep the first ``length`` keyframes. The same frames overwrite the files of the others when they come
+        again."""
         del self._entries[length:]
 
     def drop_unlisted(self) -> None:
-        """Remove images that a run left which was interrupted after its last checkpoint."""
+        """Remove images that the index does not list: an interrupted run wrote them after its last checkpoint."""
         listed = {path for entry in self._entries for path in self._paths(int(entry["frame"]))}
         for path in self.folder.iterdir():
             if path not in listed and (path.match("*.color.jpg") or path.match("*.depth*.png") or is_temporary(path)):
                 path.unlink()
 
     def save_index(self) -> None:
-        """Write the index, whole or not at all. Raises OSError."""
+        """Write the index atomically. Raises OSError."""
         self.folder.mkdir(parents=True, exist_ok=True)
         replace_text(self.folder / INDEX, json.dumps(self._entries, indent=0))
 
@@ -111,11 +112,11 @@ class Keyframes(Sequence[Frame]):
         return map(self._read, list(self._entries))
 
     def views(self) -> list[tuple[Path, Intrinsics]]:
-        """The color image's file and the camera of each, without decoding anything."""
+        """The color image's path and the camera of each keyframe. Decodes nothing."""
         return [(self._paths(int(entry["frame"]))[0], _camera(entry)) for entry in self._entries]
 
     def depth_m(self, row: int) -> NDArray[np.float32]:
-        """(H, W) depth of one, whose color is not decoded; 0 = no measurement."""
+        """(H, W) depth of a keyframe, meters; 0 = no measurement. Does not decode its color image."""
         return self._read_units(self._entries[row], 1) / np.float32(_UNITS_PER_METER)
 
     def _read(self, entry: dict[str, float]) -> Frame:
@@ -144,7 +145,7 @@ class Keyframes(Sequence[Frame]):
             sigma_path.write_bytes(_encoded(np.where(frame.depth_m > 0, sigma, 0)))
 
     def _paths(self, index: int) -> tuple[Path, Path, Path]:
-        """Color and depth image of a frame, and that of the depth's standard deviation."""
+        """The paths of a frame's color, depth and standard-deviation images."""
         name = self.folder / f"{index:06d}"
         return name.with_suffix(".color.jpg"), name.with_suffix(".depth.png"), name.with_suffix(".depth_sigma.png")
 

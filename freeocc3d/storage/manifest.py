@@ -1,6 +1,7 @@
-"""The manifest of a map, map.yaml: every key with its type, its default and the format version that brought it.
+"""The manifest of a map, map.yaml: every key with its type, its default and the format version that introduced it.
 
-A map states the newest version among the keys that it uses, so that an earlier freeocc3d reads every map that it can.
+A map states the newest version among the keys that it uses, so an earlier freeocc3d reads every map whose keys it
+knows.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from ..core.transforms import is_rigid
 from .map_files import MANIFEST
 
 FORMAT_VERSION = 3
-"""The newest format, and the newest that is read."""
+"""The newest format version."""
 
 OLDEST_VERSION = 2
-"""The oldest format that is read; the one before it packed features in another way."""
+"""The oldest format that is read. Format 1 packed features in another way."""
 
 POSES = "camera to world"
 CODEC = "transform coding, 8, 4 and 2 bits a direction"
@@ -52,7 +53,8 @@ def vector(values: NDArray[np.float64]) -> Vector:
 
 
 class CaptureRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """The capture that a map was made of. path: a folder, a file, or ``builtin:room``.  frames: all that it has."""
+    """The capture that a map was made from. path: a folder, a file, or ``builtin:room``.  frames: number of all its
+    frames."""
 
     path: str
     format: str
@@ -60,7 +62,7 @@ class CaptureRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EncoderRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """The encoder of the features. state: what its word side needs to be made again.  dimension: of its features."""
+    """The encoder of the features. state: restores the text encoder.  dimension: of the features."""
 
     name: str
     dimension: Count = 0
@@ -68,8 +70,8 @@ class EncoderRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapScale(msgspec.Struct, frozen=True, kw_only=True):
-    """The unit of length. metric: whether it is the meter.  by: what says so.  factor: meters in a unit of what the
-    tracker gave."""
+    """The unit of length. metric: whether it is the meter.  by: the source of the scale.  factor: meters per unit of
+    the tracker."""
 
     metric: bool
     by: str = "sensor"
@@ -77,7 +79,7 @@ class MapScale(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class VoxelCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """Numbers of voxels, of any size; unknown ones count within the blocks only."""
+    """Numbers of voxels of all sizes. Unknown voxels count within the blocks only."""
 
     occupied: Count
     free: Count
@@ -85,7 +87,7 @@ class VoxelCounts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """How much of everything the map holds. frames: of the capture."""
+    """Numbers of everything in the map. frames: of the capture."""
 
     gaussians: Count
     voxels: VoxelCounts
@@ -102,7 +104,7 @@ class NameCount(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SceneWords(msgspec.Struct, frozen=True, kw_only=True):
-    """Names that a vision-language model gave. keyframes: those that it named.  names: the most frequent first."""
+    """Names that a vision-language model gave. keyframes: those that it named.  names: most frequent first."""
 
     model: str = ""
     keyframes: tuple[int, ...]
@@ -110,17 +112,17 @@ class SceneWords(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Refined(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The map of larger voxels that this one was made of. box: x0 y0 z0 x1 y1 z1 of the part of it, meters; None for
-    the whole."""
+    """The map of larger voxels that this map refines. box: x0 y0 z0 x1 y1 z1 of the refined part, meters; None = the
+    whole map."""
 
     map: str
     box: tuple[float, float, float, float, float, float] | None = None
 
 
 class MapFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """What only the manifest says of a map."""
+    """What only the manifest states about a map."""
 
-    capture: Annotated[CaptureRecord, _key("the capture that the map was made of")]
+    capture: Annotated[CaptureRecord, _key("the capture that the map was made from")]
     frame: Annotated[str, _key("the frame of the map, in words")] = ""
     poses: Annotated[str, _key("the direction of the poses, in words")] = POSES
     scale: Annotated[MapScale, _key("the unit of length")] = MapScale(metric=True)
@@ -129,16 +131,16 @@ class MapFacts(msgspec.Struct, frozen=True, kw_only=True):
     T_gravity_map: Annotated[Matrix | None, _key("4 x 4, rigid, to the frame with z up and the floor at z = 0")] = None
     encoder: Annotated[EncoderRecord, _key("the encoder of the features")]
     codec: Annotated[str, _key("how features are packed, in words")] = CODEC
-    vocabulary: Annotated[SceneWords | None, _key("names that a model gave to what is in the scene")] = None
-    refined: Annotated[Refined | None, _key("the map of larger voxels that this one was made of")] = None
+    vocabulary: Annotated[SceneWords | None, _key("names that a model gave to things in the scene")] = None
+    refined: Annotated[Refined | None, _key("the map of larger voxels that this map refines")] = None
 
 
 class Manifest(MapFacts, frozen=True, kw_only=True):
-    """What map.yaml says: the facts, and what it repeats of the other files, so that they can be checked."""
+    """The content of map.yaml: the facts, and what it repeats from the other files as a check."""
 
     freeocc3d: Annotated[str, _key("version of the package that wrote the map")]
     voxel_size_m: Annotated[float, _key("edge of the largest voxels, meters", gt=0)]
-    finest_voxel_m: Annotated[float | None, _key("edge of the smallest, if sizes differ, meters", since=3)] = None
+    finest_voxel_m: Annotated[float | None, _key("edge of the smallest voxels if sizes differ, meters", since=3)] = None
     origin: Annotated[Vector, _key("x y z of the lower corner of voxel (0, 0, 0), map's frame, meters")]
     counts: Annotated[MapCounts, _key("numbers of Gaussians, voxels, frames and submaps")]
     keyframes: Annotated[tuple[Count, ...], _key("the capture's frames that are keyframes, ascending")]
@@ -151,12 +153,12 @@ class Manifest(MapFacts, frozen=True, kw_only=True):
 
     @property
     def format_version(self) -> int:
-        """The newest version among the keys that are used."""
+        """The newest version among the used keys."""
         return max(key.since for key in manifest_keys() if getattr(self, key.name) is not None)
 
 
 class ManifestKey(NamedTuple):
-    """A key of map.yaml, for the documentation. since: the format version that brought it."""
+    """A key of map.yaml, for the documentation. since: the format version that introduced it."""
 
     name: str
     required: bool
@@ -181,10 +183,11 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of the map in a folder. Raises MapError: not a map, another version, damaged."""
+    """Read the manifest of a map folder. Raises MapError for a folder that is no map, an unknown format version, or a
+    damaged manifest."""
     path = folder / MANIFEST
     if not folder.is_dir():
-        raise MapError(f"There is no map folder {folder}.")
+        raise MapError(f"The map folder {folder} does not exist.")
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_SafeLoader)
     except FileNotFoundError as error:
@@ -193,13 +196,13 @@ def read_manifest(folder: Path) -> Manifest:
         raise MapError(f"{path} cannot be read: {' '.join(str(error).split())}.") from error
     version = content.get("format_version") if isinstance(content, dict) else None
     if not isinstance(version, int):
-        raise MapError(f"{path} is not a map's manifest: it states no format_version.")
+        raise MapError(f"{path} is not the manifest of a map: it has no format_version.")
     if version > FORMAT_VERSION:
         raise MapError(
-            f"The map {folder} has format {version}, this freeocc3d reads up to {FORMAT_VERSION}: upgrade freeocc3d."
+            f"The map {folder} has format {version}; this freeocc3d reads up to {FORMAT_VERSION}: upgrade freeocc3d."
         )
     if version < OLDEST_VERSION:
-        raise MapError(f"The map {folder} has format {version}, of an earlier freeocc3d: map the capture again.")
+        raise MapError(f"The map {folder} has the old format {version}: map the capture again.")
     try:
         manifest = msgspec.convert(content, Manifest)
     except msgspec.ValidationError as error:
@@ -210,33 +213,33 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def _problem(manifest: Manifest, folder: Path) -> str:
-    """What is wrong with a manifest whose types are right, empty if nothing is."""
+    """The problem of a manifest whose types are right; empty if it has none."""
     lengths = np.array((manifest.voxel_size_m, manifest.finest_m, *manifest.origin, *manifest.up))
     if not np.isfinite(lengths).all():
         return "'voxel_size_m', 'finest_voxel_m', 'origin' or 'up' holds a number that is not finite"
     for name in ("T_world_map", "T_gravity_map"):
         T = getattr(manifest, name)
         if T is not None and not is_rigid(np.array(T)):
-            return f"'{name}' is no rigid transform"
+            return f"'{name}' is not a rigid transform"
     root = folder.resolve()
     outside = next((name for name in manifest.files if not (folder / name).resolve().is_relative_to(root)), None)
     return "" if outside is None else f"'files' names {outside}, which lies outside the map's folder"
 
 
 _KINDS = {
-    "float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false", "array": "a list",
+    "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false", "array": "a list",
     "object": "a group of keys", "null": "nothing",
 }  # fmt: skip
 _SHAPES = (
     (r"Object missing required field `(?P<key>\w+)`", "lacks '{key}'"),
-    (r"Expected `(?P<wanted>[^`]+)`, got `(?P<found>\w+)`", "has {found} in place of {wanted}"),
-    (r"Expected `array` of length (?P<wanted>\d+), got (?P<found>\d+)", "has {found} entries in place of {wanted}"),
+    (r"Expected `(?P<wanted>[^`]+)`, got `(?P<found>\w+)`", "has {found} instead of {wanted}"),
+    (r"Expected `array` of length (?P<wanted>\d+), got (?P<found>\d+)", "has {found} entries instead of {wanted}"),
     (r"Expected `\w+` (?P<bound>[<>]=? \S+)", "has a number that is not {bound}"),
 )
 
 
 def _what_is_wrong(error: msgspec.ValidationError) -> str:
-    """A validation error as a part of a sentence that names the field."""
+    """A validation error as part of a sentence that names the field."""
     message, _, where = str(error).partition(" - at `$")
     field = where.strip("`.")
     for pattern, sentence in _SHAPES:

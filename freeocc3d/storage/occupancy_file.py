@@ -21,7 +21,7 @@ _OCCUPANCY_ARRAYS = {
     "keys": ("i", 2), "probability": ("f", 2), "free": ("u", 2), "hits": ("u", 2), "state": ("u", 2),
     "colors": ("u", 2), "feature_codes": ("u", 2),
 }  # fmt: skip
-"""Arrays of occupancy.npz: kind of number and dimensions."""
+"""Arrays of occupancy.npz: kind of number and number of dimensions."""
 _FEATURE_ARRAYS = {
     "gaussian_codes": ("u", 2), "codec_basis": ("f", 2), "codec_bits": ("u", 1), "codec_offset": ("f", 1),
     "codec_scale": ("f", 1),
@@ -50,7 +50,7 @@ def write_features(folder: Path, codec: Codec, gaussian_features: NDArray[np.flo
 
 
 def read_features(folder: Path) -> tuple[Codec, NDArray[np.uint8]]:
-    """The codec, and the (N, M) coded features of the Gaussians. Raises MapError."""
+    """Read the codec and the (N, M) coded features of the Gaussians. Raises MapError."""
     path = folder / FEATURES
     arrays = read_arrays(path, _FEATURE_ARRAYS)
     tables = {name.removeprefix("codec_"): table for name, table in arrays.items() if name.startswith("codec_")}
@@ -59,18 +59,18 @@ def read_features(folder: Path) -> tuple[Codec, NDArray[np.uint8]]:
     except ValueError as error:
         raise MapError(f"{path} is damaged: {error}.") from error
     if arrays["gaussian_codes"].shape[1] != codec.code_bytes:
-        raise MapError(f"{path} is damaged: its codes do not fit its codec.")
+        raise MapError(f"{path} is damaged: its feature codes do not match its codec.")
     return codec, arrays["gaussian_codes"]
 
 
 def read_occupancy(folder: Path, manifest: Manifest, codec: Codec) -> Occupancy:
-    """The voxels, whose features stay coded. Raises MapError."""
+    """Read the voxels. Their features stay coded. Raises MapError."""
     path = folder / OCCUPANCY
     arrays = read_arrays(path, _OCCUPANCY_ARRAYS)
     blocks = len(arrays["keys"])
     arrays.setdefault("levels", np.zeros(blocks, np.uint8))
     if not _fit(arrays, blocks, codec):
-        raise MapError(f"{path} is damaged: its arrays do not fit each other.")
+        raise MapError(f"{path} is damaged: the sizes of its arrays do not match.")
     return Occupancy(
         voxel_size=manifest.voxel_size_m,
         origin=np.array(manifest.origin, np.float64),
@@ -86,7 +86,7 @@ def read_occupancy(folder: Path, manifest: Manifest, codec: Codec) -> Occupancy:
 
 
 def _fit(arrays: dict[str, NDArray[Any]], blocks: int, codec: Codec) -> bool:
-    """Whether the arrays of occupancy.npz fit each other and the codec."""
+    """Whether the sizes of the arrays of occupancy.npz match each other and the codec."""
     occupied = int(np.count_nonzero(arrays["state"] == OCCUPIED))
     levels = arrays["levels"]
     return (

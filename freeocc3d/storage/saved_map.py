@@ -1,6 +1,6 @@
-"""A saved map, opened: its manifest is read at once, each other part when it is first used.
+"""A saved map. Opening it reads its manifest; each other part is read when it is first used.
 
-Nothing is unpickled, and the size of an array is checked against that of its file before memory is taken.
+Reading unpickles nothing, and checks the size of an array against its file before it allocates memory.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class SavedMap:
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
-        """Open a map folder: the manifest is read, and every file that it lists must be there and have its size.
+        """Open a map folder: read the manifest, and check that every file in it exists and has its size.
 
-        Raises MapError: no such folder, not a map, from a newer version, a missing or damaged file.
+        Raises MapError for a missing folder, a folder that is no map, a newer format, or a missing or damaged file.
         """
         path = Path(path)
         opened = cls(path, read_manifest(path))
@@ -53,17 +53,17 @@ class SavedMap:
 
     @property
     def up(self) -> NDArray[np.float64]:
-        """(3,) unit vector that points up in the map's frame, as well as the camera's attitude tells."""
+        """(3,) unit vector that points up in the map's frame, estimated from the cameras' attitude."""
         return np.array(self.manifest.up, np.float64)
 
     @property
     def metric(self) -> bool:
-        """Whether lengths are meters; where not, their unit is unknown."""
+        """Whether lengths are meters; if not, their unit is unknown."""
         return self.manifest.scale.metric
 
     @functools.cached_property
     def T_gravity_map(self) -> NDArray[np.float64]:
-        """(4, 4) to the frame with z up and the floor at z = 0; found now where an earlier version made the map."""
+        """(4, 4) to the frame with z up and the floor at z = 0; estimated here for maps of earlier versions."""
         if self.manifest.T_gravity_map is None:
             from ..occupancy.gravity_frame import estimate_gravity_frame
 
@@ -79,14 +79,14 @@ class SavedMap:
 
     @functools.cached_property
     def capture(self) -> Capture:
-        """The capture that the map was made of, opened as it was then: with the same options, and with the focal length
-        of the color camera that the run found. Raises FreeOccError if it is not there any more, or changed."""
+        """The capture that the map was made from, opened with the same options and the focal length of the color camera
+        that the run found. Raises FreeOccError if it no longer exists or has changed."""
         from ..capture import open_capture
         from ..capture.focal_correction import Reregistered
 
         path = self.manifest.capture.path
         if not path.startswith("builtin:") and not Path(path).exists():
-            raise FreeOccError(f"The capture {path}, of which {self.path} was made, is not there any more.")
+            raise FreeOccError(f"The capture {path}, from which {self.path} was made, no longer exists.")
         opened = open_capture(path, self.settings.capture, self.settings.backends.get("capture"))
         color_focal = float(self.report.get("color_focal", 1.0))
         return opened if color_focal == 1 else Reregistered(opened, color_focal)
@@ -127,7 +127,7 @@ class SavedMap:
 
     @functools.cached_property
     def report(self) -> dict[str, Any]:
-        """Timings, frames used and lost, memory, warnings of the run that made the map."""
+        """Timings, used and lost frames, memory and warnings of the run that made the map."""
         try:
             return dict(json.loads((self.path / REPORT).read_text(encoding="utf-8")))
         except (OSError, ValueError) as error:
@@ -142,35 +142,35 @@ class SavedMap:
 
     @functools.cached_property
     def encoder(self) -> Encoder:
-        """The picture side of the encoder that the map was built with, with the options that it had then. Raises
-        FreeOccError where it cannot be loaded again, or where it needs a capture that is not there any more."""
+        """The image encoder that the map was made with, with the same options. Raises FreeOccError if it cannot be
+        loaded, or needs a capture that no longer exists."""
         loaded: Encoder = self.settings.load_backend("language", self.capture if self.encoder_needs_capture else None)
         return loaded
 
     @property
     def encoder_needs_capture(self) -> bool:
-        """Whether the encoder reads more of a frame than its picture."""
+        """Whether the encoder reads more of a frame than its color image."""
         module = registry.load("language.encoders", self.manifest.encoder.name)
         return bool(getattr(module, "NEEDS_CAPTURE", True))
 
     @functools.cached_property
     def text_encoder(self) -> TextEncoder:
-        """The word side of the encoder that the map was built with."""
+        """The text encoder that the map was made with."""
         encoder = self.manifest.encoder
         restored: TextEncoder = registry.load("language.encoders", encoder.name).load_text(encoder.state)
         return restored
 
     @property
     def vocabulary(self) -> list[str]:
-        """The words that pictures and exports by class use: what the encoder tells apart without being asked, or of one
-        of open vocabulary, what a model has named in the scene."""
+        """The words that pictures and exports use as classes: the encoder's contrast words; with an open vocabulary,
+        the names that a model gave to the scene, if there are any."""
         named = self.scene_words if self.text_encoder.open_vocabulary else []
         return named or self.text_encoder.contrast_words()
 
     @property
     def scene_words(self) -> list[str]:
-        """Names that a vision-language model gave to what is in the scene, the most frequent first. A name that only
-        one of several keyframes has is left out: most things are seen twice."""
+        """Names that a vision-language model gave to things in the scene, most frequent first. A name that only one of
+        several keyframes has is left out: most things are seen twice."""
         named = self.manifest.vocabulary
         if named is None:
             return []
@@ -191,15 +191,17 @@ class SavedMap:
         try:
             size = (self.path / name).stat().st_size
         except OSError as error:
-            raise MapError(f"The map {self.path} lacks its {name}: copy the whole folder, or map again.") from error
+            raise MapError(
+                f"The map {self.path} lacks its file {name}: copy the whole folder, or map again."
+            ) from error
         if size != expected:
-            raise MapError(f"{self.path / name} is damaged: it has {size} bytes in place of {expected}.")
+            raise MapError(f"{self.path / name} is damaged: it has {size} bytes instead of {expected}.")
 
 
 def _of_frames(
     timestamps: NDArray[np.float64], times: NDArray[np.float64], T: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(N, 4, 4) with the pose of each timestamp that a trajectory has, NaN elsewhere."""
+    """(N, 4, 4) pose of each timestamp; NaN where the trajectory has none."""
     out = np.full((len(timestamps), 4, 4), np.nan)
     row = np.clip(np.searchsorted(timestamps, times), 0, max(len(timestamps) - 1, 0))
     out[row[timestamps[row] == times]] = T[timestamps[row] == times]

@@ -1,4 +1,4 @@
-"""The folder ``MAP.partial`` of a run in progress: what each stage left, and whether it may be taken up again."""
+"""The folder ``MAP.partial`` of a run in progress: the result of each stage, and whether a resumed run can use it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STAGES: dict[Stage, tuple[str, ...]] = {
     "gaussians": ("capture", "tracking", "gaussians", "fitting", "occupancy"),
     "language": ("capture", "tracking", "gaussians", "fitting", "occupancy", "language"),
 }
-"""Stages whose results are saved, and the configuration sections that they depend on."""
+"""Stages whose results are saved, and the configuration sections on which they depend."""
 
 _TRACKING, _STAGE_FEATURES, _MARKS = "tracking.npz", "features.stage.npz", "stages.json"
 _ANSWERS, _OFFLINE = "vocabulary.stage.json", "offline"
@@ -57,7 +57,8 @@ class WorkFolder:
 
     @classmethod
     def open(cls, output: Path, overwrite: bool, resume: bool) -> WorkFolder:
-        """Raises MapError if a map or an interrupted run is in the way; changes nothing on disk."""
+        """Open the work folder of a map; change nothing on disk. Raises MapError if a map or an interrupted run is in
+        the way."""
         if not output.name:
             raise MapError(f"'{output}' cannot be the name of a map folder.")
         folder = output.with_name(output.name + ".partial")
@@ -70,24 +71,25 @@ class WorkFolder:
                 path.name not in _OWN_FILES and not is_temporary(path) for path in folder.iterdir()
             )
             if strange:
-                raise MapError(f"{folder} is in the way, and is not an interrupted run's: move it, or choose another.")
+                raise MapError(f"{folder} is in the way and holds no interrupted run: move it, or choose another.")
             if (folder / _MARKS).is_file() and not (resume or overwrite):
                 raise MapError(
-                    f"{folder} holds the work of an interrupted run: go on with --resume, or start again with "
+                    f"{folder} holds the work of an interrupted run: continue with --resume, or start again with "
                     "--overwrite."
                 )
         return cls(folder, resume and (folder / _MARKS).is_file())
 
     @classmethod
     def made_of(cls, source: Path, output: Path, overwrite: bool) -> WorkFolder:
-        """For a map that is made of another one. Raises MapError as ``open`` does, and for the other's own place."""
+        """The work folder of a map that is made from another map. Raises MapError as ``open`` does, and if the output
+        is the source's own folder."""
         if output.resolve() == source.resolve():
-            raise MapError(f"A map made of {source} cannot take that map's own place: choose another folder.")
+            raise MapError(f"A map made from {source} cannot replace it: choose another folder.")
         return cls.open(output, overwrite, resume=False)
 
     @contextlib.contextmanager
     def begun_anew(self, output: Path) -> Iterator[None]:
-        """The folder is there and empty at first, and gone where writing ``output`` fails. Raises MapError then."""
+        """Make an empty folder, and remove it if writing ``output`` fails. Raises MapError then."""
         try:
             self._make()
             yield
@@ -98,9 +100,10 @@ class WorkFolder:
             raise
 
     def begin(self, identity: list[Any], settings: Settings) -> None:
-        """Make the folder, and decide which saved stages are still valid for this configuration and for what
-        ``identity`` says of the input. Raises MapError, and touches nothing, if a resumed run was another's."""
-        relevant = settings.changed("capture", max_broken=0.0)  # a run may go on with another
+        """Make the folder, and find the saved stages that are valid for this configuration and input. identity:
+        describes the input. Raises MapError, and changes nothing, if the resumed run had another input or other
+        tracking options."""
+        relevant = settings.changed("capture", max_broken=0.0)  # a resumed run may have another
         self._fingerprints = {
             stage: config.fingerprint(relevant, sections, identity) for stage, sections in STAGES.items()
         }
@@ -109,14 +112,14 @@ class WorkFolder:
             self._valid = {stage for stage, value in self._fingerprints.items() if saved.get(stage) == value}
             if "tracking" not in self._valid:
                 raise MapError(
-                    f"{self.folder} was begun with another capture, or other capture or tracking options: resume it "
+                    f"{self.folder} was started with another capture, or other capture or tracking options: resume "
                     "with the same ones, or start again with --overwrite."
                 )
             return
         self._make()
 
     def _make(self) -> None:
-        """Raises MapError where the folder cannot be made."""
+        """Make the folder, empty. Raises MapError."""
         if self.folder.exists():
             shutil.rmtree(self.folder)
         try:
@@ -125,14 +128,14 @@ class WorkFolder:
             raise MapError(f"Cannot create {self.folder}: {error.strerror}.") from error
 
     def save_tracking(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Keep layer 1's state, in place of the one before."""
+        """Save layer 1's state in place of the last one."""
         seconds = {**self.seconds, self._stage: self.seconds.get(self._stage, 0.0) + time.perf_counter() - self._since}
         log = {"broken": self.broken, "warnings": [notice.to_dict() for notice in self.warnings], "seconds": seconds}
         write_arrays(self.folder / _TRACKING, {**state, "log": np.array(json.dumps(log))})
         self._mark("tracking")
 
     def restore_tracking(self) -> dict[str, NDArray[Any]] | None:
-        """The state of the last checkpoint, if there is one and it is still valid."""
+        """The state of the last checkpoint; None if there is no valid one."""
         path = self.folder / _TRACKING
         if "tracking" not in self._valid or not path.is_file():
             return None
@@ -144,11 +147,11 @@ class WorkFolder:
         return state
 
     def forget_tracking(self) -> None:
-        """Drop layer 1's checkpoint: a run that is resumed from here on tracks anew."""
+        """Remove layer 1's checkpoint: a run that resumes from here tracks again from the start."""
         (self.folder / _TRACKING).unlink(missing_ok=True)
 
     def gaussians(self, compute: Callable[[], Gaussians]) -> Gaussians:
-        """The saved result of layer 2, or ``compute()``, saved."""
+        """The saved result of layer 2, or else ``compute()``, which is then saved."""
         path = self.folder / map_files.GAUSSIANS
         if "gaussians" in self._valid and path.is_file():
             return read_gaussian_ply(path)
@@ -159,7 +162,7 @@ class WorkFolder:
         return result
 
     def features(self, compute: Callable[[], NDArray[np.float16]]) -> NDArray[np.float16]:
-        """The saved result of layer 3, or ``compute()``, saved."""
+        """The saved result of layer 3, or else ``compute()``, which is then saved."""
         path = self.folder / _STAGE_FEATURES
         if "language" in self._valid and path.is_file():
             return np.asarray(read_arrays(path, {"features": ("f", 2)})["features"], np.float16)
@@ -170,30 +173,30 @@ class WorkFolder:
 
     @property
     def kept(self) -> bool:
-        """Whether there is a stage's result or a checkpoint to go on from."""
+        """Whether the folder holds a result or checkpoint from which a run can resume."""
         return (self.folder / _MARKS).is_file()
 
     @property
     def answers(self) -> Path:
-        """Where the answers about keyframes are kept, which say themselves to which questions."""
+        """The file of answers about keyframes; each answer states its question."""
         return self.folder / _ANSWERS
 
     def warn(self, progress: Progress, *notices: Notice) -> None:
-        """Tell the user now, and keep it for the map's report."""
+        """Show the notices now, and keep them for the map's report."""
         for notice in notices:
             self.warnings.append(notice)
             progress.warn(notice.text)
 
     def begin_offline(self) -> Path:
-        """The folder of what a tracker does for the whole scan before its first frame; from now on the run can be taken
-        up again, and ``_OFFLINE`` says itself how far it is."""
+        """The folder for what a tracker computes of the whole scan before its first frame. From now on the run can be
+        resumed; the content of the folder says how far it is."""
         (self.folder / _OFFLINE).mkdir(exist_ok=True)
         if "tracking" not in self._valid:
             self._mark("tracking")
         return self.folder / _OFFLINE
 
     def finish(self, output: Path) -> None:
-        """The work folder takes the map's name; a map that it replaces is gone only when the new one stands."""
+        """Give the work folder the map's name. A map that it replaces is removed only after that."""
         for path in self.folder.iterdir():
             if path.name in _STAGE_FILES or is_temporary(path):
                 path.unlink()
@@ -216,13 +219,13 @@ class WorkFolder:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def drop_if_empty(self) -> None:
-        """Leave nothing behind where nothing was done."""
+        """Remove the folder if it is empty."""
         with contextlib.suppress(OSError):
             self.folder.rmdir()
 
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Add the time spent inside to the stage's."""
+        """Add the time spent inside to the seconds of the stage."""
         self._stage, self._since = stage, time.perf_counter()
         try:
             yield
@@ -238,7 +241,7 @@ class WorkFolder:
             raise MapError(f"Cannot read {self.folder / _MARKS}: start again with --overwrite.") from error
 
     def _mark(self, stage: Stage) -> None:
-        """Record that a stage's result is saved; later stages' results are out of date."""
+        """Record that a stage's result is saved. Results of later stages become invalid."""
         order = list(STAGES)
         self._valid = {name for name in self._valid if order.index(name) < order.index(stage)} | {stage}
         marks = {name: self._fingerprints[name] for name in self._valid}

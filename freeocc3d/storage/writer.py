@@ -1,4 +1,4 @@
-"""Writing a map folder: every part, the manifest last, in a work folder that then takes the map's name."""
+"""Writes a map folder: every part, and last the manifest, into a work folder that then takes the map's name."""
 
 from __future__ import annotations
 
@@ -30,14 +30,13 @@ from .work_folder import WorkFolder
 
 @dataclass(frozen=True)
 class MapParts:
-    """What a map is written of. A part that is None is that of the map that this one is made from: its files are
-    copied, and what the manifest says of it stays.
+    """The parts of a map to write. If a part is None, its files and its manifest entries come from the source map.
 
-    facts: what only the manifest says; in a map that is made from another one that map's manifest, changed.
-    report: gives what report.json holds; called last, for it may say how long saving took.
+    facts: what only the manifest states; for a map made from another map, the changed manifest of that map.
+    report: returns the content of report.json; called last, since the content may include the time of saving.
     codec: packs the features of the voxels and of the Gaussians.  features: (N, D) of the Gaussians.
-    keyframes: those of the trajectory; where they lie in the work folder already, images of others are removed.
-    draw: draws pictures into a folder, or leaves it without any.
+    keyframes: those of the trajectory. If they already lie in the work folder, images of other frames are removed.
+    draw: draws pictures into a folder, or none.
     """
 
     facts: MapFacts
@@ -50,23 +49,22 @@ class MapParts:
     trajectory: Trajectory | None = None
     keyframes: Keyframes | None = None
     depth_factor: float = 1.0
-    """Of the depth of keyframes that are copied."""
+    """Multiplies the depth of copied keyframes."""
     draw: Callable[[Path], None] | None = None
 
 
 def write_changed_map(source: SavedMap, work: WorkFolder, output: Path, parts: MapParts) -> None:
-    """Write a map that is made from another one. Raises MapError where it cannot be written; nothing is left then."""
+    """Write a map that is made from another one. Raises MapError if that fails; nothing is left then."""
     with work.begun_anew(output):
         write_map(work, parts, source)
         work.finish(output)
 
 
 def write_map(work: WorkFolder, parts: MapParts, source: SavedMap | None = None) -> None:
-    """Write a whole map into the work folder, the manifest last, after which ``WorkFolder.finish`` gives it its name.
+    """Write a whole map into the work folder, the manifest last. ``WorkFolder.finish`` then gives it its name.
     Gaussians and keyframes that a stage of the run has left there are not written again.
 
-    source: the map that this one is made from. Raises OSError, and MapError for a broken keyframe of the source.
-    """
+    source: the map that this one is made from. Raises OSError, and MapError for a broken keyframe of the source."""
     folder = work.folder
     with work.timed("saving"):
         (folder / map_files.CONFIG).write_text(config.dump(parts.settings), encoding="utf-8")
@@ -98,13 +96,13 @@ def _write_keyframes(work: WorkFolder, keyframes: Keyframes, depth_factor: float
         keyframes.copy_to(folder, depth_factor)
         return
     if len(keyframes) < len(Keyframes.load(folder)):
-        work.forget_tracking()  # its checkpoint counts those that are left out from here on
+        work.forget_tracking()  # its checkpoint counts the keyframes that are now left out
     keyframes.save_index()
     keyframes.drop_unlisted()
 
 
 def _copy_missing(source: Path, folder: Path, pictures: bool) -> None:
-    """Copy what was not written anew, but for the report."""
+    """Copy the files that were not written, except the report."""
     for name in (*map_files.ALWAYS, *(map_files.PICTURES if pictures else ())):
         if name != map_files.REPORT and not (folder / name).exists() and (source / name).is_file():
             shutil.copy2(source / name, folder / name)
@@ -113,7 +111,7 @@ def _copy_missing(source: Path, folder: Path, pictures: bool) -> None:
 
 
 def _manifest(folder: Path, parts: MapParts, report: Mapping[str, Any]) -> Manifest:
-    """The facts, and what the parts that are written anew change."""
+    """The facts, changed by the parts that are written."""
     said: dict[str, Any] = {name: getattr(parts.facts, name) for name in parts.facts.__struct_fields__}
     counts: dict[str, Any] = msgspec.structs.asdict(said["counts"]) if "counts" in said else {}
     if "submaps" in report:

@@ -81,7 +81,7 @@ def test_mistakes_with_configurations_and_outputs(tmp_path, room) -> None:
     assert "not valid YAML" in refused("reconstruct", "builtin:room", "-o", out, "--config", tmp_path / "c.yaml")
     assert "--overwrite" in refused("reconstruct", "builtin:room", "-o", room)
     cuda = refused("reconstruct", "builtin:room", "-o", out, *SMALL, "--device", "cuda:7")
-    assert "Nothing that is chosen runs on cuda:7" in cuda
+    assert "No chosen backend runs on cuda:7" in cuda
     odometry = ("--set", "tracking.backend=odometry", "--device", "cuda:7")
     assert "There is no device 'cuda:7'" in refused("reconstruct", "builtin:room", "-o", out, *SMALL, *odometry)
     assert list(tmp_path.iterdir()) == [tmp_path / "c.yaml"]
@@ -124,7 +124,7 @@ def test_the_demo_thins_the_walk_and_answers_its_words(tmp_path) -> None:
 
 
 def test_mistakes_with_maps(tmp_path) -> None:
-    assert "There is no map folder" in refused("query", tmp_path / "nothing", "red")
+    assert "nothing does not exist" in refused("query", tmp_path / "nothing", "red")
     assert "not a map" in refused("info", tmp_path)
     assert run("query", code=2).stdout == ""
 

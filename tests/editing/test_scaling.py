@@ -120,15 +120,15 @@ def test_a_length_between_two_pixels_or_words(room: Map, half: Map) -> None:
 
 def test_points_that_are_none_are_told(half: Map) -> None:
     keyframe = int(half.trajectory.keyframes[1])
-    with pytest.raises(MapError, match=r"Frame 1 is no keyframe of .*; the nearest are 0, "):
+    with pytest.raises(MapError, match=r"Frame 1 is not a keyframe of .*; the nearest are 0, "):
         scaling.scale_by_length(half, ["1:5,5", "red cup"], 1.0)
-    with pytest.raises(MapError, match=r"Pixel 999,5 is outside of keyframe .*320 x 240"):
+    with pytest.raises(MapError, match=r"Pixel 999,5 is outside keyframe .*320 x 240"):
         scaling.scale_by_length(half, [f"{keyframe}:999,5", "red cup"], 1.0)
     with pytest.raises(MapError, match=r"'xylophone' matches nothing"):
         scaling.scale_by_length(half, ["xylophone", "red cup"], 1.0)
-    with pytest.raises(MapError, match="are one point of the map"):
+    with pytest.raises(MapError, match="are the same point of the map"):
         scaling.scale_by_length(half, ["red cup", "red cup"], 1.0)
-    with pytest.raises(MapError, match="A length is a positive number of meters"):
+    with pytest.raises(MapError, match="The length must be a positive number of meters"):
         scaling.scale_by_length(half, ["red cup", "blue chair"], -1.0)
 
 

@@ -236,4 +236,4 @@ def test_the_command_says_where_it_is(server: Hub, home: Path, capsys: pytest.Ca
         (server.folder / name).unlink()
     (server.folder / "model.safetensors").write_bytes(b"weights")
     succeed(["models", "pull", REPOSITORY])
-    assert "a checkpoint, to be exported: freeocc3d models export" in " ".join(capsys.readouterr().out.split())
+    assert "a checkpoint; export it: freeocc3d models export" in " ".join(capsys.readouterr().out.split())

@@ -174,13 +174,13 @@ def test_the_command_lists_and_verifies(home: Path, capsys: pytest.CaptureFixtur
     succeed(["models", "list"])
     assert "unusable" in capsys.readouterr().out
     succeed(["models", "verify", "good"])
-    assert "3 files are as they should be" in capsys.readouterr().out
+    assert "3 files match their hashes" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="1"):
         main(["models", "verify", "bad"])
     assert "text.onnx is damaged" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="1"):
         main(["models", "verify"])  # one that is damaged hides no other
     said = capsys.readouterr()
-    assert "good: 3 files are as they should be" in said.out
+    assert "good: 3 files match their hashes" in said.out
     assert "text.onnx is damaged" in said.err
     assert "strange is no model package" in said.err

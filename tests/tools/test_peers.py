@@ -178,5 +178,5 @@ def test_dense_slam_follows_the_room(monkeypatch) -> None:
     error = T_cam_first_true @ T_first_cam[5]
     assert np.linalg.norm(error[:3, 3]) < 0.08
     assert np.degrees(np.arccos((np.trace(error[:3, :3]) - 1) / 2)) < 2  # of 5 degrees
-    assert set(seconds) == {"decode", "track", "integrate", "synthesise"}
+    assert set(seconds) == {"decode", "track", "integrate", "synthesize"}
     assert failures == 0

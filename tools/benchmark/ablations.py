@@ -1,7 +1,7 @@
 """The ablations of ``configs/ablations``: configurations that are mapped and scored by name.
 
-The first line of a file says what the variant is, ``# table:`` to which table of the paper it belongs, and ``# needs:``
-what is lacking while this version of freeocc3d does not know its options. Whether it does is found out by asking it.
+The first line of a file says what the variant is. ``# table:`` names its table of the paper. ``# needs:`` says what is
+missing where this version of freeocc3d refuses its options; a trial run of the check finds that out.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .folders import REPOSITORY
 FOLDER = REPOSITORY / "configs" / "ablations"
 
 OURS = "rgbd"
-"""The variant whose poses the peers ``ours_*`` use, and whose map is asked."""
+"""The variant whose poses the peers ``ours_*`` use, and whose map is queried."""
 
 UNFITTED, MONO = "rgbd_no_fitting", "mono"
 TRUE_POSES, TRUE_CLASSES = "rgbd_true_poses", "rgbd_true_poses_closed_set"
@@ -41,8 +41,8 @@ for path in sys.argv[1:]:
 
 @dataclass(frozen=True)
 class Ablation:
-    """title: what it is.  table: where the paper has it.  lacking: why it cannot run, one sentence; empty if it can.
-    color_alone: whether it does without depth."""
+    """title: what it is.  table: of the paper.  lacking: why it cannot run, one sentence; empty if it can. color_alone:
+    whether it works without depth."""
 
     name: str
     title: str
@@ -53,7 +53,7 @@ class Ablation:
 
 
 def list_ablations() -> list[str]:
-    """Of all ablations."""
+    """The names of all ablations."""
     return sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 

@@ -1,10 +1,10 @@
-"""Asks maps for things that are not there: how often something is returned all the same.
+"""Asks maps for things that are not there, and counts how often they return a region.
 
-A capture with class images is mapped with the encoder ``labels``, another with ``segmenter`` and the network beside the
-captures. The words are names of LVIS and Objects365 (``clip_text_names.npz``), evenly spread over those that name
-nothing in the scene: a name is absent unless it, a synonym, what it is a kind of by its last word, or a wider or
-narrower word is something that the scene holds. What a scene holds is what its ground truth holds; where that has no
-classes, what one sees in its images (``SEEN``).
+A capture with class images is mapped with the encoder ``labels``; other captures with ``segmenter`` and the network in
+the models folder. The words are names of LVIS and Objects365 (``clip_text_names.npz``), evenly spread over the names of
+things that the scene does not hold. A name is absent unless the scene holds it, a synonym, the kind that its last word
+names, or a wider or narrower word. The ground truth says what a scene holds; where it has no classes, its images do
+(``SEEN``).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SEEN = {
         "remote control", "trash can",
     ),
 }  # fmt: skip
-"""What is in captures whose truth has no classes, by looking at their images."""
+"""What the images of captures without true classes show."""
 
 SEGMENTER = {
     "model": str(MODELS / "enet_nyu40.onnx"),
@@ -41,7 +41,7 @@ SEGMENTER = {
 
 
 def absent_names(names: list[str], present: list[str]) -> list[str]:
-    """The names that name nothing of what is present, in alphabetical order."""
+    """The names of nothing that is present, in alphabetical order."""
     from freeocc3d.language.synonyms import match_names
 
     return sorted({name for name in names if not match_names(name, present)[0]})
@@ -53,17 +53,17 @@ def spread(names: list[str]) -> list[str]:
 
 
 def measure_absent_words(capture: str) -> Figures:
-    """Shares of absent names, and of the present classes' names, that return a region."""
+    """Shares of the absent names, and of the present classes' names, that return a region."""
     from freeocc3d.core.progress import Progress
     from freeocc3d.pipeline.run import reconstruct
 
     if not MODELS.is_dir():
-        raise PartFailed(f"there are no names to ask for: {MODELS} is missing")
+        raise PartFailed(f"there are no names to ask for: the folder {MODELS} is missing")
     names = [str(name) for name in np.load(MODELS / "clip_text_names.npz")["names"]]
     present = scene_classes(Path(capture))
     seen = list(present or SEEN.get(Path(capture).name, ()))
     if not seen:
-        raise PartFailed(f"what {capture} shows is not known: name it in SEEN of tools/benchmark/absent_words.py")
+        raise PartFailed(f"the things in {capture} are not known: add them to SEEN of tools/benchmark/absent_words.py")
     language = {"encoder": "labels"} if present else {"encoder": "segmenter", "segmenter": SEGMENTER}
     tracking = {"backend": "known"} if present else {}
     settings = {"language": language, "tracking": tracking, "fitting": {"passes": 0}}
@@ -96,7 +96,7 @@ def measure_absent_words(capture: str) -> Figures:
 
 
 def scene_classes(capture: Path) -> tuple[str, ...]:
-    """Names of the classes that a capture's ground truth holds; none where it knows geometry only."""
+    """Names of the classes in a capture's ground truth; none if it holds geometry only."""
     from freeocc3d.evaluation.ground_truth import load_ground_truth
 
     path = capture / "ground_truth.npz"

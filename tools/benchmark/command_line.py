@@ -1,12 +1,12 @@
-"""Maps, ablations and the strongest peers that run here, on the same captures in one run: every figure that is claimed.
+"""Measures maps, ablations and the strongest peers that run here, on the same captures in one run.
 
     python tools/benchmark.py [--suite quick|full] [-o FOLDER] [--compare OLD/results.json]
     python tools/benchmark.py --captures SCAN --variants rgbd dense_slam_tsdf ours_octomap
 
 Rows are captures x variants. A variant is an ablation of configs/ablations (mapped and scored by the command), a peer,
-or another measurement. Each is measured in a process of its own, so that its threads, its memory peak and its imports
-are its own; this process imports little. Times a frame are over all frames of the capture, although the peers that make
-voxels use every second one. A time moves by some percent with what else the machine does: compare ratios of one run.
+or another measurement. Each runs in its own process, with its own threads, memory peak and imports; this process
+imports little. Times per frame count all frames of the capture, although the peers that make voxels use every second
+one. Times vary by some percent with the machine's other work: compare ratios within one run.
 """
 
 from __future__ import annotations
@@ -56,15 +56,13 @@ def parse_arguments() -> argparse.Namespace:
     )
     parser.add_argument("--suite", choices=SUITES, default="quick", help="quick: minutes; full: all captures, variants")
     parser.add_argument("--captures", nargs="+", type=Path, metavar="SCAN", help="folders of scans with poses")
-    parser.add_argument(
-        "--variants", nargs="+", metavar="NAME", help="what --list lists; all of the suite's if not given"
-    )
-    parser.add_argument("--list", action="store_true", help="list what --variants can name, and what runs")
+    parser.add_argument("--variants", nargs="+", metavar="NAME", help="names from --list; default: all of the suite")
+    parser.add_argument("--list", action="store_true", help="list the names for --variants, and which can run")
     parser.add_argument("--frames", type=int, metavar="N", help="the first N frames only")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="FOLDER", help="write results.json, table.md and plots here"
     )
-    parser.add_argument("--compare", type=Path, metavar="OLD", help="an earlier results.json: print what moved")
+    parser.add_argument("--compare", type=Path, metavar="OLD", help="an earlier results.json: print what changed")
     parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
     parser.add_argument("--inside", nargs=2, help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -79,7 +77,7 @@ def parse_arguments() -> argparse.Namespace:
             if not capture.is_dir():
                 parser.error(f"there is no capture {capture}: name one with --captures")
     if given.frames is not None and given.frames < 3:
-        parser.error("--frames needs at least 3, for fewer cannot be aligned")
+        parser.error("--frames needs at least 3, since fewer cannot be aligned")
     return given
 
 

@@ -1,4 +1,4 @@
-"""What moved between two runs."""
+"""What changed between two runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COMPARED = {
     "peak_memory_bytes": ("memory GB", 1e-9, 0.05),
     "map_bytes": ("map MB", 1e-6, 0.1),
 }
-"""Figure -> (name, factor, what counts as a move)."""
+"""Figure -> (name, factor, smallest change that is reported)."""
 
 
 def describe_moves(old: Figures, new: Figures) -> str:

@@ -1,8 +1,8 @@
-"""What precisions of a model package cost and lose, and what guided upsampling gains at the edges of class images.
+"""What each precision of a model package costs and loses, and what guided upsampling gains at the edges of class
+images.
 
-The network is a small CLIP with random weights: its size and speed are those of any network of its shape; what int8 and
-fp16 lose may differ with real weights.
-"""
+The network is a small CLIP with random weights. Its size and speed are those of any network of its shape; the losses of
+int8 and fp16 may differ with real weights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .figures import Figures, Line
 from .timing import time_fastest
 
 SHAPE = {"hidden_size": 384, "num_hidden_layers": 6, "num_attention_heads": 6, "intermediate_size": 1536}
-"""Of the image and the text tower: a third of ViT-B/16's weights in half of its layers."""
+"""Shape of the image and the text tower: a third of ViT-B/16's weights in half of its layers."""
 DIMENSION, PATCH = 512, 16
 FRAME = 480, 640
 WORDS = ("chair", "table", "red sofa", "a plant on the window sill")
@@ -89,8 +89,8 @@ def _checkpoint() -> Any:
 
 
 def measure_edges() -> Figures:
-    """Class images of the built-in room averaged over patches and brought back: which share of the pixels near an edge
-    gets its class from the nearest patch, linearly between patches, and guided by the image."""
+    """Averages class images of the built-in room over patches and upsamples them: the share of the pixels near an edge
+    that get their class from the nearest patch, linearly between patches, and guided by the image."""
     import cv2
     import numpy as np
 
@@ -122,7 +122,7 @@ def measure_edges() -> Figures:
 
 
 def encoders_lines(figures: Figures) -> list[Line]:
-    """What was measured, and what is asked for."""
+    """Rows of a table: what, measured, asked."""
     height, width = figures["frame"]
     lines: list[Line] = []
     for row in figures["rows"]:
@@ -131,7 +131,7 @@ def encoders_lines(figures: Figures) -> list[Line]:
         cosines = f"patches {row['patch_cosine']:.4f}, words {row['text_cosine']:.4f}"
         measured = (
             f"{row['bytes'] / 1e6:.1f} MB; {width} x {height} pixels {frame_ms}, upsampled {upsampled_ms}; "
-            f"a prompt {prompt_ms}; least cosine to fp32: {cosines}"
+            f"a prompt {prompt_ms}; smallest cosine to fp32: {cosines}"
         )
         lines.append((f"clip, {row['precision']}", measured, ""))
     edges = figures["edges"]

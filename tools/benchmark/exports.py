@@ -1,9 +1,9 @@
 """Every exporter on a map of a capture: seconds, peak memory and bytes.
 
-Each runs as ``freeocc3d export`` does, in a process of its own, start and loading of the map included. The ``.bt``
-is compared with what OctoMap itself writes of the same voxels, and the plan for robots with the truth's. This process
-maps nothing itself, and loads no voxels before all is exported: a process begins with the peak of the one that starts
-it.
+Each runs as ``freeocc3d export`` in its own process, with start and loading of the map included. The ``.bt`` is
+compared with OctoMap's own file of the same voxels, and the plan for robots with the plan of the truth. This process
+maps nothing itself, and loads no voxels before all exports are done: a process begins with the memory peak of the
+process that starts it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .plan_agreement import measure_plan, plan_lines
 from .processes import COMMAND, run_timed
 
 SECONDS, BYTES = 10, 2e9
-"""What is asked of each at 4 cm."""
+"""What is asked of each export at 4 cm."""
 
 BT = "octomap .bt"
 EXPORTS: dict[str, tuple[str, str, dict[str, str]]] = {
@@ -40,7 +40,7 @@ EXPORTS: dict[str, tuple[str, str, dict[str, str]]] = {
     "poses, colmap": ("colmap", "poses", {}),
     "poses, nerfstudio": ("nerfstudio", "poses", {"form": "nerfstudio"}),
 }
-"""What is written: file, format, options."""
+"""The exports: file, format, options."""
 
 
 def measure_exports(capture: str) -> Figures:

@@ -11,6 +11,6 @@ MODELS = DATA.parent / "models"
 
 
 def capture_name(capture: Path) -> str:
-    """What tables call a capture: its path in the data folder, or its folder's name."""
+    """The capture's name in tables: its path in the data folder, or its folder's name."""
     capture, data = capture.resolve(), DATA.resolve()
     return str(capture.relative_to(data)) if capture.is_relative_to(data) else capture.name

@@ -1,4 +1,4 @@
-"""What layer 3 leaves of mistakes in class images: mIoU after the fusion of images with flipped regions."""
+"""How far layer 3 corrects mistakes in class images: mIoU after fusing images with flipped regions."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from .figures import Figures, tabulate
 
 FLIPPED, SEEDS, CELL_PX = 0.2, (0, 1, 2), 48
 KINDS = ("superpixels", "components")
-"""Regions whose label is flipped: what a jittered grid of ``CELL_PX`` cuts each class into, or its connected parts."""
+"""Regions whose label is flipped: the parts that a jittered grid of ``CELL_PX`` cuts each class into, or its connected
+components."""
 
 
 def measure_fusion(map_path: str) -> Figures:
-    """mIoU of a map of class images, as a share of that of the nearest true labels at the same voxels, and what is left
-    when a share of each keyframe's regions shows a class at random: ours, plain averages, the last keyframe's word."""
+    """mIoU of a map of class images, the mIoU of the nearest true labels at the same voxels, and the mIoU when a share
+    of each keyframe's regions shows a random class: ours, plain averages, the last keyframe's label."""
     from freeocc3d.language.encoders.labels import LabelsEncoder
     from freeocc3d.query.scan_map import load_map
 
@@ -34,7 +35,7 @@ def measure_fusion(map_path: str) -> Figures:
 
 
 class Flipped:
-    """Class images of which a share of the regions is relabeled to another class at random."""
+    """Class images in which a random share of the regions is relabeled to another class."""
 
     def __init__(self, images: Any, classes: int, kind: str, seed: int):
         self.images, self.classes, self.kind, self.seed = images, classes, kind, seed
@@ -67,7 +68,7 @@ def _superpixels(image: Any, rng: Any) -> Any:
 
 
 def _components(image: Any) -> Any:
-    """Numbers of the connected parts of the classes."""
+    """Numbers of the connected components of the classes."""
     import cv2
     import numpy as np
 
@@ -125,7 +126,7 @@ class _Scene:
             yield PosedFrame(frame, T, row)
 
     def fused(self, encoder: Any) -> Figures:
-        """mIoU by way of fusing."""
+        """mIoU by method of fusion."""
         import numpy as np
 
         from freeocc3d.language.feature_fusion import FeatureFusion
@@ -144,7 +145,7 @@ class _Scene:
         return {"ours": self.score(ours.features()), "mean": self.score(mean.features()), "last": self.score(last)}
 
     def score(self, features: Any) -> float:
-        """mIoU over the classes present of the voxels' nearest words."""
+        """mIoU, over the present classes, of the words nearest to the voxels."""
         import numpy as np
 
         from freeocc3d.core.voxel_keys import unpack_voxels
@@ -186,7 +187,7 @@ def _slots(occupancy: Any, bins: Any) -> Any:
 
 
 def tabulate_fusion(measured: list[Figures]) -> list[str]:
-    """A table of mIoU, a row a capture and kind of flips."""
+    """A table of mIoU, a row for each capture and kind of flips."""
     rows = []
     for found in measured:
         capture = found["capture"]

@@ -1,4 +1,4 @@
-"""How well a map's Gaussians show frames that they were not fitted to: every tenth of the capture."""
+"""How well a map's Gaussians show frames that they were not fitted to: every tenth frame of the capture."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ EVERY = 10
 
 
 def measure_held_out(loaded: Any) -> dict[str, Any]:
-    """PSNR and depth error on every tenth frame that has a pose and is no keyframe, at the map's own poses."""
+    """PSNR and depth error on every tenth frame that has a pose and is not a keyframe, at the map's own poses."""
     from freeocc3d.capture.focal_correction import Reregistered
     from freeocc3d.gaussians import fitting, rendered_views
     from freeocc3d.gaussians.rasterizers import cpu

@@ -1,4 +1,4 @@
-"""One capture's runs, and where they leave what others read."""
+"""One capture's runs, and the folders where they leave results for each other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """What rows call the capture."""
+        """The capture's name in the rows."""
         return capture_name(self.capture)
 
     def map(self, variant: str) -> Path:
@@ -26,5 +26,5 @@ class Job:
         return self.folder / variant
 
     def poses(self, source: str) -> Path:
-        """Where a run leaves its poses for others."""
+        """The file where a run leaves its poses for others."""
         return self.folder / f"{source}.npz"

@@ -13,8 +13,8 @@ GRIDS = ((30, 40), (120, 160))
 
 
 def measure_lifting() -> Figures:
-    """Bytes a second of the fusion of 512-dimensional features: of every Gaussian in view its feature is read, and its
-    sum is read and written."""
+    """Bytes a second of the fusion of 512-dimensional features: for every Gaussian in view it reads the feature, and
+    reads and writes the sum."""
     import numpy as np
 
     from freeocc3d.language.feature_fusion import FeatureFusion
@@ -39,7 +39,7 @@ def measure_lifting() -> Figures:
 
 
 def lifting_lines(figures: Figures) -> list[Line]:
-    """What was measured, and what is asked for."""
+    """Rows of a table: what, measured, asked."""
     copy = figures["copy_bytes_per_second"]
     return [
         (

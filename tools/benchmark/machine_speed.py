@@ -1,4 +1,4 @@
-"""What this machine reaches at most: copies of memory, and exponentials."""
+"""The highest speeds of this machine: copies of memory, and exponentials."""
 
 from __future__ import annotations
 

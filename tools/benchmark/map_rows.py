@@ -1,4 +1,4 @@
-"""Rows of the ablations: a capture mapped by the command, and scored against the capture's poses and ground truth."""
+"""Rows of the ablations: the command maps a capture, and its poses and ground truth score the map."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def _count_frames(capture: Path) -> int:
 
 
 def score_map(map: str, capture: str, out: str) -> Figures:
-    """ATE and RPE against the capture's poses; IoU and mIoU where it brings a ground truth. Leaves the aligned poses of
-    all frames in ``out``."""
+    """ATE and RPE against the capture's poses; IoU and mIoU if it has a ground truth. Leaves the aligned poses of all
+    frames in ``out``."""
     from freeocc3d.evaluation import scene_scoring, scoring
     from freeocc3d.evaluation.ground_truth import load_ground_truth
     from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors

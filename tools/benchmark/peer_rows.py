@@ -1,5 +1,4 @@
-"""Rows of the peers: what Open3D, OctoMap and plain back-projection make of a capture, at its poses, ours or dense
-SLAM's."""
+"""Rows of the peers: Open3D, OctoMap and plain back-projection on a capture, at its poses, ours or dense SLAM's."""
 
 from __future__ import annotations
 
@@ -19,11 +18,11 @@ PEERS = {
     "true_poses_back_projection": "the capture's own poses, points counted (the ceiling)",
     "true_poses_tsdf": "the capture's own poses, TSDF (the ceiling)",
 }
-"""``POSES_OCCUPANCY``: where the poses come from, and what makes voxels of them."""
+"""``POSES_OCCUPANCY``: the source of the poses, and the method that makes voxels."""
 
 
 def run_dense_slam(job: Job) -> Figures:
-    """Open3D's dense SLAM on the frames: its seconds a step; it leaves its poses. Raises PartFailed."""
+    """Run Open3D's dense SLAM on the frames, and save its poses. Returns its seconds a step. Raises PartFailed."""
     figures = run_inside(
         "peer_rows:track_dense_slam", capture=str(job.capture), frames=job.frames, out=str(job.poses("dense_slam"))
     )
@@ -60,13 +59,13 @@ def track_dense_slam(capture: str, frames: int | None, out: str) -> Figures:
 
 
 def measure_peer(job: Job, name: str, slam: Figures | None) -> Figures:
-    """One peer's occupancy. slam: of dense SLAM, whose poses ``dense_slam_*`` use. Raises PartFailed."""
+    """Measure one peer's occupancy. slam: of dense SLAM, whose poses ``dense_slam_*`` use. Raises PartFailed."""
     source = next(s for s in ("dense_slam", "ours", "true_poses") if name.startswith(s))
     poses = {"dense_slam": job.poses("dense_slam"), "ours": job.poses(OURS), "true_poses": None}[source]
     if source == "dense_slam" and slam is not None and "error" in slam:
         raise PartFailed(slam["error"])
     if poses is not None and not poses.is_file():
-        raise PartFailed(f"there are no poses of {source}: name the variant that makes them, too")
+        raise PartFailed(f"there are no poses of {source}: also name the variant that makes them")
     truth = job.capture / "ground_truth.npz"
     if not truth.is_file():
         raise PartFailed(f"{job.name} has no ground_truth.npz to score against")
@@ -93,8 +92,8 @@ def measure_peer(job: Job, name: str, slam: Figures | None) -> Figures:
 
 
 def score_occupancy(kind: str, capture: str, frames: int | None, poses: str | None, truth: str) -> Figures:
-    """Score what a peer calls occupied, given the capture's poses (``poses`` None) or those in a file, which are in the
-    true frame already."""
+    """Score a peer's occupied voxels, at the capture's poses (``poses`` None) or those in a file, which are in the true
+    frame."""
     import numpy as np
 
     from freeocc3d.capture import open_capture

@@ -1,18 +1,18 @@
-"""The strongest peers that run on a CPU, measured beside our own map on the same frames and poses.
+"""The strongest peers that run on a CPU, for comparison with our own map on the same frames and poses.
 
     dense_slam               Open3D's dense SLAM (``t.pipelines.slam``): color and depth to poses
     tsdf_occupied            Open3D's TSDF (``t.geometry.VoxelBlockGrid``): the surface at given poses
     back_projected_occupied  the plainest baseline: depth pixels added up in the voxels that they fall in
     octomap_occupied         OctoMap (A. Hornung et al., OctoMap, Autonomous Robots 2013) through pyoctomap
 
-Every parameter is a constant of this module, the same for all captures; the occupancy peers' were chosen once, in
-their favor, on 7-Scenes' kitchen and two rendered rooms together. What the libraries ask for is left as they publish
-it, except where a constant below says why not. A capture's reader has already dropped depth beyond the sensor's range,
-so the occupancy peers use all that is left. They take the same frames, every second one with a pose, answer on the same
-lattice in the frame of the poses that they are given, and know no unknown: a voxel that they have not seen is not
-occupied. A frame that cannot be decoded is left out.
+Every parameter is a constant of this module, the same for all captures. Those of the occupancy peers were chosen once,
+in their favor, on 7-Scenes' kitchen and two rendered rooms together. The libraries' published values stay as they are,
+except where a constant below gives a reason. A capture's reader has already dropped depth beyond the sensor's range, so
+the occupancy peers use all depth that is left. They use the same frames, every second one with a pose, and the same
+lattice, in the frame of the poses. They have no unknown state: a voxel that they have not seen is not occupied. A frame
+that cannot be decoded is left out.
 
-The kitchen's truth is itself a TSDF of that capture at its own poses: there, a TSDF at the same poses is nearly
+The kitchen's truth is itself a TSDF of that capture at its own poses. There, a TSDF at the same poses is nearly
 compared with itself.
 """
 
@@ -38,34 +38,34 @@ SLAM_DEPTH_MIN_M, SLAM_DEPTH_MAX_M = 0.1, 6.0
 SLAM_DEPTH_DIFF_M = 0.07
 SLAM_TRUNCATION_VOXELS = 8.0
 SLAM_BLOCKS = 40_000
-"""Open3D's examples/python/t_reconstruction_system/default_config.yml, but for the voxel size and the greatest depth,
-there 3 m: with the sensor's 6 m the kitchen's error stays what it is, and the house's bedroom is not lost."""
+"""Open3D's examples/python/t_reconstruction_system/default_config.yml, except for the voxel size and the largest depth,
+which is 3 m there: with the sensor's 6 m the kitchen's error stays the same, and the house's bedroom is not lost."""
 
 SLAM_UNITS_PER_METER = 5000.0
-"""Of the 16-bit depth that dense SLAM is given: no rounding for captures in millimeters, 13 m at most."""
+"""Units of dense SLAM's 16-bit depth: no rounding for captures in millimeters, and a range of 13 m."""
 
 TSDF_VOXEL_SIZE_M = 0.02
 TSDF_TRUNCATION_VOXELS = 4.0
 """8 cm, half of Open3D's default: with 16 cm the two faces of doors, boards and table tops blot each other out."""
 
 TSDF_MIN_WEIGHT = 1.0
-"""Observations that a corner of the surface needs more than; Open3D's default 3 drops what few frames have seen."""
+"""A corner of the surface needs more observations than this. Open3D's default 3 drops what few frames have seen."""
 
 TSDF_MIN_AREA_M2 = 6e-4
-"""Surface in a voxel from which on it is occupied: the least that the kitchen's truth counts."""
+"""Smallest surface in an occupied voxel: the smallest that the kitchen's truth counts."""
 
 PIXEL_STRIDE = 4
-"""Every n-th pixel of every n-th row is back-projected, or cast as a ray: at 6 m that is still 5 cm from point to point
-at 640 x 480, less than a voxel."""
+"""Every n-th pixel of every n-th row is back-projected, or cast as a ray. At 6 m and 640 x 480, points are then 5 cm
+apart, less than a voxel."""
 
 MIN_SEEN_FACES = 1.0
-"""Seen area, in faces of a voxel, from which on a voxel is occupied. A pixel counts the area that it covers at its
-depth, so that the far side of a room is held to the same as the near one."""
+"""Smallest seen area of an occupied voxel, in faces of a voxel. A pixel counts the area that it covers at its depth, so
+near and far sides of a room need the same area."""
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where occupancy is asked: voxel (i, j, k) covers ``origin + [i, i+1) * voxel_size``.
+    """The lattice of the occupancy: voxel (i, j, k) covers ``origin + [i, i+1) * voxel_size``.
 
     origin: (3,) lower corner of voxel (0, 0, 0) in the frame of the poses, meters.
     shape: voxels along x, y and z.  voxel_size: edge of a voxel, meters.
@@ -85,10 +85,10 @@ class Lattice:
 
 
 def dense_slam(capture: Capture, frames: Sequence[int]) -> tuple[NDArray[np.float64], Seconds, int]:
-    """Decode, track, integrate and synthesise the given frames, in their order.
+    """Decode, track, integrate and synthesize the given frames, in their order.
 
-    Returns T_world_cam (N, 4, 4) of the capture's N frames, the world being the first camera's and NaN what was not
-    used; the seconds of each step; and the number of frames whose tracking failed, which keep the last pose.
+    Returns T_world_cam (N, 4, 4) of the capture's N frames, where the world is the first camera and unused frames are
+    NaN; the seconds of each step; and the number of frames whose tracking failed, which keep the last pose.
     """
     import open3d as o3d
 
@@ -101,7 +101,7 @@ def dense_slam(capture: Capture, frames: Sequence[int]) -> tuple[NDArray[np.floa
     measured = o3d.t.pipelines.slam.Frame(height, width, camera, device)
     rendered = o3d.t.pipelines.slam.Frame(height, width, camera, device)
 
-    seconds = start_steps("decode", "track", "integrate", "synthesise")
+    seconds = start_steps("decode", "track", "integrate", "synthesize")
     poses = np.full((len(capture), 4, 4), np.nan)
     failures = 0
     for count, index in enumerate(frames):
@@ -127,19 +127,19 @@ def dense_slam(capture: Capture, frames: Sequence[int]) -> tuple[NDArray[np.floa
         model.synthesize_model_frame(
             rendered, SLAM_UNITS_PER_METER, SLAM_DEPTH_MIN_M, SLAM_DEPTH_MAX_M, SLAM_TRUNCATION_VOXELS, False
         )
-        lap(seconds, "synthesise", mark)
+        lap(seconds, "synthesize", mark)
     return poses, seconds, failures
 
 
 def frames_with_pose(T_world_cam: NDArray[np.float64], every: int) -> NDArray[np.int64]:
-    """Every n-th of the frames whose pose, of (N, 4, 4), is finite: the frames that the occupancy peers use."""
+    """Every n-th frame with a finite pose in (N, 4, 4): the frames that the occupancy peers use."""
     return np.flatnonzero(np.isfinite(T_world_cam).all(axis=(1, 2)))[::every]
 
 
 def tsdf_occupied(
     capture: Capture, T_world_cam: NDArray[np.float64], lattice: Lattice, every: int = 2
 ) -> tuple[NDArray[np.bool_], Seconds]:
-    """Voxels (X, Y, Z) of the lattice in which enough of the TSDF's surface lies, and the seconds of each step.
+    """Voxels (X, Y, Z) of the lattice that hold enough of the TSDF's surface, and the seconds of each step.
 
     T_world_cam: (N, 4, 4) poses in the lattice's frame, NaN for frames without one.
     """
@@ -150,7 +150,7 @@ def tsdf_occupied(
 def surface_area(
     capture: Capture, T_world_cam: NDArray[np.float64], lattice: Lattice, every: int
 ) -> tuple[NDArray[np.float64], Seconds]:
-    """(X, Y, Z) square meters of the TSDF's surface in each voxel, a triangle belonging where its centroid lies."""
+    """(X, Y, Z) square meters of the TSDF's surface in each voxel. A triangle belongs to the voxel of its centroid."""
     import open3d as o3d
 
     core = o3d.core
@@ -189,7 +189,7 @@ def _corners(grid: Any) -> NDArray[np.float64]:
     except RuntimeError as error:
         if "SetVertexColors" not in str(error):
             raise
-        return np.zeros((0, 3, 3))  # Open3D 0.20 stumbles over a surface without a vertex
+        return np.zeros((0, 3, 3))  # Open3D 0.20 fails on a surface without a vertex
     return np.asarray(mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()], np.float64)
 
 
@@ -225,16 +225,16 @@ def octomap_occupied(
 ) -> tuple[NDArray[np.bool_], Seconds]:
     """Voxels (X, Y, Z) of the lattice that an OcTree of their size calls occupied, and the seconds of each step.
 
-    The sensor model is OctoMap's own: a ray's end counts 0.7, what it passed 0.4, clamped to 0.12 … 0.97, occupied from
-    0.5. Rays have no further limit of length.
+    The sensor model is OctoMap's own: a ray's end counts 0.7 and its way 0.4, clamped to 0.12 … 0.97; occupied from
+    0.5. The length of rays has no further limit.
 
-    T_world_cam: (N, 4, 4) poses in the lattice's frame, NaN for frames without one.
-    Raises DependencyError where pyoctomap is not installed.
+    T_world_cam: (N, 4, 4) poses in the lattice's frame, NaN for frames without one. Raises DependencyError if pyoctomap
+    is not installed.
     """
     try:
         import pyoctomap
     except ImportError as error:
-        raise DependencyError("OctoMap is measured through pyoctomap: pip install 'pyoctomap>=1.2'.") from error
+        raise DependencyError("The OctoMap peer needs pyoctomap: pip install 'pyoctomap>=1.2'.") from error
 
     tree = pyoctomap.OcTree(lattice.voxel_size)
     seconds = start_steps("decode", "insert", "read")
@@ -252,7 +252,7 @@ def octomap_occupied(
 
 
 def _decoded(capture: Capture, frames: NDArray[np.int64], seconds: Seconds) -> Iterator[Frame]:
-    """The frames that can be decoded, and the time that it takes."""
+    """The frames that can be decoded. Adds the time of decoding."""
     for index in frames:
         mark = time.perf_counter()
         try:

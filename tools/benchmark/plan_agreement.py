@@ -1,10 +1,9 @@
-"""How well a map's plan for robots agrees with the truth's.
+"""How well a map's plan for robots agrees with the plan of the truth.
 
-The plan is what ``export --format nav2`` writes. The truth's is made by the same rule of the voxels of the capture's
-ground truth, at the centers of the plan's cells. There are three figures, by who knows a cell: over the cells that both
-know, over all that the truth knows, and over those of them that the capture's depth images reach. The last two differ
-where the truth was made from depth that the capture does not hold: without noise, and with space beyond the sensor's
-range seen through up to it.
+The plan is the output of ``export --format nav2``. The same rule makes the truth's plan from the voxels of the
+capture's ground truth, at the centers of the plan's cells. Three figures differ in the cells that they count: those
+that both plans know, all that the truth knows, and those of these that the capture's depth images reach. The last two
+differ where the truth comes from depth that the capture does not hold: without noise, and beyond the sensor's range.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ import numpy as np
 from .figures import Figures, Line
 
 PLAN_PICTURE = "plan.png"
-"""Ours, the truth's, and the truth's of what was measured: left in the folder that the map is in."""
+"""Our plan, the truth's, and the truth's of what was measured; in the folder that holds the map."""
 
 FREE, UNKNOWN, OCCUPIED = 254, 205, 0
-_EVERY = 4  # frames that are asked what they tell of
+_EVERY = 4  # every n-th frame is tested
 
 
 def measure_plan(map_path: str) -> Figures:
-    """Agreement of a map's plan with that of its capture's ground truth."""
+    """Agreement of a map's plan with the plan of its capture's ground truth."""
     import cv2
     import yaml
 
@@ -132,11 +131,11 @@ def plan_lines(figures: Figures) -> list[Line]:
     return [
         ("plan: cells known to map and truth that agree", percent["agree_of_both"], "90 %"),
         (
-            f"  of those that depth images tell of ({percent['measured']} of the truth's)",
+            f"  of those that depth images reach ({percent['measured']} of the truth's)",
             percent["agree_of_measured"],
             "90 %",
         ),
-        ("  of all that the truth knows", percent["agree_of_truth"], "90 %"),
+        ("  of all cells that the truth knows", percent["agree_of_truth"], "90 %"),
         ("  the truth's free cells that are called occupied", percent["free_called_occupied"], "0 %"),
         ("  the truth's occupied cells that are called free", percent["occupied_called_free"], "0 %"),
         ("  free cells that are connected, through doors", percent["free_in_one_piece"], "100 %"),

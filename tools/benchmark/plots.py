@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 
 COLORS = ("#77aadd", "#ee8866", "#44bb99", "#eedd88", "#ffaabb", "#99ddff", "#bbcc33", "#aaaa00", "#dddddd")
-"""Paul Tol's "light" scheme: told apart by the color-blind too, and black text is read on each."""
+"""Paul Tol's "light" scheme: color-blind readers can distinguish the colors, and black text is readable on each."""
 
 HATCHES = ("", "///", "...", "xxx")
-"""What tells names apart once the colors have all been used."""
+"""Distinguish names after all colors have been used."""
 
 STYLE: Any = {
     "font.size": 11.0,
@@ -87,7 +87,7 @@ def trajectory_plot(
 def seen_from_above(up: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Unit vectors (3,) to the right and upwards in a picture that looks down along ``-up``: right x forward = up."""
     up = up / np.linalg.norm(up)
-    axis = np.eye(3)[np.argmin(np.abs(up))]  # the axis that lies flattest becomes the right, as near as it can
+    axis = np.eye(3)[np.argmin(np.abs(up))]  # the most horizontal axis, made horizontal, points right
     right = axis - (axis @ up) * up
     right /= np.linalg.norm(right)
     return right, np.cross(up, right)
@@ -96,8 +96,8 @@ def seen_from_above(up: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 def iou_bars(path: Path, rows: Sequence[Row]) -> None:
     """IoU of each variant, grouped by capture in the order of the rows.
 
-    rows: {"capture": name, "variant": name, "iou": fraction 0…1}; where the last is None or missing, there is no
-    bar but the words "not available".
+    rows: {"capture": name, "variant": name, "iou": fraction 0…1}. If the IoU is None or missing, the plot shows the
+    words "not available" instead of a bar.
     """
     import matplotlib
 
@@ -134,8 +134,8 @@ def iou_bars(path: Path, rows: Sequence[Row]) -> None:
 def stage_bars(path: Path, rows: Sequence[Row]) -> None:
     """Milliseconds a frame of each stage, stacked, a bar for each row that states them.
 
-    rows: {"capture": name, "variant": name, "ms_per_frame": {stage: ms}}; a row without the last, or with None, is left
-    out.
+    rows: {"capture": name, "variant": name, "ms_per_frame": {stage: ms}}. A row without "ms_per_frame", or with None,
+    is left out.
     """
     import matplotlib
 
@@ -165,7 +165,7 @@ def stage_bars(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """How the bar of each name is drawn, in the order in which they first come."""
+    """The look of each name's bar, in the order of the names."""
     return {
         name: {
             "color": COLORS[n % len(COLORS)],
@@ -178,7 +178,7 @@ def _looks(names: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def _figure(width: float, height: float) -> tuple[Figure, Axes]:
-    """An empty figure of some inches that draws without a display."""
+    """An empty figure, size in inches, that draws without a display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Figures of poses from color alone, and those of pycolmap's own pipeline at its defaults on the same images."""
+"""Figures of poses from color alone, ours and those of pycolmap's own pipeline at its defaults, on the same images."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .figures import Figures, tabulate
 
 STAGES = ("features", "matching", "mapping", "adjustment")
 LONG, STRIDES = 1000, (5, 3)
-"""Every 5th frame of captures of this many or more, every 3rd of others."""
+"""The first stride is for captures with this many frames or more, the second for others."""
 
 
 def measure_poses_from_color(capture: str) -> Figures:
-    """Share of the images that are placed, ATE after Sim(3), seconds of wall and processor: ours and pycolmap's, which
-    is told that all images have one camera. Depth is not read, poses only to score."""
+    """Share of the images that are placed, ATE after Sim(3), wall and CPU seconds: ours and pycolmap's, with one camera
+    for all images. Depth is not read; the true poses only score."""
     import numpy as np
 
     from freeocc3d.capture import open_capture
@@ -46,7 +46,7 @@ def measure_poses_from_color(capture: str) -> Figures:
 
 
 def choose_stride(frames: int) -> int:
-    """Of a capture of so many frames, every how many-th is used where color alone is read."""
+    """The stride of the frames that are used when only color is read, for a capture with this many frames."""
     return STRIDES[frames < LONG]
 
 
@@ -103,7 +103,8 @@ def _or_none(pose: Any) -> Any:
 
 
 def _scores(T_world_cam: Any, true: Any) -> Figures:
-    """Of (N, 4, 4) poses against true ones: share that is placed, and ATE of the camera centers after Sim(3)."""
+    """Share of the (N, 4, 4) poses that are placed, and ATE of the camera centers against the true poses after
+    Sim(3)."""
     import numpy as np
 
     from freeocc3d.core.transforms import umeyama
@@ -119,7 +120,7 @@ def _scores(T_world_cam: Any, true: Any) -> Figures:
 
 
 def tabulate_poses_from_color(rows: list[Figures]) -> list[str]:
-    """A table, two lines a capture."""
+    """A table, two lines for each capture."""
     table = []
     for row in rows:
         if "error" in row:

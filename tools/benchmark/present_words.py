@@ -1,9 +1,9 @@
-"""Asks maps for what is there: how well the voxels of a class are found by its name, and how soon.
+"""Asks maps for what is there: how well the voxels of a class are found by its name, and how fast.
 
-A capture is mapped with its class images and poses, and its Gaussians are projected on the truth's lattice, as
-``freeocc3d evaluate`` does: a half-voxel shift between two lattices would be taken for an error of the answer. Asked is
-for the name of each class of which the truth holds LEAST voxels; what all regions of the answer hold is compared with
-the voxels of the classes that the name means, over voxels that the truth knows.
+A capture is mapped with its class images and poses. Its Gaussians are projected on the truth's lattice, as ``freeocc3d
+evaluate`` does: otherwise a half-voxel shift between two lattices would count as an error of the answer. The words are
+the names of the classes with at least LEAST voxels in the truth. The voxels of all regions of an answer are compared
+with those of the classes that the name means, where the truth is known.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def measure_present_words(capture: str) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         made = reconstruct(capture, Path(folder) / "map", settings, progress=Progress())
         found = classes_found(made, Path(capture) / "ground_truth.npz")
-        # A process that imports nothing for other reasons.
+        # A new process, which imports only what queries need.
         return {**found, **run_inside("present_words:time_queries", map_path=str(made.path))}
 
 
@@ -42,7 +42,7 @@ def classes_found(scan_map: Any, truth_path: Path) -> Figures:
     """How well each class is found, in a map whose frame is the truth's.
 
     iou: of the answer.  occupied: share of the class's voxels that the map holds occupied at all.  iou_occupied: of the
-    answer among voxels that both hold occupied: what is left to language.
+    answer among voxels that both hold occupied, which measures the language alone.
     """
     from freeocc3d.core.types import UNKNOWN, PosedFrame
     from freeocc3d.evaluation.ground_truth import load_ground_truth
@@ -90,9 +90,9 @@ def classes_found(scan_map: Any, truth_path: Path) -> Figures:
 
 
 def time_queries(map_path: str) -> Figures:
-    """Of a process that answers one word, in text, in JSON and with all details; and of one word after the other, each
-    for the first time, in a loaded map: median, longest, and median of the processor's time, on which other programs
-    have no part."""
+    """Seconds of a process that answers one word: in text, in JSON and with all details. Seconds of one word after the
+    other, each for the first time, in a loaded map: median, maximum, and median of the processor time, which does not
+    depend on other programs."""
     from freeocc3d.query.scan_map import load_map
 
     loaded = load_map(map_path)
@@ -132,7 +132,7 @@ def present_words_lines(rows: list[Figures]) -> list[Line]:
         found = row["classes"]
         enough = [name for name, own in found.items() if own["iou"] >= ENOUGH]
         short = "".join(
-            f"; {name}: IoU {own['iou']:.2f}, of whose voxels {own['occupied']:.0%} are occupied"
+            f"; {name}: IoU {own['iou']:.2f}, {own['occupied']:.0%} of its voxels are occupied"
             for name, own in found.items()
             if name not in enough
         )
@@ -141,9 +141,9 @@ def present_words_lines(rows: list[Figures]) -> list[Line]:
             (f"{where}: classes found with IoU ≥ {ENOUGH}", share + short, "≥ 80 %"),
             (f"{where}: {' and '.join(row['absent'])} that return a region", f"{len(row['absent_answered'])}", "0"),
             (
-                f"{where}: one word in a loaded map, median and most",
+                f"{where}: one word in a loaded map, median and maximum",
                 f"{1e3 * row['loaded_seconds']:.1f}, {1e3 * row['loaded_most_seconds']:.1f} ms "
-                f"({1e3 * row['loaded_processor_seconds']:.1f} ms of the processor)",
+                f"({1e3 * row['loaded_processor_seconds']:.1f} ms processor time)",
                 "≤ 30 ms",
             ),
         ]

@@ -1,4 +1,4 @@
-"""Measurements in processes of their own, so that their threads, memory peak and imports are their own."""
+"""Measurements in their own processes, with their own threads, memory peak and imports."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class PartFailed(Exception):
 
 
 def run_timed(command: list[str]) -> tuple[float, int, str]:
-    """Wall seconds, peak resident bytes (of the largest of its processes) and stdout.
+    """Wall seconds, peak resident bytes (of the largest of its processes) and stdout of a command.
 
-    A process begins with the peak of the one that starts it, which therefore has to be small.
-    Raises PartFailed with the command's last line on stderr.
+    A process begins with the peak of the process that starts it, which must therefore be small. Raises PartFailed with
+    the command's last line on stderr.
     """
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
         mark = time.perf_counter()
@@ -50,7 +50,7 @@ def run_inside(function: str, **arguments: Any) -> Figures:
 
 
 def find_function(function: str) -> Any:
-    """What ``module:function`` of this package names."""
+    """The function ``module:function`` of this package."""
     module, _, name = function.partition(":")
     return getattr(importlib.import_module(f"{__package__}.{module}"), name)
 

@@ -13,8 +13,8 @@ COLD_STARTS = 5
 
 
 def measure_query(map_path: str) -> Figures:
-    """Seconds of a process that answers a word; of loading a map with its first answer; and the median of those after
-    it."""
+    """Seconds of a process that answers a word; of loading a map and its first answer; and the median of later
+    answers."""
     command = [*COMMAND, "query", map_path, QUERY_WORD, "--json"]
     cold = statistics.median(run_timed(command)[0] for _ in range(COLD_STARTS))  # before this process imports anything
     from freeocc3d.query.scan_map import load_map
@@ -37,7 +37,7 @@ def measure_query(map_path: str) -> Figures:
 
 
 def query_lines(figures: Figures) -> list[Line]:
-    """What was measured, and what is asked for."""
+    """Rows of a table: what, measured, asked."""
     return [
         ("query from a cold start", f"{figures['cold_seconds']:.2f} s", "≤ 1.5 s"),
         ("query in a loaded map", f"{1e3 * figures['loaded_seconds']:.1f} ms", "≤ 30 ms"),

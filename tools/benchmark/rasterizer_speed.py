@@ -1,5 +1,5 @@
-"""Speed of the rasterizers: forward and backward of 300,000 Gaussians at 320 x 240, compiled against plain PyTorch; and
-on a GPU, gsplat against plain PyTorch there."""
+"""Speed of the rasterizers: forward and backward of 300,000 Gaussians at 320 x 240, compiled against plain PyTorch; on
+a GPU also gsplat against plain PyTorch."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ _LAYERS = 3
 
 
 def surfaces_in_view(count: int, width: int, height: int) -> tuple[list[Any], Any, Any]:
-    """Gaussians on three wavy surfaces behind each other, all within the image: the hardest case that a map makes. The
-    five arrays of them, T_cam_world, and the camera."""
+    """Gaussians on three wavy surfaces, one behind the other, all within the image: the hardest case that a map makes.
+    Returns their five arrays, T_cam_world, and the camera."""
     import numpy as np
     import torch
 

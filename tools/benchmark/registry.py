@@ -1,4 +1,4 @@
-"""Every variant by name: ablations, peers, and what else is measured."""
+"""Every variant by name: ablations, peers, and other measurements."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from .peer_rows import PEERS
 
 @dataclass(frozen=True)
 class Measurement:
-    """What is measured in a process of its own, besides the rows of ablations and peers.
+    """A measurement in its own process, besides the rows of ablations and peers.
 
     measure: ``module:function`` that returns figures.  given: its arguments: none, ``capture``, ``captures`` (two) or
-    ``map_path``.  map_of: the ablation whose map it asks.  lines: ``module:function`` from one process's figures to
-    lines of what was measured and what is asked for.  table: instead of it, from all rows to lines of Markdown.
+    ``map_path``.  map_of: the ablation whose map it uses.  lines: ``module:function`` from one process's figures to
+    lines of what was measured and its goal.  table: instead of it, from all rows to lines of Markdown.
     """
 
     title: str
@@ -29,7 +29,7 @@ class Measurement:
 
 MEASUREMENTS = {
     "splat": Measurement(
-        "Gaussians a second through layer 4's projection, and what its arithmetic and memory need at least",
+        "Gaussians a second through layer 4's projection, and the least time that its arithmetic and memory need",
         "nothing",
         "splat_speed:measure_splat",
         lines="splat_speed:splat_lines",
@@ -84,13 +84,13 @@ MEASUREMENTS = {
         table="tracking_stress:tabulate_lengths",
     ),
     "absent_words": Measurement(
-        "names of things that are not there: how often a region is returned all the same",
+        "names of things that are not there: how often they return a region",
         "capture",
         "absent_words:measure_absent_words",
         table="absent_words:tabulate_absent_words",
     ),
     "present_words": Measurement(
-        "names of the classes that are there: how much of each is found, and how soon",
+        "names of the classes that are there: how much of each is found, and how fast",
         "capture",
         "present_words:measure_present_words",
         table="present_words:tabulate_present_words",
@@ -141,12 +141,12 @@ SUITES: dict[str, tuple[tuple[str, ...], tuple[str, ...] | None]] = {
 
 
 def list_names() -> list[str]:
-    """Of all variants."""
+    """The names of all variants."""
     return [*ablations.list_ablations(), *PEERS, *MEASUREMENTS]
 
 
 def describe_variants() -> list[str]:
-    """A line for each variant, with what is lacking for it."""
+    """A line for each variant, with what it lacks."""
     lines = []
     for name, ablation in ablations.read_ablations().items():
         lacking = f": not available, {ablation.lacking}" if ablation.lacking else ""

@@ -14,7 +14,7 @@ COLUMNS = (
 
 
 def write_markdown(results: Figures) -> str:
-    """A table of all rows, and those of the measurements. What was not measured is a dash, never a zero."""
+    """The table of all rows, and those of the measurements. A dash, never a zero, shows what was not measured."""
     lines = [" | ".join(("", *COLUMNS, "")).strip(), "|" + "---|" * len(COLUMNS)]
     for row in results["rows"]:
         cells = (

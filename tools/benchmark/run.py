@@ -26,11 +26,11 @@ _TRACKED = ("stress", "glued", "lengths")
 
 
 def run(captures: Sequence[Path], names: Sequence[str], frames: int | None, folder: Path) -> Figures:
-    """All rows, and the figures of all measurements that are named."""
+    """All rows, and the figures of all named measurements."""
     jobs = [Job(capture.resolve(), frames, folder / str(number)) for number, capture in enumerate(captures)]
     if any(name not in MEASUREMENTS or name in _TRACKED for name in names):
         first = str(jobs[0].capture)
-        _try("nothing yet, everything is compiled first", lambda: run_inside("tracking_stress:warm_up", capture=first))
+        _try("nothing yet, all kernels compile first", lambda: run_inside("tracking_stress:warm_up", capture=first))
     rows: list[Figures] = []
     for job in jobs:
         job.folder.mkdir(parents=True)
@@ -81,7 +81,7 @@ def _over_dense_slam(row: Figures, slam_seconds: float) -> Figures:
 
 
 def _arguments_of(part: Measurement, jobs: Sequence[Job]) -> Iterator[dict[str, Any]]:
-    """What a measurement is given in each of its processes, and "name", which its rows have as "capture"."""
+    """The arguments of a measurement in each of its processes, and "name", which its rows have as "capture"."""
     if part.given == "nothing":
         yield {"name": ""}
     elif part.given == "captures":
@@ -100,7 +100,7 @@ def _measure_part(name: str, part: Measurement, given: dict[str, Any]) -> list[F
 
     def measure() -> Figures:
         if "map_path" in given and not (Path(given["map_path"]) / "map.yaml").is_file():
-            raise PartFailed(f"there is no map to ask: name the variant {part.map_of}, too")
+            raise PartFailed(f"there is no map: also name the variant {part.map_of}")
         return run_inside(part.measure, **given)
 
     figures = _try(f"{capture}: {name}" if capture else name, measure)

@@ -1,4 +1,4 @@
-"""Speed of layer 4's projection, and what its arithmetic and memory need at least."""
+"""Speed of layer 4's projection, and the least time that its arithmetic and memory need."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SPLAT_GAUSSIANS, SPLAT_VOXEL_SIZE_M = 2_000_000, 0.08
 
 
 def measure_splat() -> Figures:
-    """Gaussians a second through layer 4's projection, beside what the machine needs for its arithmetic alone."""
+    """Gaussians a second through layer 4's projection, and the time of its arithmetic and memory traffic alone."""
     import numpy as np
 
     from freeocc3d.core.voxel_keys import unpack_voxels
@@ -56,7 +56,7 @@ def measure_splat() -> Figures:
 
 
 def splat_lines(figures: Figures) -> list[Line]:
-    """What was measured, and what is asked for."""
+    """Rows of a table: what, measured, asked."""
     floor = figures["floor_seconds"]
     steps = ", ".join(f"{step} {1e3 * value:.0f}" for step, value in figures["steps"].items())
     return [

@@ -1,4 +1,4 @@
-"""Multi-view stereo on a capture's color at its true poses, against its depth."""
+"""Multi-view stereo on a capture's color at its true poses, compared with its depth."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from freeocc3d.tracking.trackers import known
 from .figures import Figures
 
 ASKED = "<= 1.5 % (rendered), <= 3 % (kitchen), >= 40 % kept"
-_CLOSE = 0.01  # meters from frame to frame: below it every fifth frame is used, above it every third
-_AROUND = 10  # frames on either side of these that stereo is given
+_CLOSE = 0.01  # meters from frame to frame: every fifth frame is used below it, every third above it
+_AROUND = 10  # frames on either side that stereo also uses
 
 
 def measure_stereo(capture: str, frames: int | None = None) -> Figures:
     """Median relative error, share of the pixels with a true depth that are kept, and seconds a frame.
 
-    frames: how many are compared, spread over the scan; None = all.
+    frames: number of compared frames, spread over the scan; None = all.
     """
     opened = open_capture(capture)
     stride = 5 if _spacing(opened) < _CLOSE else 3
@@ -89,7 +89,7 @@ def _with_others(compared: Sequence[int], used: Sequence[int]) -> list[int]:
 
 
 def _spacing(capture: Capture) -> float:
-    """Median way between one frame and the next, meters."""
+    """Median distance from one frame to the next, meters."""
     poses = [capture.pose(index) for index in range(min(len(capture), 200))]
     places = np.array([pose[:3, 3] for pose in poses if pose is not None])
     return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))

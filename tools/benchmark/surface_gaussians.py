@@ -8,7 +8,7 @@ from typing import Any
 
 def surface_gaussians(count: int) -> Any:
     """Gaussians as layer 2 makes them at 8 cm, one per 4 cm of surface, on square patches of 2 m in random places and
-    directions; in the order of the patches, as neighbors in a map are neighbors in memory."""
+    directions. They are in the order of the patches, since neighbors in a map are neighbors in memory."""
     import numpy as np
 
     from freeocc3d.core.transforms import quats_to_rotations
@@ -19,7 +19,7 @@ def surface_gaussians(count: int) -> Any:
     patches = patch[-1] + 1
     quats = rng.normal(size=(patches, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    edge = 2.0 * math.sqrt(patches)  # of a building two meters high that holds two meters of patch for each of floor
+    edge = 2.0 * math.sqrt(patches)  # of a building 2 m high with 2 m^2 of patches per m^2 of floor
     corners = rng.uniform((0, 0, 0), (edge, edge, 2.0), (patches, 3))
     on_patch = np.concatenate((rng.uniform(0, 2.0, (count, 2)), rng.normal(0, 0.005, (count, 1))), axis=1)
     means = corners[patch] + np.einsum("nij,nj->ni", quats_to_rotations(quats)[patch], on_patch)

@@ -1,4 +1,4 @@
-"""Seconds of steps."""
+"""Times steps, in seconds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Seconds = dict[str, float]
 
 
 def start_steps(*steps: str) -> Seconds:
-    """No seconds yet of each step."""
+    """Zero seconds for each step."""
     return dict.fromkeys(steps, 0.0)
 
 
@@ -21,7 +21,7 @@ def lap(seconds: Seconds, step: str, mark: float) -> float:
 
 
 def time_fastest(work: Callable[[], object], repeats: int = 5) -> float:
-    """Seconds of the fastest of some runs."""
+    """Seconds of the fastest run."""
     times = []
     for _ in range(repeats):
         mark = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Layer 1 alone, on captures that are altered: frames dropped, darkened, turned round, glued; and of growing length."""
+"""Layer 1 alone, on altered captures: frames dropped, darkened, reversed, glued; and on captures of growing length."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ _GAP, _BLACK = 30, 20
 
 @dataclass(frozen=True)
 class Shown:
-    """Frames of a capture in the order in which they are shown, and what becomes of each."""
+    """Frames of a capture in the order of tracking, and how each is altered."""
 
     frames: Sequence[int]
     change: Change = lambda position, frame: frame
     lost: frozenset[int] = frozenset()
-    """Positions of frames that show nothing, and have to be reported lost."""
+    """Positions of frames that show nothing, which tracking must report as lost."""
 
 
 def sequences(count: int) -> dict[str, Shown]:
-    """By name, for a capture of ``count`` frames."""
+    """The altered sequences by name, for a capture of ``count`` frames."""
     middle = count // 2
     every, black = range(count), frozenset(range(middle, middle + _BLACK))
     return {
@@ -66,7 +66,7 @@ def _blank(frame: Frame) -> Frame:
 
 
 def _holes(position: int, frame: Frame) -> Frame:
-    """Every second square of 16 pixels, at random."""
+    """Without depth in a random half of the squares of 16 pixels."""
     height, width = frame.depth_m.shape
     missing = np.random.default_rng(position).random((height // 16 + 1, width // 16 + 1)) < 0.5
     holes = np.kron(missing, np.ones((16, 16), bool))[:height, :width]
@@ -80,14 +80,14 @@ def _left_missing(position: int, frame: Frame) -> Frame:
 
 
 def opened(capture: str) -> Capture:
-    """A capture as the pipeline would give it to layer 1, which is not told its poses."""
+    """A capture as the pipeline gives it to layer 1, which does not read its poses."""
     plain = open_capture(capture, Options())
     ratio = focal_calibration.estimate_color_focal(plain, select_frames(plain))
     return plain if ratio == 1 else Reregistered(plain, ratio)
 
 
 def tracked(captures: Iterable[tuple[Capture, Shown]]) -> tuple[rgbd.RgbdTracker, Trajectory, float]:
-    """The tracker after all of the sequences, one after the other, its trajectory by position, and its seconds."""
+    """The tracker after all sequences, one after the other, its trajectory by position, and its seconds."""
     tracker = rgbd.RgbdTracker(rgbd.Options())
     position, seconds = 0, 0.0
     for capture, sequence in captures:
@@ -105,7 +105,7 @@ def tracked(captures: Iterable[tuple[Capture, Shown]]) -> tuple[rgbd.RgbdTracker
 
 
 def measure_sequence(capture: str, name: str) -> Figures:
-    """One sequence of a capture: ATE against its poses, and what became of its frames."""
+    """One sequence of a capture: ATE against its poses, and the status of its frames."""
     scan = opened(capture)
     sequence = sequences(len(scan))[name]
     tracker, trajectory, seconds = tracked([(scan, sequence)])
@@ -144,7 +144,7 @@ def measure_stress(capture: str) -> Figures:
 
 
 def measure_glued(captures: list[str]) -> Figures:
-    """Two captures of different places as if they were one: which frames the submaps hold."""
+    """Two captures of different places as one: the frames of the submaps."""
     scans = [opened(capture) for capture in captures]
     tracker, trajectory, seconds = tracked([(scan, Shown(range(len(scan)))) for scan in scans])
     expected = [list(range(len(scans[0]))), list(range(len(scans[0]), sum(map(len, scans))))]
@@ -159,7 +159,7 @@ def measure_glued(captures: list[str]) -> Figures:
 
 
 def measure_lengths(capture: str) -> Figures:
-    """Seconds of layer 1 on the first 250, 500, 1000 frames, and what it keeps of a keyframe."""
+    """Seconds of layer 1 on the first 250, 500, 1000 frames, and bytes in memory per keyframe."""
     rows = []
     for count in LENGTHS:
         mark = time.perf_counter()
@@ -248,7 +248,7 @@ def tabulate_lengths(rows: list[Figures]) -> list[str]:
 
 
 def warm_up(capture: str) -> Figures:
-    """Have everything compiled, so that no measurement pays for it."""
+    """Compile all kernels, so that no measurement includes compilation."""
     plain = open_capture(Path(capture), Options())
     few = range(0, min(len(plain), 40), 8)
     tracked([(plain, Shown(few))])

@@ -30,8 +30,8 @@ def measure_voxels() -> Figures:
 
 
 def _features() -> Figures:
-    """Gaussians a second with 512-dimensional features, from binning to normalized voxels; the floor is the reading of
-    each feature from memory once."""
+    """Gaussians a second with 512-dimensional features, from binning to normalized voxels. The floor is the time to
+    read each feature from memory once."""
     import numpy as np
 
     from freeocc3d.occupancy import build, carve, splat
@@ -52,8 +52,8 @@ def _features() -> Figures:
 
 
 def _insertion() -> Figures:
-    """Depth images a second at 640 x 480 and 8 cm, in the built-in room: carving alone, carving and taking the surface
-    into cells, and OctoMap's insertion of all their pixels and of every 16th."""
+    """Depth images a second at 640 x 480 and 8 cm, in the built-in room: carving alone, carving with the surface in
+    cells, and OctoMap's insertion of all their pixels and of every 16th."""
     import numpy as np
 
     from freeocc3d.capture import open_capture
@@ -102,8 +102,8 @@ def _insertion() -> Figures:
 
 
 def _codes() -> Figures:
-    """What is lost by coding: mean cosine to the features, and voxels whose best of 20 words stays. A million codes
-    asked for 20 words."""
+    """What coding loses: mean cosine to the features, and the share of voxels whose best of 20 words stays. Seconds of
+    a million codes for 20 words."""
     import numpy as np
 
     from freeocc3d.language.feature_codec import Codec
@@ -147,7 +147,7 @@ def _smooth(points: Any, length: float) -> Any:
 
 
 def _update() -> Figures:
-    """Seconds to take one more keyframe's Gaussians into a map of a hundred, over those of making it anew."""
+    """Seconds to add one keyframe's Gaussians to a map of a hundred, compared with a new map."""
     import numpy as np
 
     from freeocc3d.core.types import Frame, Intrinsics
@@ -182,8 +182,8 @@ def _update() -> Figures:
 
 
 def _asked() -> Figures:
-    """Seconds of a whole query, regions included, for 20 words on a million voxels of 40 kinds of things, whose
-    names are contrast words: every voxel reaches the threshold for every word, as with CLIP's raw similarities."""
+    """Seconds of a whole query, with regions, for 20 words on a million voxels of 40 kinds of things, whose names are
+    contrast words. Every voxel reaches the threshold for every word, as with CLIP's raw similarities."""
     import numpy as np
 
     from freeocc3d.core.types import OCCUPIED, UNKNOWN, Occupancy
@@ -227,8 +227,8 @@ def _asked() -> Figures:
 
 
 def _adaptive() -> Figures:
-    """The built-in room at 8 cm, with voxels down to 1 cm where they show more: seconds, voxels, bytes on disk, and
-    the blocks that voxels of 1 cm wherever there is a surface would take."""
+    """The built-in room at 8 cm, with voxels down to 1 cm where they show more: seconds, voxels, bytes on disk, and the
+    number of blocks if every surface had voxels of 1 cm."""
     import numpy as np
 
     from freeocc3d.core.types import OCCUPIED
@@ -262,7 +262,7 @@ def _adaptive() -> Figures:
 
 
 def voxels_lines(figures: Figures) -> list[Line]:
-    """What was measured, and what is asked for."""
+    """Rows of a table: what, measured, asked."""
     parts = ("features", "insertion", "codes", "update", "adaptive", "asked")
     features, insertion, codes, update, several, asked = (figures[name] for name in parts)
     octomap = []
@@ -280,10 +280,10 @@ def voxels_lines(figures: Figures) -> list[Line]:
             "",
         ),
         ("depth images carved, 640 x 480, 8 cm", f"{insertion['carving']:.0f} frames/s", "30"),
-        ("  and their surface taken into cells", f"{insertion['mapping']:.0f} frames/s", ""),
+        ("  with their surface in cells", f"{insertion['mapping']:.0f} frames/s", ""),
         *octomap,
         ("a million voxels scored for 20 words", f"{1e3 * codes['million_voxels_seconds']:.0f} ms", "100 ms"),
-        ("  the whole answer, beside 40 contrast words", f"{1e3 * asked['seconds']:.0f} ms", ""),
+        ("  the whole answer, with 40 contrast words", f"{1e3 * asked['seconds']:.0f} ms", ""),
     ]
     for name, coded in codes["sets"].items():
         said = f"cosine {coded['cosine']:.4f}, same word {100 * coded['same_word']:.1f} %"
@@ -295,7 +295,7 @@ def voxels_lines(figures: Figures) -> list[Line]:
         ("the built-in room, 8 cm down to 1 cm where it shows more", f"{several['seconds']:.1f} s", ""),
         ("  % of the surface at 8, 4, 2, 1 cm", shares, ""),
         (
-            "  blocks, and with 1 cm wherever there is a surface",
+            "  blocks, and with 1 cm at every surface",
             f"{several['blocks']:,} of {several['blocks_everywhere']:,}",
             "",
         ),
