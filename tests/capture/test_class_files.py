@@ -36,7 +36,7 @@ def test_lists_in_every_form(tmp_path: Path) -> None:
         ("a.txt", "", "a list of names"),
     ],
 )
-def test_broken_lists_are_told(tmp_path: Path, name: str, text: str, told: str) -> None:
+def test_broken_lists_are_reported(tmp_path: Path, name: str, text: str, told: str) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(CaptureError, match=told):
         read_class_names(tmp_path / name)

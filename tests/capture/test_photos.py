@@ -197,7 +197,7 @@ def test_damaged_images_are_broken_frames(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
-def test_too_few_and_what_phones_write_are_told(tmp_path: Path) -> None:
+def test_too_few_and_what_phones_write_are_reported(tmp_path: Path) -> None:
     write_photo(tmp_path / "one" / "IMG_1.jpg")
     with pytest.raises(CaptureError, match=r"holds only one image, IMG_1\.jpg: a scan needs many"):
         open_capture(tmp_path / "one")

@@ -69,7 +69,7 @@ def test_nerfstudio_without_depth_has_a_nominal_scale_by_its_points(tmp_path: Pa
     assert open_capture(tmp_path, Options(scale=1.0)).pose(2)[0, 3] == pytest.approx(pose_matrix(2)[0, 3])
 
 
-def test_a_scale_beside_depth_is_refused_and_depth_can_be_left_out(tmp_path: Path) -> None:
+def test_a_scale_with_depth_is_refused_and_depth_can_be_left_out(tmp_path: Path) -> None:
     write_nerfstudio(tmp_path, 3)
     with pytest.raises(ConfigError, match=r"capture\.scale is for scans without depth"):
         open_capture(tmp_path, Options(scale=2.0))
@@ -121,7 +121,9 @@ def broken_nerfstudio(folder: Path, key: str, value: object, frame: bool) -> Non
         ("frames", [], False, "not a trajectory|holds 0 images"),
     ],
 )
-def test_what_nerfstudio_files_lack_is_told(tmp_path: Path, key: str, value: object, frame: bool, said: str) -> None:
+def test_what_nerfstudio_files_lack_is_reported(
+    tmp_path: Path, key: str, value: object, frame: bool, said: str
+) -> None:
     broken_nerfstudio(tmp_path, key, value, frame)
     with pytest.raises(CaptureError, match=said):
         open_capture(tmp_path)
@@ -165,7 +167,7 @@ def test_true_poses_of_a_reconstruction_are_those_of_the_numbers_in_its_names(tm
     np.testing.assert_array_equal(read_poses(tmp_path).timestamps, [0, 1, 2, 30])
 
 
-def test_damaged_models_and_cameras_that_are_not_read_are_told(tmp_path: Path) -> None:
+def test_damaged_models_and_cameras_that_are_not_read_are_reported(tmp_path: Path) -> None:
     write_colmap(tmp_path / "fov", 2, camera="FOV 32 24 30 30 16 12 0.5")
     with pytest.raises(CaptureError, match="model FOV, which is not supported: undistort"):
         open_capture(tmp_path / "fov")

@@ -155,7 +155,7 @@ def test_names_are_matched_by_their_numbers_where_they_differ(scan) -> None:
         ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n", "no readable COLMAP model"),
     ],
 )
-def test_what_is_no_trajectory_is_told_in_a_sentence(tmp_path, name, text, said) -> None:
+def test_what_is_no_trajectory_is_reported_in_a_sentence(tmp_path, name, text, said) -> None:
     (tmp_path / name).write_text(text, encoding="latin-1")
     with pytest.raises(CaptureError, match=said):
         read_trajectory(tmp_path / name)
@@ -178,7 +178,7 @@ def test_missing_files_and_folders_without_poses(tmp_path) -> None:
         ),
     ],
 )
-def test_poses_of_another_capture_are_told(scan, found, said) -> None:
+def test_poses_of_another_capture_are_reported(scan, found, said) -> None:
     with pytest.raises(CaptureError, match=said):
         found.of_frames(scan)
 

@@ -108,7 +108,7 @@ def test_ascending_reading_decodes_each_frame_once(tmp_path: Path, monkeypatch: 
     assert len(seeks) <= 5, "one for each group of pictures at the most"
 
 
-def test_what_is_no_video_is_told_in_a_sentence(tmp_path: Path) -> None:
+def test_what_is_no_video_is_reported_in_a_sentence(tmp_path: Path) -> None:
     notes = tmp_path / "notes.mp4"
     notes.write_text("no video at all\n" * 50)
     with pytest.raises(CaptureError, match=r"notes\.mp4 is not a readable video"):
@@ -137,7 +137,7 @@ def test_a_video_that_is_cut_off_gives_what_is_there(tmp_path: Path) -> None:
     assert shown == list(range(len(capture) - 2))
 
 
-def test_damaged_frames_are_told_and_the_others_read(tmp_path: Path) -> None:
+def test_damaged_frames_are_reported_and_the_others_read(tmp_path: Path) -> None:
     path = write_video(tmp_path / "scan.avi", codec="mjpeg")
     data = bytearray(path.read_bytes())
     at = [n for n in range(len(data) - 1) if data[n : n + 2] == b"\xff\xd8"][20]

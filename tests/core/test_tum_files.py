@@ -28,7 +28,7 @@ def test_tum_poses_come_back(tmp_path) -> None:
         ("a " * 8, "convert"),
     ],
 )
-def test_what_is_no_pose_is_told(line: str, said: str) -> None:
+def test_what_is_no_pose_is_reported(line: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         tum_poses([line.split()])
 

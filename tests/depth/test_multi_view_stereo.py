@@ -107,7 +107,7 @@ def test_what_was_computed_is_taken_up_again(computed) -> None:
     assert not list((folder / "depth").glob("*tmp*"))
 
 
-def test_a_damaged_surface_is_told(computed, tmp_path: Path) -> None:
+def test_a_damaged_surface_is_reported(computed, tmp_path: Path) -> None:
     capture, folder, _ = computed
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     (tmp_path / "depth" / "000010.depth.npz").unlink()
@@ -125,7 +125,7 @@ def test_a_damaged_surface_is_told(computed, tmp_path: Path) -> None:
         _source(capture, tmp_path)
 
 
-def test_a_damaged_layout_is_told(computed, tmp_path: Path) -> None:
+def test_a_damaged_layout_is_reported(computed, tmp_path: Path) -> None:
     capture, folder, _ = computed
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     (tmp_path / "depth" / "000010.depth.npz").unlink()
@@ -145,7 +145,7 @@ def test_a_damaged_layout_is_told(computed, tmp_path: Path) -> None:
         _source(capture, tmp_path)
 
 
-def test_images_that_show_nothing_are_told(tmp_path: Path) -> None:
+def test_images_that_show_nothing_are_reported(tmp_path: Path) -> None:
     class Blank(Color):
         def __getitem__(self, index: int) -> Frame:
             frame = super().__getitem__(index)

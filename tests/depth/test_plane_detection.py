@@ -116,7 +116,7 @@ def room() -> _Room:
     return _room()
 
 
-def _towards(room: _Room, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _toward(room: _Room, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     origin = room.centers[0]
     return origin, _world(targets) - origin
 
@@ -156,7 +156,7 @@ def test_the_outermost_planes_are_the_rooms(room, axis: int, at: float) -> None:
 @pytest.mark.parametrize(("axis", "at"), _WALLS)
 @pytest.mark.parametrize("short", [0.93, 0.97, 1.0])
 def test_bare_walls_are_where_rays_reach_the_edges_planes(room, axis: int, at: float, short: float) -> None:
-    origin, ways = _towards(room, _bare(axis, at))
+    origin, ways = _toward(room, _bare(axis, at))
     found = room.planes.near(origin, ways, np.full(len(ways), short))
     right = np.abs(found - 1.0) * np.abs(ways @ _WORLD[:, axis]) < 0.5 * _CELL
     assert right.mean() > (0.95 if axis < 2 or at else 0.8)  # furniture stands on the floor
@@ -164,7 +164,7 @@ def test_bare_walls_are_where_rays_reach_the_edges_planes(room, axis: int, at: f
 
 def test_no_plane_is_taken_far_from_the_surface(room) -> None:
     for axis, at in _WALLS:
-        origin, ways = _towards(room, _bare(axis, at))
+        origin, ways = _toward(room, _bare(axis, at))
         times = np.random.default_rng(2).uniform(0.7, 1.2, len(ways))
         found = room.planes.near(origin, ways, times)
         assert ((found == 0) | (found > 0.97 * times)).all()
@@ -181,10 +181,10 @@ def test_a_door_that_is_seen_through_stays_open(behind: int) -> None:
     off = back.offset - corner @ back.normal
     assert off == pytest.approx(0.0 if behind == 400 else _BEHIND, abs=_CELL)
     rng = np.random.default_rng(3)
-    origin, ways = _towards(room, rng.uniform((3.1, 0.0, 0.2), (3.9, 0.0, 1.9), (500, 3)))
+    origin, ways = _toward(room, rng.uniform((3.1, 0.0, 0.2), (3.9, 0.0, 1.9), (500, 3)))
     found = room.planes.near(origin, ways, np.full(len(ways), 0.98))
     assert (found == 0).mean() > 0.99
-    origin, ways = _towards(room, rng.uniform((0.5, 0.0, 2.2), (2.6, 0.0, 2.4), (500, 3)))
+    origin, ways = _toward(room, rng.uniform((0.5, 0.0, 2.2), (2.6, 0.0, 2.4), (500, 3)))
     found = room.planes.near(origin, ways, np.full(len(ways), 0.98))
     if behind == 400:
         assert (np.abs(found - 1.0) < 0.01).mean() > 0.95

@@ -60,7 +60,7 @@ def test_small_gaps_are_shown_as_guesses_unless_they_are_seen_edge_on() -> None:
     along = np.eye(4)
     along[:3, :3] = Rotation.from_euler("y", 89.0, degrees=True).as_matrix()
     along[:3, 3] = 0.1, 0.5, 1.5
-    center = (slice(50, 65), slice(30, 50))  # towards the right part, at a cosine of at most 0.4
+    center = (slice(50, 65), slice(30, 50))  # toward the right part, at a cosine of at most 0.4
     assert render_surface_depth(_wall(0.8), Layout([]), CAMERA, along).inverse[center].all()
     assert not render_surface_depth(_wall(0.05), Layout([]), CAMERA, along).inverse[center].any()
 

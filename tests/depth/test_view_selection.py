@@ -11,7 +11,7 @@ def _line(positions):
     return T
 
 
-def test_a_few_degrees_beside_are_preferred() -> None:
+def test_a_few_degrees_apart_are_preferred() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform((-0.5, -0.5, 1.9), (0.5, 0.5, 2.1), (200, 3)).astype(np.float32)
     T = _line([0.0, 0.01, 0.28, 0.3, 1.8])  # 0, 0.3, 8, 8.5 and 42 degrees at 2 m

@@ -92,7 +92,7 @@ def test_a_step_a_change_of_meaning_and_neither_where_it_is_noise() -> None:
 
 
 def test_down_to_the_finest_only_along_the_line_where_the_meaning_changes() -> None:
-    """A flat wall at half a metre, of two kinds: small voxels lie along the line between them, at every level."""
+    """A flat wall at half a meter, of two kinds: small voxels lie along the line between them, at every level."""
     frames, poses = [wall_frame(0.5, n) for n in range(2)], np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 0.3
     settings = config.resolve({})

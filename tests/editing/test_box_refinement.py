@@ -106,7 +106,7 @@ def test_boxes_that_cannot_be_refined(room: Map, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("needed", [False, True])
 def test_a_map_that_has_moved_to_another_machine(room: Map, needed: bool, tmp_path: Path, monkeypatch) -> None:
-    """Colours are found in the keyframes; where an encoder needs the capture, features are the map's own."""
+    """Colors are found in the keyframes; where an encoder needs the capture, features are the map's own."""
     monkeypatch.setattr(color, "NEEDS_CAPTURE", needed)
     told = []
     progress = Progress()

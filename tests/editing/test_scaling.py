@@ -118,7 +118,7 @@ def test_a_length_between_two_pixels_or_words(room: Map, half: Map) -> None:
     assert scaling.scale_by_length(half, ["red cup", "green plant"], apart) == pytest.approx(2.0)
 
 
-def test_points_that_are_none_are_told(half: Map) -> None:
+def test_points_that_are_none_are_reported(half: Map) -> None:
     keyframe = int(half.trajectory.keyframes[1])
     with pytest.raises(MapError, match=r"Frame 1 is not a keyframe of .*; the nearest are 0, "):
         scaling.scale_by_length(half, ["1:5,5", "red cup"], 1.0)

@@ -113,7 +113,7 @@ def bent(axis: int) -> np.ndarray:
         ({"classes": "wall"}, "'classes'.*list of class names"),
     ],
 )  # fmt: skip
-def test_what_is_no_package_is_told(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_what_is_no_package_is_reported(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(FreeOccError, match=message) as error:
         load_global_package(write_package(tmp_path / "scene.pkl", package(**changes)))
     assert one_sentence(error)
@@ -177,7 +177,7 @@ def test_frames_of_other_scenes_and_unlisted_ones_do_not_count(tmp_path: Path) -
     assert load_frames_mask(tmp_path / "none", "scene0000_00", SHAPE) is None
 
 
-def test_missing_frames_are_told(tmp_path: Path) -> None:
+def test_missing_frames_are_reported(tmp_path: Path) -> None:
     path = data_set(tmp_path, {"train/00001": np.ones(SHAPE, bool)}, valid_img_paths=["x/00001.jpg", "x/00004.jpg"])
     with pytest.raises(FreeOccError, match="lacks 1 of the 2 frames of scene0000_00, the first 00004") as error:
         load_global_package(path)

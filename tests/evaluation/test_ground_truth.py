@@ -112,6 +112,6 @@ def test_masks_hold_only_what_is_known() -> None:
     assert masks["frames"].ravel().tolist() == [True, False, False, False]
 
 
-def test_voxel_centres_are_half_a_voxel_from_the_corner() -> None:
+def test_voxel_centers_are_half_a_voxel_from_the_corner() -> None:
     truth = GroundTruth(np.zeros((2, 3, 4), np.uint8), np.array([1.0, 2.0, 3.0]), 0.1, ("free",))
     np.testing.assert_allclose(truth.centers()[1, 2, 3], (1.15, 2.25, 3.35))

@@ -96,7 +96,7 @@ def test_the_rooms_map_agrees_with_its_truth(room: Any) -> None:
     assert scene.errors.ate_rmse_m < 0.01
     scored = scoring.Evaluation((scene,), truth.classes[1:], "se3")
     assert scored.scores.iou > 0.7
-    assert scored.miou() is None  # the colour encoder knows no furniture
+    assert scored.miou() is None  # the color encoder knows no furniture
     assert "None of the classes is known" in scored.notes[0]
 
 
@@ -128,7 +128,7 @@ def test_the_order_of_frames_does_not_count(room: Any) -> None:
 # Gaussians of any origin
 
 
-def test_gaussians_are_projected_at_the_lattices_centres() -> None:
+def test_gaussians_are_projected_at_the_lattices_centers() -> None:
     some = random_gaussians(60, seed=3, extent=1.0)
     truth = lattice((-0.5, -0.5, -0.5), 0.05, (20, 20, 20))
     semantics = np.eye(2, dtype=np.float32)[np.arange(60) % 2]
@@ -233,7 +233,7 @@ def _assert_ply_frames_are_the_same(
     assert agreement(fused.occupied, expected.occupied) > 0.99
 
 
-def test_unusable_frames_are_told_in_a_sentence(tmp_path: Path) -> None:
+def test_unusable_frames_are_reported_in_a_sentence(tmp_path: Path) -> None:
     poses, settings, classes = Poses(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))), config.load(None), NO_CLASSES
     truth = lattice(shape=(4, 4, 4))
     with pytest.raises(FreeOccError, match="no per-frame Gaussians"):

@@ -127,7 +127,7 @@ def test_the_builder_agrees_with_the_protocol_written_out(changes: dict) -> None
     assert built.classes == ("free", "wall", "door", "post")
 
 
-def test_within_fills_the_neighbours_of_what_a_point_lies_in() -> None:
+def test_within_fills_the_neighbors_of_what_a_point_lies_in() -> None:
     capture = Corner([0.0])
     inside, within = (
         replicaocc_truth.build_truth_from_capture(
@@ -191,7 +191,7 @@ def test_a_capture_without_class_images_gives_geometry(tmp_path: Path) -> None:
     assert {1, 2} <= set(np.unique(classed.labels))
 
 
-def test_what_cannot_be_built_is_told_in_a_sentence(tmp_path: Path) -> None:
+def test_what_cannot_be_built_is_reported_in_a_sentence(tmp_path: Path) -> None:
     bare = write_seven_scenes(tmp_path / "bare", 3, poses=False)
     with pytest.raises(FreeOccError, match="has no poses"):
         replicaocc_truth.build_truth(bare)

@@ -103,7 +103,7 @@ def written(path: Path, *scenes: ScoredScene, listed: bool = False) -> Page:
 
 
 def share(picture: np.ndarray, color: tuple[int, int, int]) -> float:
-    """Of the pixels of the view from above, how many have this colour but for the light on it."""
+    """Of the pixels of the view from above, how many have this color but for the light on it."""
     seen = picture[: len(picture) // 2].astype(float)
     hue = seen / np.maximum(seen.max(axis=2, keepdims=True), 1)
     wanted = np.array(color) / max(color)
@@ -133,7 +133,7 @@ def test_the_page_says_what_the_evaluation_says(tmp_path: Path) -> None:
     assert "counted 0: lamp" in listed[2]
 
 
-def test_the_page_needs_nothing_beside_it_and_is_the_same_each_time(tmp_path: Path) -> None:
+def test_the_page_needs_nothing_else_and_is_the_same_each_time(tmp_path: Path) -> None:
     page = written(tmp_path / "one.html", room(way=True))
     text = (tmp_path / "one.html").read_text()
     assert all(a.startswith(("data:image/png;base64,", "#")) for a in page.addresses)

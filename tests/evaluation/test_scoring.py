@@ -179,7 +179,7 @@ def test_maps_are_pooled_and_a_split_must_be_whole(bedroom: Path, tmp_path: Path
         evaluate_scenes(ScoringRequest(maps=[bedroom], split=tmp_path / "split.txt"))
 
 
-def test_truth_and_maps_that_do_not_fit_are_told_in_a_sentence(bedroom: Path, tmp_path: Path) -> None:
+def test_truth_and_maps_that_do_not_fit_are_reported_in_a_sentence(bedroom: Path, tmp_path: Path) -> None:
     house = data_folder() / "house"
     truth = house / "bedroom" / "ground_truth.npz"
     assert "given 2 times for 1" in refused(

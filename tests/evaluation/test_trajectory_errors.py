@@ -17,7 +17,7 @@ from freeocc3d.tracking.trajectory_alignment import Poses, TrajectoryAlignment, 
 
 
 def walk(n: int, seed: int, rests: bool = False) -> NDArray[np.float64]:
-    """(n, 4, 4) a hand-held walk: steps of some centimetres, the camera turning; it may stand still for a while."""
+    """(n, 4, 4) a hand-held walk: steps of some centimeters, the camera turning; it may stand still for a while."""
     rng = np.random.default_rng(seed)
     heading = np.cumsum(rng.normal(0, 0.1, n))
     step = np.stack((np.cos(heading), np.sin(heading), 0.1 * rng.normal(size=n)), axis=1) * rng.uniform(
@@ -62,7 +62,7 @@ def test_ate_is_the_root_mean_square_of_what_alignment_leaves() -> None:
 
 def test_a_mirrored_trajectory_keeps_its_error() -> None:
     """A world mirrored at x = 0 is no rigid motion away: of a cross in the plane x = ±a, y = ±b, z = ±c with a the
-    smallest extent, the best a rotation can do leaves every centre off by 2 a."""
+    smallest extent, the best a rotation can do leaves every center off by 2 a."""
     corners = np.array(np.meshgrid([-0.1, 0.1], [-1, 1], [-2, 2], indexing="ij"), float).reshape(3, -1).T
     corners[:, 0] *= np.sign(corners[:, 1] * corners[:, 2])  # chiral: not its own mirror image
     corners = np.unique(corners, axis=0)

@@ -36,7 +36,7 @@ def test_a_sphere_has_its_distances_to_half_a_voxels_diagonal() -> None:
     analytic = np.linalg.norm(at - center, axis=-1) - radius
     found = transform_signed(analytic <= 0)
     assert (np.sign(found) == np.where(analytic <= 0, -1, 1)).all()
-    # The nearest centre on the other side lies beyond the surface, by at most a voxel's diagonal.
+    # The nearest center on the other side lies beyond the surface, by at most a voxel's diagonal.
     beyond = np.abs(found) - np.abs(analytic)
     assert beyond.min() > -1e-5
     assert beyond.max() < np.sqrt(3)

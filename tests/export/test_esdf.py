@@ -31,7 +31,7 @@ def brute(obstacle, size):
 
 
 @pytest.mark.parametrize("unknown", ["free", "obstacle", "nan"])
-def test_distances_are_exact_and_in_metres(tmp_path, unknown) -> None:
+def test_distances_are_exact_and_in_meters(tmp_path, unknown) -> None:
     export_map(map_of(scene()), "esdf", tmp_path / "esdf.npz", {"frame": "map", "unknown": unknown})
     with np.load(tmp_path / "esdf.npz") as file:
         distance, state = file["distance"], file["state"]
@@ -74,7 +74,7 @@ def test_openvdb_holds_the_distances_of_known_voxels(tmp_path) -> None:
     assert told["metadata"]["frame"] == '"gravity"'
 
 
-def test_what_has_no_distances_is_told(tmp_path) -> None:
+def test_what_has_no_distances_is_reported(tmp_path) -> None:
     with pytest.raises(ExportError, match="no obstacle"):
         export_map(map_of(occupancy_of([], free=[(0, 0, 0)])), "esdf", tmp_path / "a.npz", {"frame": "map"})
     with pytest.raises(ExportError, match="GiB"):

@@ -99,7 +99,7 @@ def test_cubes_have_only_their_outer_faces_facing_outwards(tmp_path, voxels, fac
     np.testing.assert_allclose(np.asarray(mesh.vertices).min(axis=0), 0.1 * np.min(voxels, axis=0), atol=1e-6)
 
 
-def test_points_and_colours(tmp_path) -> None:
+def test_points_and_colors(tmp_path) -> None:
     import open3d as o3d
 
     occupancy = asymmetric()
@@ -123,7 +123,7 @@ def test_a_querys_matches_stand_out(tmp_path) -> None:
     assert np.abs(np.asarray(mesh.vertices)[strong] - center).max() < 0.051
 
 
-def test_bad_requests_are_told_and_leave_nothing(tmp_path) -> None:
+def test_bad_requests_are_reported_and_leave_nothing(tmp_path) -> None:
     good = map_of(asymmetric())
     with pytest.raises(ConfigError, match="npz"):
         export_map(good, "npy", tmp_path / "a")

@@ -41,7 +41,7 @@ def test_an_npz_in_another_frame_says_where_it_is(tmp_path) -> None:
     np.testing.assert_array_equal(labels[grid == 1], np.where(row % 3, row % 3, 3))
 
 
-def test_a_ply_names_its_frame_and_keeps_colours(tmp_path) -> None:
+def test_a_ply_names_its_frame_and_keeps_colors(tmp_path) -> None:
     import open3d as o3d
 
     scan_map = map_of(occupancy_of(VOXELS, colors=[(255, 0, 0), (0, 255, 0), (0, 0, 255)]))
@@ -74,7 +74,7 @@ def test_a_map_of_several_sizes_is_brought_to_the_largest() -> None:
     assert place_voxels(map_of(several), "map", one_size=True).occupancy.deepest == 0
 
 
-def test_bad_frames_are_told(tmp_path) -> None:
+def test_bad_frames_are_reported(tmp_path) -> None:
     scan_map = map_of(occupancy_of(VOXELS))
     with pytest.raises(ConfigError, match="map, gravity or first-camera, got 'robot'"):
         export_map(scan_map, "npz", tmp_path / "a.npz", {"frame": "robot"})
@@ -86,7 +86,7 @@ def test_bad_frames_are_told(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("frame", ["map", "gravity"])
-def test_a_box_holds_the_voxels_whose_centres_lie_in_it(frame) -> None:
+def test_a_box_holds_the_voxels_whose_centers_lie_in_it(frame) -> None:
     rng = np.random.default_rng(0)
     voxels = np.unique(rng.integers(-12, 12, (300, 3)), axis=0)
     occupied, free = voxels[::2], voxels[1::2]

@@ -78,7 +78,7 @@ def splat_transform(tmp_path_factory) -> list[str]:
 
 
 def exported(tmp_path: Path, command: list[str], target: str):
-    """Gaussians of random colours, and what the converter made of their export."""
+    """Gaussians of random colors, and what the converter made of their export."""
     g = random_gaussians(300, seed=2)
     g.colors[:] = np.random.default_rng(2).integers(0, 256, g.colors.shape)
     export_map(map_of(g), "gaussians", tmp_path / "g.ply")
@@ -95,7 +95,7 @@ def test_splat_transform_reads_what_was_written(tmp_path: Path, splat_transform)
     np.testing.assert_allclose(np.stack([columns[f"rot_{i}"] for i in range(4)], 1), g.quats_wxyz, atol=1e-6)
 
 
-def test_splat_transform_sees_the_colours_and_opacities_that_were_written(tmp_path: Path, splat_transform) -> None:
+def test_splat_transform_sees_the_colors_and_opacities_that_were_written(tmp_path: Path, splat_transform) -> None:
     """Its compressed PLY holds red, green, blue and opacity as it decodes them, 8 bits each of a block's range."""
     g, path = exported(tmp_path, splat_transform, "g.compressed.ply")
     header, _, body = path.read_bytes().partition(b"end_header\n")

@@ -121,7 +121,7 @@ def test_of_a_disk_that_fills_up_nothing_is_left(tmp_path, monkeypatch, name) ->
     assert "the disk is full" in refused(None, "any", tmp_path / name)
 
 
-def test_a_place_that_cannot_be_written_to_is_told(keyframes) -> None:
+def test_a_place_that_cannot_be_written_to_is_reported(keyframes) -> None:
     with pytest.raises(ExportError, match=r"Cannot write /proc/map\.npz: "):
         export_map(whole(room()[0], keyframes), "npz", "/proc/map.npz")
 
@@ -141,7 +141,7 @@ def test_maps_of_several_sizes_go_through_every_exporter(tmp_path, keyframes, ki
 
 
 @pytest.mark.parametrize(("kind", "name"), CASES)
-def test_a_voxel_larger_than_the_room_is_written_or_told(tmp_path, keyframes, kind, name) -> None:
+def test_a_voxel_larger_than_the_room_is_written_or_reported(tmp_path, keyframes, kind, name) -> None:
     huge = occupancy_of([(0, 0, 0)], free=[(0, 0, 1)]).replace(voxel_size=20.0)
     scan_map = whole(huge, keyframes)
     if kind == "nav2":

@@ -41,7 +41,7 @@ def test_faces_stand_upright_where_the_frame_has_them(tmp_path, frame) -> None:
     assert merged.volume == pytest.approx(len(there.rows) * 1e-3, rel=1e-3)  # positive: faces look outwards
 
 
-def test_colours_are_the_surfaces_as_light(tmp_path) -> None:
+def test_colors_are_the_surfaces_as_light(tmp_path) -> None:
     scan_map = map_of(occupancy_of([(0, 14, 20)], colors=[(255, 128, 0)]))
     export_map(scan_map, "glb", tmp_path / "map.glb", {"frame": "map"})
     (mesh,) = trimesh.load(tmp_path / "map.glb").geometry.values()

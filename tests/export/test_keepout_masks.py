@@ -122,7 +122,7 @@ def test_a_layer_is_where_the_plan_is_whatever_the_lattice(tmp_path) -> None:
         ("plant:1.5:60%", Avoided("plant", 1.5, 60)),
     ],
 )
-def test_entries_are_words_metres_and_costs(entry, expected) -> None:
+def test_entries_are_words_meters_and_costs(entry, expected) -> None:
     assert parse_avoided([entry]) == [expected]
 
 
@@ -144,7 +144,7 @@ def test_entries_are_words_metres_and_costs(entry, expected) -> None:
         (["avoid"], "same file name"),
     ],
 )
-def test_bad_entries_are_told(tmp_path, entries, message) -> None:
+def test_bad_entries_are_reported(tmp_path, entries, message) -> None:
     with pytest.raises(ConfigError, match=message):
         export_map(map_of(occupancy_of([(0, 0, 0)]), Z_UP), "nav2", tmp_path / "map.yaml", {"avoid": entries})
     assert not list(tmp_path.iterdir())

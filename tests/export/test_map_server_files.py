@@ -20,7 +20,7 @@ def test_costs_are_read_as_they_were_written(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(("pixel", "read"), [(0, 100), (254, 0), (205, -1)])
-def test_a_plans_pixels_are_told_apart(tmp_path, pixel, read) -> None:
+def test_a_plans_pixels_are_distinguished(tmp_path, pixel, read) -> None:
     pixels = np.full((2, 3), 205, np.uint8)
     pixels[1, 0] = pixel  # the smallest y, the last x
     write_map(tmp_path / "map.yaml", pixels, CellGrid(np.zeros(2), 0.1, (2, 3), "gravity"), PLAN, "a plan")

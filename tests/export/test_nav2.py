@@ -70,13 +70,13 @@ def test_free_share_and_inflation(tmp_path) -> None:
         ({"inflation": float("nan")}, "inflation"),
     ],
 )
-def test_bad_options_are_told(tmp_path, options, message) -> None:
+def test_bad_options_are_reported(tmp_path, options, message) -> None:
     with pytest.raises(ConfigError, match=message):
         export_map(map_of(room()[0], Z_UP), "nav2", tmp_path / "map.yaml", options)
     assert not list(tmp_path.iterdir())
 
 
-def test_what_cannot_be_written_is_told(tmp_path) -> None:
+def test_what_cannot_be_written_is_reported(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"\.yaml"):
         export_map(map_of(room()[0], Z_UP), "nav2", tmp_path / "map.pgm")
     with pytest.raises(ExportError, match="no plan"):

@@ -108,7 +108,7 @@ def test_a_file_is_no_larger_than_octomaps_own(tmp_path, occupancy) -> None:
     assert body(tmp_path / "own.ot") == body(tmp_path / "map.ot")
 
 
-def test_colours_and_probabilities(tmp_path) -> None:
+def test_colors_and_probabilities(tmp_path) -> None:
     occupancy = scattered()
     occupancy = occupancy.replace(probability=np.where(occupancy.state == OCCUPIED, 0.7, 0.6).astype(np.float32))
     export_map(map_of(occupancy), "octomap", tmp_path / "map.ot", {"frame": "map", "color": True})
@@ -135,7 +135,7 @@ def test_debians_tools_open_and_compare(tmp_path) -> None:
     )
 
 
-def test_what_cannot_be_written_is_told(tmp_path) -> None:
+def test_what_cannot_be_written_is_reported(tmp_path) -> None:
     scan_map = map_of(scattered())
     with pytest.raises(ConfigError, match=r"named .bt"):
         export_map(scan_map, "octomap", tmp_path / "map.octree")

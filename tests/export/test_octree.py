@@ -61,7 +61,7 @@ def test_nodes_are_those_of_a_plain_tree_in_its_order(seed) -> None:
         np.testing.assert_array_equal(tree.kinds[inner] >> 2 * i & 3 > 0, tree.children[inner] >> i & 1 == 1)
 
 
-def test_one_voxel_is_a_branch_and_other_colours_are_not_merged() -> None:
+def test_one_voxel_is_a_branch_and_other_colors_are_not_merged() -> None:
     assert len(build_octree([leaves([(0, 0, 0)], [1.0])])) == DEPTH + 1
     cube = np.stack(np.meshgrid(*[(0, 1)] * 3), axis=-1).reshape(-1, 3)
     assert len(build_octree([leaves(cube, np.ones(8))])) == DEPTH

@@ -39,7 +39,7 @@ def collision_free(path, tree_size):
 
 
 def planned(is_free, start, goal, low, high):
-    """(N, 3) points of a path that OMPL's RRT-Connect finds, a centimetre apart; None without a path."""
+    """(N, 3) points of a path that OMPL's RRT-Connect finds, a centimeter apart; None without a path."""
     from ompl import base, geometric
 
     space = base.RealVectorStateSpace(3)

@@ -1,4 +1,4 @@
-"""PLY: closed surfaces, and the colourings that are computed."""
+"""PLY: closed surfaces, and the colorings that are computed."""
 
 from types import SimpleNamespace
 
@@ -15,7 +15,7 @@ BLUE, YELLOW = (68, 1, 84), (253, 231, 37)
 
 
 def point_colors(tmp_path, occupancy, color):
-    """(V, 3) colours that Open3D reads of the voxels' centres."""
+    """(V, 3) colors that Open3D reads of the voxels' centers."""
     import open3d as o3d
 
     scan_map = SimpleNamespace(
@@ -56,7 +56,7 @@ def test_an_empty_map_is_refused_in_a_sentence(tmp_path, color) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_unknown_colours_are_told_with_those_that_exist() -> None:
+def test_unknown_colors_are_reported_with_those_that_exist() -> None:
     with pytest.raises(ConfigError, match="rgb, class, height or probability, got 'depth'"):
         ply.Options(color="depth")
 

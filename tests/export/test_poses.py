@@ -30,7 +30,7 @@ def scan_map(tmp_path):
 
 
 def pixels(scan_map, row):
-    """Where the points of the export stand in a keyframe's image; integers are pixel centres."""
+    """Where the points of the export stand in a keyframe's image; integers are pixel centers."""
     points = scan_map.gaussians.means.astype(float)
     camera = scan_map.keyframes.views()[row][1]
     return points, *project(transform(invert(cameras(3)[row]), points), camera)
@@ -70,7 +70,7 @@ def test_nerfstudio_cameras_look_along_minus_z(tmp_path, scan_map) -> None:
     np.testing.assert_allclose(described["T_frame_map"], CAMERA_TO_UP)
 
 
-def test_what_cannot_be_written_is_told(tmp_path, scan_map) -> None:
+def test_what_cannot_be_written_is_reported(tmp_path, scan_map) -> None:
     with pytest.raises(ConfigError, match="colmap or nerfstudio"):
         export_map(scan_map, "poses", tmp_path / "out", {"form": "bundler"})
     export_map(scan_map, "poses", tmp_path / "out", {"points": 0})

@@ -1,4 +1,4 @@
-"""Lifting, cells, the ray-aligned initialisation, and anchors that follow their keyframes."""
+"""Lifting, cells, the ray-aligned initialization, and anchors that follow their keyframes."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_means_are_their_anchors_in_their_keyframes_and_keep_pixel_and_depth() -
         assert (pixels < (CAMERA.width, CAMERA.height)).all()
 
 
-def test_ray_aligned_initialisation_is_the_papers() -> None:
+def test_ray_aligned_initialization_is_the_papers() -> None:
     T = random_pose(3)
     g = lifted([wall_frame(2.0)], [T], gamma=2.5, coverage=0.5)
     np.testing.assert_allclose(g.scales[:, 2], 2.5 * g.scales[:, 0], rtol=1e-6)

@@ -150,7 +150,7 @@ def test_options_out_of_range_are_refused(wrong) -> None:
         fitting.Options(**wrong)
 
 
-def test_isotropic_gaussians_are_spheres_of_their_neighbours_distance() -> None:
+def test_isotropic_gaussians_are_spheres_of_their_neighbors_distance() -> None:
     frames, poses = walls(1)
     g = lifted(frames, poses, initialization="isotropic")
     assert (g.scales == g.scales[:, :1]).all()

@@ -10,15 +10,15 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-COLOURS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], np.float32)
+COLORS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], np.float32)
 """RGB in 0…1 that each class of ``write_classifier`` is made for; the first is void."""
 
 SHARPNESS = 4.0
 
 
 def logits(image: NDArray[np.floating]) -> NDArray[np.float32]:
-    """(…, 4) of (…, 3) normalised colours: minus half the squared distance to a class's colour, but for a constant."""
-    return (SHARPNESS * (image @ COLOURS.T - 0.5 * (COLOURS**2).sum(axis=1))).astype(np.float32)
+    """(…, 4) of (…, 3) normalized colors: minus half the squared distance to a class's color, but for a constant."""
+    return (SHARPNESS * (image @ COLORS.T - 0.5 * (COLORS**2).sum(axis=1))).astype(np.float32)
 
 
 def write_classifier(
@@ -34,8 +34,8 @@ def write_classifier(
 
     tail: "logits", "softmax" or "argmax".  shrink: the output is smaller by this factor.
     """
-    weight = numpy_helper.from_array((SHARPNESS * COLOURS)[:, :, None, None], "weight")
-    bias = numpy_helper.from_array(-0.5 * SHARPNESS * (COLOURS**2).sum(axis=1), "bias")
+    weight = numpy_helper.from_array((SHARPNESS * COLORS)[:, :, None, None], "weight")
+    bias = numpy_helper.from_array(-0.5 * SHARPNESS * (COLORS**2).sum(axis=1), "bias")
     nodes, at = [], "image"
 
     def add(kind: str, *more: str, **attributes: Any) -> None:

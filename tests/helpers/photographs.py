@@ -1,4 +1,4 @@
-"""A capture of colour images alone, for the tests of structure from motion."""
+"""A capture of color images alone, for the tests of structure from motion."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def dense(occupancy: Occupancy, values: np.ndarray, lo: object, hi: object, fill
 def occupancy_of(
     voxels: object, features: object = None, colors: object = None, free: object = (), origin: object = (0, 0, 0)
 ) -> Occupancy:
-    """An occupancy map with given occupied and free voxels (V, 3) of 0.1 m; features and colours are given in the
+    """An occupancy map with given occupied and free voxels (V, 3) of 0.1 m; features and colors are given in the
     voxels' order and stored in the map's."""
     voxels = np.asarray(voxels, np.int32).reshape(-1, 3)
     free = np.asarray(free, np.int32).reshape(-1, 3)
@@ -122,7 +122,7 @@ def write_standard_ply(
             **{f"scale_{i}": np.log(written.scales[:, i]) for i in range(1 if spheres else 3)},
             **{
                 f"rot_{i}": 2.0 * written.quats_wxyz[:, i] for i in range(4)
-            },  # not of unit length, as optimisers leave it
+            },  # not of unit length, as optimizers leave it
             **({} if labels is None else {"label": labels}),
         }
     header = "".join(f"property float {name}\n" for name in columns)

@@ -15,7 +15,7 @@ SIZE = 32, 24
 """Width and height of the images that are written, unless told otherwise."""
 
 DEPTH_M = 2.0
-"""Depth of frame 0's pixels; frame i is a centimetre farther."""
+"""Depth of frame 0's pixels; frame i is a centimeter farther."""
 
 
 def data_folder() -> Path:
@@ -35,7 +35,7 @@ def models_folder() -> Path:
 
 
 def color_image(index: int, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB: red grows to the right, green downwards, blue with the index."""
+    """(H, W, 3) RGB: red grows to the right, green downward, blue with the index."""
     width, height = size
     red, green = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
     return np.stack((red, green, np.full(red.shape, 10.0 * index % 256)), axis=-1).astype(np.uint8)
@@ -64,7 +64,7 @@ def camera_matrix(size: tuple[int, int] = SIZE) -> NDArray[np.float64]:
 
 
 def write_image(path: Path, image: NDArray[np.generic]) -> None:
-    """Write RGB or grey in the format that the name states."""
+    """Write RGB or gray in the format that the name states."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image)
 

@@ -28,7 +28,7 @@ class Rectangle:
     def seen(
         self, origin: NDArray[np.float64], directions: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distance along (H, W, 3) directions, inf where missed, and grey 0…1."""
+        """Distance along (H, W, 3) directions, inf where missed, and gray 0…1."""
         a, b, c = (np.asarray(v, float) for v in (self.across, self.along, self.corner))
         normal = np.cross(a, b)
         distance = ((c - origin) @ normal) / (directions @ normal)
@@ -42,7 +42,7 @@ class Rectangle:
 def render(
     rectangles: Sequence[Rectangle], T_world_cam: NDArray[np.float64], camera: Intrinsics = CAMERA, noise: float = 1.0
 ) -> tuple[StereoView, NDArray[np.float32]]:
-    """The view, with ``noise`` of that many grey levels, and its true depth, 0 = nothing hit."""
+    """The view, with ``noise`` of that many gray levels, and its true depth, 0 = nothing hit."""
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack(((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)), axis=-1)
     found = [r.seen(T_world_cam[:3, 3], rays @ T_world_cam[:3, :3].T) for r in rectangles]
@@ -57,7 +57,7 @@ def render(
 
 
 def looking(x: float, y: float = 0.0, z: float = 0.0, towards: float = 2.0) -> NDArray[np.float64]:
-    """A camera at (x, y, z) that looks at (0, 0, towards)."""
+    """A camera at (x, y, z) that looks at (0, 0, toward)."""
     forward = np.array((0.0, 0.0, towards)) - (x, y, z)
     forward /= np.linalg.norm(forward)
     right = np.cross((0.0, 1.0, 0.0), forward)
@@ -70,7 +70,7 @@ def looking(x: float, y: float = 0.0, z: float = 0.0, towards: float = 2.0) -> N
 
 
 def _noise(x: NDArray[np.float64], y: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
-    """Smooth random grey with features of 5 and 12 cm."""
+    """Smooth random gray with features of 5 and 12 cm."""
     rng = np.random.default_rng(seed)
     total = np.zeros_like(x)
     for size, weight in ((0.05, 0.5), (0.12, 0.5)):

@@ -63,7 +63,7 @@ def test_a_map_is_made_asked_and_outlives_its_model(
     assert json.loads(capsys.readouterr().out)["encoder"] == "clip"
 
 
-def test_a_model_that_is_not_there_is_told_before_any_work(model: Path, tmp_path: Path) -> None:
+def test_a_model_that_is_not_there_is_reported_before_any_work(model: Path, tmp_path: Path) -> None:
     language = {"encoder": "clip", "clip": {"model": "tinny"}}
     with pytest.raises(ModelError, match=r"There is no model 'tinny' \(did you mean 'tiny'\?\)"):
         freeocc3d.reconstruct("builtin:room", tmp_path / "map", {**QUICK, "language": language})

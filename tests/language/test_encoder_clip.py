@@ -139,7 +139,7 @@ def test_one_window_as_large_as_the_frame_is_the_frame(folder: Path) -> None:
 
 
 def test_windows_are_spliced_where_they_belong(folder: Path) -> None:
-    """A patch's feature is the normalised mean of what the windows over it say, each encoded as a frame of its own."""
+    """A patch's feature is the normalized mean of what the windows over it say, each encoded as a frame of its own."""
     shown = frame(48, 64)
     got = encoder(folder, short_side=48, stride=0).encode(shown).astype(np.float32)
     alone = encoder(folder, short_side=32, window=0, stride=0)
@@ -187,19 +187,19 @@ def test_other_precisions_stay_near(folder: Path, tmp_path: Path, precision: str
         ({"contrast": ("wall", " ")}, "'contrast' must not hold empty words"),
     ],
 )
-def test_options_out_of_range_are_told(options: dict[str, Any], message: str) -> None:
+def test_options_out_of_range_are_reported(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         clip.Options(model="x", **options)
 
 
-def test_a_device_that_is_not_there_is_told(folder: Path) -> None:
+def test_a_device_that_is_not_there_is_reported(folder: Path) -> None:
     with pytest.raises(ConfigError, match="does not run on cuda:0"):
         encoder(folder, device="cuda:0")
     with pytest.raises(ConfigError, match="must be cpu or cuda:0"):
         encoder(folder, device="tpu")
 
 
-def test_no_model_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_model_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FREEOCC3D_MODELS", str(tmp_path))
     with pytest.raises(ModelError, match=r"language\.clip\.model names no model"):
         clip.load(clip.Options())

@@ -1,4 +1,4 @@
-"""Colour names: what words mean, what surfaces under imperfect light are called, and the encoder's contract."""
+"""Color names: what words mean, what surfaces under imperfect light are called, and the encoder's contract."""
 
 from __future__ import annotations
 
@@ -135,13 +135,13 @@ def test_spellings_mean_the_same() -> None:
     np.testing.assert_array_equal(dark, deep)
 
 
-def test_a_phrase_of_two_colours_finds_things_of_either() -> None:
+def test_a_phrase_of_two_colors_finds_things_of_either() -> None:
     for name in ("red", "white"):
         assert scores(SURFACES[name], ["red and white"])["red and white"] > 0.9
     assert scores(SURFACES["blue"], ["red and white"])["red and white"] < 0.3
 
 
-def test_every_word_is_reached_by_some_colour_and_competes_with_others_only() -> None:
+def test_every_word_is_reached_by_some_color_and_competes_with_others_only() -> None:
     modified = [f"{modifier} {base}" for modifier, meanings in MODIFIERS.items() for base in meanings]
     words = [*TERMS, *NAMES, *modified]
     text = WORDS.encode_words(words)
@@ -153,7 +153,7 @@ def test_every_word_is_reached_by_some_colour_and_competes_with_others_only() ->
         assert row.max() >= WORDS.same_word, word  # the term that the word is a shade of does not compete
 
 
-def test_meanings_name_colours_that_exist() -> None:
+def test_meanings_name_colors_that_exist() -> None:
     for meaning in (*TERMS.values(), *NAMES.values(), *(m for table in MODIFIERS.values() for m in table.values())):
         assert set(meaning) <= set(CENTROIDS)
     for table in MODIFIERS.values():
@@ -191,8 +191,8 @@ def test_look_up_table_agrees_with_the_formula() -> None:
     assert (exact * looked_up).sum(axis=1).min() > 0.99
 
 
-def test_lab_of_reference_colours() -> None:
-    """Values of the sRGB primaries in CIELAB (D65), as colour tables give them."""
+def test_lab_of_reference_colors() -> None:
+    """Values of the sRGB primaries in CIELAB (D65), as color tables give them."""
     rgb = np.array([(255, 255, 255), (0, 0, 0), (255, 0, 0), (0, 255, 0), (0, 0, 255)], float)
     expected = [(100, 0, 0), (0, 0, 0), (53.24, 80.09, 67.20), (87.73, -86.18, 83.18), (32.30, 79.19, -107.86)]
     np.testing.assert_allclose(color.rgb_to_lab(rgb), expected, atol=0.05)
@@ -206,7 +206,7 @@ def test_state_is_plain_and_restores_the_words() -> None:
 
 
 @pytest.mark.parametrize("state", [{}, {"terms": ["red"]}, {"terms": list(TERMS), "colours": ["red"]}])
-def test_a_map_with_other_colours_is_refused(state: dict) -> None:
+def test_a_map_with_other_colors_is_refused(state: dict) -> None:
     with pytest.raises(MapError, match="make the map again"):
         load_text(state)
 

@@ -87,6 +87,6 @@ def test_resampling_equals_pytorchs() -> None:
         assert np.abs(resample_patches(values, grid) - expected).max() < 1e-5
 
 
-def test_options_out_of_range_are_told() -> None:
+def test_options_out_of_range_are_reported() -> None:
     with pytest.raises(ConfigError, match="'short_side' must be from 16 to 4096"):
         dinov2.Options(short_side=0)

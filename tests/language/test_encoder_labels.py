@@ -116,7 +116,7 @@ def test_a_capture_without_class_images_says_what_to_do(tmp_path: Path) -> None:
         (lambda path: (path / "other0.png").write_bytes((path / "seg2_frame00000.png").read_bytes()), "same number"),
     ],
 )
-def test_broken_folders_are_told(tmp_path: Path, broken: object, told: str) -> None:
+def test_broken_folders_are_reported(tmp_path: Path, broken: object, told: str) -> None:
     path = folder(tmp_path, [0, 1])
     broken(Path(path))  # type: ignore[operator]
     with pytest.raises(CaptureError, match=told):
@@ -128,7 +128,7 @@ def test_missing_classes_file_is_named(tmp_path: Path) -> None:
         load(Options(folder=folder(tmp_path, [0, 1]), classes=str(tmp_path / "absent.json")), scan(tmp_path))
 
 
-def test_broken_class_images_are_told(tmp_path: Path) -> None:
+def test_broken_class_images_are_reported(tmp_path: Path) -> None:
     capture = scan(tmp_path)
     path = Path(folder(tmp_path, [0, 1]))
     encoder = load(Options(folder=str(path)), capture)
@@ -140,7 +140,7 @@ def test_broken_class_images_are_told(tmp_path: Path) -> None:
         encoder.encode(capture[1])
 
 
-def test_another_aspect_ratio_and_values_without_names_are_told(tmp_path: Path) -> None:
+def test_another_aspect_ratio_and_values_without_names_are_reported(tmp_path: Path) -> None:
     capture = scan(tmp_path)
     for image, told in ((np.ones((20, 20), np.uint8), "20 x 20"), (np.full(SIZE[::-1], 9, np.uint8), "value 9")):
         with pytest.raises(CaptureError, match=told):

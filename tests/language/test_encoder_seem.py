@@ -84,6 +84,6 @@ def test_words_are_found_again(folder: Path, tmp_path: Path, monkeypatch: pytest
     assert np.linalg.norm(features, axis=1) == pytest.approx(1, abs=1e-5)
 
 
-def test_options_out_of_range_are_told() -> None:
+def test_options_out_of_range_are_reported() -> None:
     with pytest.raises(ConfigError, match="'mask_probability' must be greater than 0 and less than 1"):
         seem.Options(mask_probability=1.0)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
-from onnx_models import COLOURS, logits, write_classifier, write_identity, write_model
+from onnx_models import COLORS, logits, write_classifier, write_identity, write_model
 from small_captures import data_folder, models_folder
 
 import freeocc3d
@@ -28,11 +28,11 @@ PLAIN: dict[str, Any] = {"mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0), "strid
 
 
 def picture(height: int = 64, width: int = 96) -> NDArray[np.uint8]:
-    """Four fields of the classes' colours, each of them large and a little off."""
+    """Four fields of the classes' colors, each of them large and a little off."""
     rows, columns = np.indices((height, width))
     number = 2 * (rows >= height // 2) + (columns >= width // 2)
     rng = np.random.default_rng(0)
-    return np.clip(255 * COLOURS[number] + rng.normal(0, 8, (height, width, 3)), 0, 255).astype(np.uint8)
+    return np.clip(255 * COLORS[number] + rng.normal(0, 8, (height, width, 3)), 0, 255).astype(np.uint8)
 
 
 def frame(color: NDArray[np.uint8]) -> Frame:
@@ -89,7 +89,7 @@ def test_class_numbers_are_certain(tmp_path: Path) -> None:
     np.testing.assert_array_equal(features.argmax(axis=2), expected(picture()).argmax(axis=2))
 
 
-def test_images_are_normalised_and_channels_put_in_order(tmp_path: Path) -> None:
+def test_images_are_normalized_and_channels_put_in_order(tmp_path: Path) -> None:
     mean, std = (0.1, 0.2, 0.3), (0.5, 0.6, 0.7)
     color = picture()
     normalised = (color.astype(np.float32) / 255 - np.float32(mean)) / np.float32(std)
@@ -158,7 +158,7 @@ def test_posteriors_of_classes_that_are_mapped_to_one_are_added(tmp_path: Path) 
         ("classes: [", "not valid YAML"),
     ],
 )
-def test_broken_mappings_are_told(tmp_path: Path, text: str, told: str) -> None:
+def test_broken_mappings_are_reported(tmp_path: Path, text: str, told: str) -> None:
     path = tmp_path / "mapping.yaml"
     path.write_text(text)
     with pytest.raises(FreeOccError, match=told):
@@ -172,7 +172,7 @@ def refused(tmp_path: Path, path: Path, told: str, **options: Any) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_files_that_are_no_networks_are_told(tmp_path: Path) -> None:
+def test_files_that_are_no_networks_are_reported(tmp_path: Path) -> None:
     refused(tmp_path, tmp_path / "absent.onnx", "There is no file .*language.segmenter.model")
     refused(tmp_path, tmp_path, "There is no file .*language.segmenter.model")
     (tmp_path / "text.onnx").write_text("not a network")
@@ -195,12 +195,12 @@ def test_files_that_are_no_networks_are_told(tmp_path: Path) -> None:
         ([1, 3, 8, 8], TensorProto.FLOAT, 2),
     ],
 )
-def test_networks_of_other_inputs_are_told(tmp_path: Path, shape: list[int], dtype: int, inputs: int) -> None:
+def test_networks_of_other_inputs_are_reported(tmp_path: Path, shape: list[int], dtype: int, inputs: int) -> None:
     path = write_identity(tmp_path / "net.onnx", shape, dtype, inputs)
     refused(tmp_path, path, "does not take one RGB image")
 
 
-def test_networks_that_fit_neither_classes_nor_sizes_are_told(tmp_path: Path) -> None:
+def test_networks_that_fit_neither_classes_nor_sizes_are_reported(tmp_path: Path) -> None:
     net = write_classifier(tmp_path / "net.onnx", size=(64, 96))
     refused(tmp_path, write_identity(tmp_path / "three.onnx", [1, 3, 8, 8]), r"names 4 classes.*out \(1, 3, 8, 8\)")
     refused(tmp_path, write_identity(tmp_path / "two.onnx", [2, 3, 8, 8]), "takes 2 images at once")
@@ -212,13 +212,13 @@ def test_networks_that_fit_neither_classes_nor_sizes_are_told(tmp_path: Path) ->
     refused(tmp_path, net, "There is no file .*language.segmenter.classes", classes=str(tmp_path / "absent.txt"))
 
 
-def test_files_that_are_not_there_are_told_before_any_work(tmp_path: Path) -> None:
+def test_files_that_are_not_there_are_reported_before_any_work(tmp_path: Path) -> None:
     settings = {"language": {"encoder": "segmenter", "segmenter": {"model": str(tmp_path / "absent.onnx")}}}
     with pytest.raises(ConfigError, match=r"absent\.onnx, which language\.segmenter\.model names"):
         checks.check(config.resolve(settings))
 
 
-def test_what_shapes_leave_open_is_told_before_there_is_work_to_lose(tmp_path: Path) -> None:
+def test_what_shapes_leave_open_is_reported_before_there_is_work_to_lose(tmp_path: Path) -> None:
     open_ = write_identity(tmp_path / "net.onnx", [1, "channels", "height", "width"])
     refused(tmp_path, open_, r"names 4 classes.*\(1, 3, 64, 64\)")
     shape = numpy_helper.from_array(np.array([1, 4, 10, 10]), "shape")
@@ -315,10 +315,10 @@ def test_a_map_of_a_networks_classes_is_asked_and_refined_without_its_capture(tm
         },
     }
     made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings)
-    by_colour = freeocc3d.reconstruct("builtin:room", tmp_path / "colours", {**settings, "language": {}})
+    by_color = freeocc3d.reconstruct("builtin:room", tmp_path / "colours", {**settings, "language": {}})
     red = made.query("red thing")
     assert red.matched
-    seen = by_colour.query("red").regions[0]
+    seen = by_color.query("red").regions[0]
     assert np.linalg.norm(red.regions[0].centroid - seen.centroid) < 0.3
     nothing = made.query("purple unicorn")
     assert not nothing.matched

@@ -43,7 +43,7 @@ def encoder(folders: dict[str, str], **options: Any) -> trident.TridentEncoder:
 
 
 def pixels(rgb: NDArray[np.uint8], mean: list[float], std: list[float], patch: int) -> torch.Tensor:
-    """(1, 3, H, W) normalised, GRID patches."""
+    """(1, 3, H, W) normalized, GRID patches."""
     size = GRID[1] * patch, GRID[0] * patch
     resized = torch.from_numpy(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)).float() / 255
     return ((resized - torch.tensor(mean)) / torch.tensor(std)).permute(2, 0, 1)[None]
@@ -180,7 +180,7 @@ def test_pooling_is_the_weighted_mean_of_masks_means() -> None:
     assert pool_masks(features, shares, scores) == pytest.approx(expected, abs=1e-5)
 
 
-def test_lacking_and_mistaken_models_are_told(folders: dict[str, str]) -> None:
+def test_lacking_and_mistaken_models_are_reported(folders: dict[str, str]) -> None:
     with pytest.raises(ModelError, match=r"language\.trident\.sam names no model"):
         trident.load(trident.Options(**{**folders, "sam": ""}))
     with pytest.raises(ModelError, match=r"language\.trident\.dino needs a model of kind backbone; .* is of kind sam"):

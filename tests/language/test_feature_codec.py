@@ -60,8 +60,8 @@ def test_a_component_that_is_never_negative_decodes_to_exact_zeros() -> None:
     np.testing.assert_array_equal(Codec.fit(features).decode(Codec.fit(features).encode(features)), features)
 
 
-def test_normalised_means_outside_of_the_fitted_range_survive() -> None:
-    """Features of voxels are normalised means of the features that the codec was fitted to."""
+def test_normalized_means_outside_of_the_fitted_range_survive() -> None:
+    """Features of voxels are normalized means of the features that the codec was fitted to."""
     codec = Codec.fit(unit(np.array([(0.9, 0.43, 0.0), (0.9, 0.0, 0.43)])))
     mean = unit(np.array([(0.9, 0.215, 0.215)]))
     assert cosines(codec.decode(codec.encode(mean)), mean)[0] > 0.9999
@@ -109,7 +109,7 @@ def test_cosines_are_those_of_decoded_features(dimension: int, many: bool, monke
 
 
 def smooth_fields(length: float, n: int = 20000, dimension: int = 512) -> NDArray[np.float16]:
-    """Features that change over the walls of a room of 4 m, by their correlation length in metres."""
+    """Features that change over the walls of a room of 4 m, by their correlation length in meters."""
     rng = np.random.default_rng(0)
     points = rng.uniform(0, 4, (n, 3))
     wall = rng.integers(0, 3, n)

@@ -171,7 +171,7 @@ def test_regions_are_connected_and_alike() -> None:
     zeros = [5, 6, 7, 8, 9, 10]
     np.testing.assert_array_equal(first, [a, a, b, b, a, *zeros, c])
     np.testing.assert_array_equal(shared, first)
-    features[0, 1] = (1, 0.2)  # like its neighbour, but not the same
+    features[0, 1] = (1, 0.2)  # like its neighbor, but not the same
     first, shared = feature_fusion._regions(features, np.float32(0.9), np.float32(0.999))
     assert (first[1], shared[1]) == (0, 1)
 

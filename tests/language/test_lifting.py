@@ -72,7 +72,7 @@ def test_features_come_from_where_the_gaussians_project_to() -> None:
     np.testing.assert_allclose(features[seen & ~left], np.broadcast_to((0, 1), (np.sum(seen & ~left), 2)), atol=1e-3)
 
 
-def test_a_broken_frame_is_left_out_with_a_warning_and_others_faults_are_told() -> None:
+def test_a_broken_frame_is_left_out_with_a_warning_and_others_faults_are_reported() -> None:
     told = Warnings()
     assert lift_features(WALL, frames(7, 2), poses(2), Halves(), None, told).any()
     assert told.said == ["Frame 7 is broken."]

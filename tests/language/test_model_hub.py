@@ -217,7 +217,7 @@ def test_names_that_are_none(server: Hub, name: str, message: str) -> None:
         model_hub.pull_package(name)
 
 
-def test_no_network_is_told_in_a_sentence(
+def test_no_network_is_reported_in_a_sentence(
     home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")  # nobody listens there

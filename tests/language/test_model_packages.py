@@ -39,7 +39,7 @@ def test_a_manifest_may_be_json(tmp_path: Path) -> None:
     assert model_packages.read_package(folder).dimension == 8
 
 
-def test_a_wrong_hash_is_told(tmp_path: Path) -> None:
+def test_a_wrong_hash_is_reported(tmp_path: Path) -> None:
     folder = dense_package(tmp_path / "tiny")
     content = bytearray((folder / "text.onnx").read_bytes())
     content[-5] ^= 1
@@ -51,7 +51,7 @@ def test_a_wrong_hash_is_told(tmp_path: Path) -> None:
     package.session("image")
 
 
-def test_what_is_not_onnx_is_told(tmp_path: Path) -> None:
+def test_what_is_not_onnx_is_reported(tmp_path: Path) -> None:
     folder = dense_package(tmp_path / "tiny")
     (folder / "image.onnx").write_bytes(b"\x80\x04a pickle, perhaps")
     write_manifest(folder)
@@ -76,7 +76,7 @@ def test_what_is_not_onnx_is_told(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_other_inputs_and_outputs_are_told(tmp_path: Path, inputs: Any, outputs: Any, message: str) -> None:
+def test_other_inputs_and_outputs_are_reported(tmp_path: Path, inputs: Any, outputs: Any, message: str) -> None:
     folder = dense_package(tmp_path / "tiny")
     graph(folder / "image.onnx", inputs, outputs)
     write_manifest(folder)
@@ -102,7 +102,7 @@ def test_other_inputs_and_outputs_are_told(tmp_path: Path, inputs: Any, outputs:
         ({"files": {}}, "'parts' and 'files' must name the same files"),
     ],
 )
-def test_unusable_manifests_are_told(tmp_path: Path, changes: Any, message: str) -> None:
+def test_unusable_manifests_are_reported(tmp_path: Path, changes: Any, message: str) -> None:
     folder = dense_package(tmp_path / "tiny", **changes)
     with pytest.raises(ModelError, match=message) as caught:
         model_packages.read_package(folder)
@@ -135,7 +135,7 @@ def test_manifests_run_nothing(tmp_path: Path) -> None:
         model_packages.read_package(folder)
 
 
-def test_what_is_lacking_is_told(tmp_path: Path, home: Path) -> None:
+def test_what_is_lacking_is_reported(tmp_path: Path, home: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(ModelError, match="lacks a manifest"):
         model_packages.read_package(tmp_path / "empty")

@@ -73,7 +73,7 @@ def test_real_embeddings_find_synonyms_and_leave_others_alone() -> None:
     assert real.meaning(["chair", "sofa"])["couch"] == 1
 
 
-def test_files_that_cannot_be_used_are_told(tmp_path: Path) -> None:
+def test_files_that_cannot_be_used_are_reported(tmp_path: Path) -> None:
     def told(words: str, **arrays: NDArray[np.generic]) -> None:
         np.savez(tmp_path / "names.npz", **arrays)  # type: ignore[arg-type]
         with pytest.raises(ConfigError, match=words):

@@ -94,7 +94,7 @@ def test_large_pictures_are_sent_smaller() -> None:
     assert sent[10, -10, 2] > 200 > 50 > sent[10, 10, 2]  # RGB: red grows to the right
 
 
-def test_answers_that_name_nothing_are_told_and_cost_nothing_else(tmp_path: Path) -> None:
+def test_answers_that_name_nothing_are_reported_and_cost_nothing_else(tmp_path: Path) -> None:
     with serving(saying("I'm sorry,\x1b[31m I can't.", '["chair"]', "", '["chair"]')) as server:
         found, warnings = named(namer(server.url), tmp_path)
     assert found["names"] == {"chair": {"count": 2, "keyframes": [10, 30]}}

@@ -200,12 +200,12 @@ def test_the_text_side_is_found_by_its_content(package: model_packages.Package, 
         clip.load_text(asked).encode_words(["lamp"])
 
 
-def test_a_text_side_of_another_dimension_is_told(package: model_packages.Package, home: Path) -> None:
+def test_a_text_side_of_another_dimension_is_reported(package: model_packages.Package, home: Path) -> None:
     with pytest.raises(ModelError, match="has 24 dimensions, the map's features 32"):
         clip.load_text({**state(package), "dimension": 32}).encode_words(["chair"])
 
 
-def test_a_damaged_state_is_told() -> None:
+def test_a_damaged_state_is_reported() -> None:
     with pytest.raises(MapError, match="encoder is damaged"):
         clip.load_text({"model": "x"})
 

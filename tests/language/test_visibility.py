@@ -21,7 +21,7 @@ def frame(depth_m: object) -> Frame:
 
 
 def pose(seed: int) -> NDArray[np.float64]:
-    """A camera about two metres from the origin that looks at it, turned a little."""
+    """A camera about two meters from the origin that looks at it, turned a little."""
     rng = np.random.default_rng(seed)
     U, _, Vt = np.linalg.svd(np.eye(3) + 0.2 * rng.normal(size=(3, 3)))
     T = np.eye(4)

@@ -52,7 +52,7 @@ def test_confidences_are_softmax_where_nothing_scores_higher(words: int, monkeyp
         np.testing.assert_allclose(found[:, w], expected, rtol=1e-3)
 
 
-def test_only_what_hangs_together_with_a_seed_grows() -> None:
+def test_only_what_is_connected_to_a_seed_grows() -> None:
     voxels = np.array([(0, 0, 0), (1, 1, 1), (2, 2, 2), (9, 0, 0), (9, 0, 1)], np.int32)
     seeds = np.array([False, False, True, False, False])
     assert word_matching.grow_regions(seeds, label_components(voxels)).tolist() == [True, True, True, False, False]

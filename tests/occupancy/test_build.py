@@ -70,7 +70,7 @@ def test_unknown_features_stay_zero_and_known_ones_become_unit() -> None:
     np.testing.assert_allclose(rows.astype(float), [[0, 0, 0], [0.6, 0.8, 0]], atol=1e-3)
 
 
-def test_a_hall_of_200_metres_costs_what_is_in_it() -> None:
+def test_a_hall_of_200_meters_costs_what_is_in_it() -> None:
     """Its dense array would hold 400 million voxels."""
     corners = [(-100.0, -100.0, 0.0), (100.0, 100.0, 5.0), (-100.0, 99.0, 2.0)]
     frames = [wall_frame(2.0, n) for n in range(3)]

@@ -17,7 +17,7 @@ OPTIONS = carve.Options()
 
 
 def evidence_of(frame: Frame, T=None, options: carve.Options = OPTIONS):
-    """Counts of one image over the blocks that it looks into, and the voxel centres in the world."""
+    """Counts of one image over the blocks that it looks into, and the voxel centers in the world."""
     T = np.eye(4) if T is None else T
     evidence = carve.DepthEvidence(ORIGIN, V, options)
     packed = evidence.add(frame, T)
@@ -49,7 +49,7 @@ def test_the_camera_may_stand_anywhere() -> None:
     assert np.abs(centers[hits > 0][:, 0] - 1.0).max() <= 1.5 * V
 
 
-def test_a_voxel_with_a_thin_post_in_it_is_not_seen_through_beside_the_post() -> None:
+def test_a_voxel_with_a_thin_post_in_it_is_not_seen_through_next_to_the_post() -> None:
     frame = wall_frame(3.0)
     post = slice(82, 85)  # 3 pixels at 1.5 m: 3.5 cm, beside the optical axis
     frame.depth_m[:, post] = 1.5

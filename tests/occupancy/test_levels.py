@@ -46,7 +46,7 @@ def states(occupancy: Occupancy) -> dict[tuple[int, ...], int]:
     return found
 
 
-def test_corners_edges_and_centres(mixed: Occupancy) -> None:
+def test_corners_edges_and_centers(mixed: Occupancy) -> None:
     assert mixed.finest == 0.02
     assert len(states(mixed)) == 2 * (4 * 8) ** 3  # two blocks of level 0, nothing twice
     corners, edges = mixed.occupied_voxels(), mixed.occupied_edges()
@@ -78,7 +78,7 @@ def test_put_together_occupied_wins_over_unknown_over_free(mixed: Occupancy, lev
     np.testing.assert_allclose(np.linalg.norm(made.features.astype(float), axis=1), 1, atol=2e-3)
 
 
-def test_colours_of_parts_are_averaged() -> None:
+def test_colors_of_parts_are_averaged() -> None:
     keys = levels.subdivide_keys(np.array([(0, 0, 0)]))
     parts = some_map(keys, np.ones(8))
     state = np.full((8, 512), FREE, np.uint8)

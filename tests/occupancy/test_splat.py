@@ -19,7 +19,7 @@ LOCAL = np.stack((np.arange(512) // 64, np.arange(512) // 8 % 8, np.arange(512) 
 
 
 def project(g: Gaussians, origin=(0.0, 0.0, 0.0), least=0.0, **options):
-    """Bins, block keys, probabilities (B, 512) and voxel centres (B * 512, 3)."""
+    """Bins, block keys, probabilities (B, 512) and voxel centers (B * 512, 3)."""
     origin = np.asarray(origin, float)
     bins = splat.bin_gaussians(g, origin, splat.Options(voxel_size=V, **options), least_scale=least)
     keys = voxel_keys.unpack_voxels(bins.packed)
@@ -232,7 +232,7 @@ def test_torch_projects_as_the_kernels_do(device: str, projection: str, monkeypa
     )
 
 
-def test_a_gpu_that_is_not_there_is_told() -> None:
+def test_a_gpu_that_is_not_there_is_reported() -> None:
     torch = pytest.importorskip("torch")
     with pytest.raises(ConfigError, match="cpu or cuda"):
         splat.check(splat.Options(device="gpu"))

@@ -48,7 +48,7 @@ def test_cameras_that_are_rolled_or_held_sideways_have_the_same_up() -> None:
     points = np.concatenate((floor, wall))
     for roll in (0.0, 20.0, -20.0, 90.0, -90.0):
         held = rolled(T, roll + rng.normal(0, 6, len(T)))
-        for scale in (0.4, 1.0, 4.0):  # units that are no metres
+        for scale in (0.4, 1.0, 4.0):  # units that are no meters
             held[:, :3, 3] = scale * T[:, :3, 3]
             assert estimate_up(held, scale * points)[2] > np.cos(np.deg2rad(1.5)), (roll, scale)
 

@@ -27,6 +27,6 @@ def test_each_way_of_missing_frames_has_its_code() -> None:
     assert "the first is frame 4" in apart
 
 
-def test_a_scan_that_is_mostly_lost_is_told_what_to_look_for() -> None:
+def test_a_scan_that_is_mostly_lost_gets_advice() -> None:
     (notice,) = warn_of_trajectory(trajectory("keyframe", "lost", "lost"))
     assert "Most of the scan is missing" in notice.text

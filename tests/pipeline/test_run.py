@@ -78,7 +78,7 @@ def test_a_pose_free_run_never_reads_poses_or_class_images(tmp_path, monkeypatch
     assert made.manifest.counts.voxels.occupied > 500
 
 
-def test_neighbouring_folders_are_left_alone(tmp_path, room) -> None:
+def test_neighboring_folders_are_left_alone(tmp_path, room) -> None:
     output = shutil.copytree(room.path, tmp_path / "map")
     (tmp_path / "map.old").mkdir()
     (tmp_path / "map.old" / "backup.txt").write_text("mine")
@@ -249,7 +249,7 @@ def test_poses_of_another_system_make_a_map(tmp_path) -> None:
     assert made.manifest.frame.startswith("world frame of the trajectory file")
 
 
-def test_a_color_camera_of_another_focal_length_is_told_and_corrected(tmp_path) -> None:
+def test_a_color_camera_of_another_focal_length_is_reported_and_corrected(tmp_path) -> None:
     kitchen = data_folder() / "7scenes-kitchen"
     given = {"capture": {"stop": 8, "color_focal": 0.9}}
     made = freeocc3d.reconstruct(kitchen, tmp_path / "given", given)

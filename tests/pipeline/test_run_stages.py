@@ -102,7 +102,7 @@ def test_a_disk_that_fills_up_at_the_very_end_costs_nothing(tmp_path, monkeypatc
     assert freeocc3d.reconstruct("builtin:room", tmp_path / "map", ROOM, resume=True).query("red").matched
 
 
-def test_a_full_disk_is_told_and_what_was_done_is_kept(tmp_path, monkeypatch) -> None:
+def test_a_full_disk_is_reported_and_what_was_done_is_kept(tmp_path, monkeypatch) -> None:
     from freeocc3d.storage.keyframes import Keyframes
 
     written = []
@@ -180,7 +180,7 @@ def test_a_resumed_run_asks_for_no_keyframe_twice(tmp_path) -> None:
     assert made.manifest.vocabulary.names["table"].count == 3
 
 
-def test_a_key_that_is_not_set_is_told_before_any_work(tmp_path, monkeypatch) -> None:
+def test_a_key_that_is_not_set_is_reported_before_any_work(tmp_path, monkeypatch) -> None:
     monkeypatch.delenv("ROOM_KEY", raising=False)
     with pytest.raises(ConfigError, match="ROOM_KEY"):
         freeocc3d.reconstruct(

@@ -17,7 +17,7 @@ from freeocc3d.settings import config
 from freeocc3d.storage.manifest import MapScale
 
 UNIT_M = 2.5
-"""Metres per unit of what the other system gives."""
+"""Meters per unit of what the other system gives."""
 
 ROOM = {"synthetic": {"width": 160, "height": 120, "frames": 60, "noise": False}}
 
@@ -97,7 +97,7 @@ def test_with_a_scale_given_from_the_start_the_map_is_metric(scan: Path, tmp_pat
     assert (near < 0.16).mean() > 0.9
 
 
-def test_a_guessed_camera_is_told(scan: Path, tmp_path: Path) -> None:
+def test_a_guessed_camera_is_reported(scan: Path, tmp_path: Path) -> None:
     settings = {
         "capture": {"stop": 8},
         "tracking": {"backend": "file", "file": {"path": "other.txt", "points": "points.ply", "scale": None}},

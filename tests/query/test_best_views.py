@@ -51,7 +51,7 @@ def test_the_nearest_of_those_that_see_it_alike_comes_first_and_hidden_ones_do_n
     assert [view.frame for view in views] == [3, 15, 12]
     assert [view.visible for view in views] == [1.0, 1.0, 1.0]
     for view, z in zip(views, (0.5, 0.2, 0.0), strict=True):
-        depth = 2.05 - z  # of the voxels' centres
+        depth = 2.05 - z  # of the voxels' centers
         x0, y0, x1, y1 = view.box
         assert abs(x0 - (CAMERA.cx - 0.2 / depth * CAMERA.fx)) <= 1
         assert abs(x1 - (CAMERA.cx + 0.2 / depth * CAMERA.fx)) <= 1
@@ -69,7 +69,7 @@ def test_what_lies_behind_the_surface_or_beyond_the_image_is_not_visible(tmp_pat
     depth_aside = np.where(np.abs(columns) < 0.3, 2.0, 3.0)[None].repeat(CAMERA.height, 0).astype(np.float32)
     (views,) = best_views(room, *keyframes(tmp_path, [(depth, T), (depth_aside, aside)]), regions)
     assert views[0].frame == 0
-    assert views[0].visible == 0.25  # one layer of four: the next one's centres lie 0.15 m behind the front
+    assert views[0].visible == 0.25  # one layer of four: the next one's centers lie 0.15 m behind the front
     assert views[1].visible == 0.125
     assert views[1].box[0] == 0
 

@@ -63,7 +63,7 @@ def test_on_bridges_a_voxel_that_was_not_mapped(gap: int, stands: bool) -> None:
     assert bool(asked(room, "cup", Where(on="table"))) == stands
 
 
-def test_what_leans_against_a_thing_or_hangs_beside_it_is_not_on_it() -> None:
+def test_what_leans_against_a_thing_or_hangs_next_to_it_is_not_on_it() -> None:
     leans = box((6, 0, 0), (7, 4, 6), feature(CUP=1))
     hangs = box((5, 0, -4), (6, 2, 0), feature(CUP=1))
     room = occupancy(TABLE | leans)
@@ -176,7 +176,7 @@ def test_conditions_that_make_no_sense_are_refused(bad: dict) -> None:
         Where(**bad)
 
 
-def test_near_reads_word_and_metres() -> None:
+def test_near_reads_word_and_meters() -> None:
     assert near_word("sink") == ("sink", 0.5)
     assert near_word("coffee table:1.5") == ("coffee table", 1.5)
     with pytest.raises(ConfigError, match="as in sink"):

@@ -34,7 +34,7 @@ def test_several_regions_are_placed_at_once_as_one_by_one(saved) -> None:
     assert loaded.boxes_of([]) == loaded.views_of_each([]) == loaded.stands_of([]) == []
 
 
-def test_a_class_is_the_voxels_that_are_labelled_so(saved) -> None:
+def test_a_class_is_the_voxels_that_are_labeled_so(saved) -> None:
     loaded = load_map(saved)
     labels, everything = loaded.labels(), len(loaded.occupancy.colors)
     for k, result in enumerate(loaded.query_classes(loaded.vocabulary, top_k=everything), start=1):
@@ -56,7 +56,7 @@ def test_what_a_picture_of_the_room_shows_is_found_again(saved) -> None:
     assert set(asked.regions[0].rows.tolist()) & set(found.regions[0].rows.tolist())
 
 
-def test_a_place_to_stand_is_told_where_lengths_are_metres(saved, monkeypatch) -> None:
+def test_a_place_to_stand_is_reported_where_lengths_are_meters(saved, monkeypatch) -> None:
     loaded = load_map(saved)
     region = loaded.query("red").regions[0]
     monkeypatch.setattr(

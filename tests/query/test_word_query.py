@@ -21,7 +21,7 @@ from freeocc3d.query.word_query import Options, query, similarity
 
 
 def components_by_flooding(voxels: NDArray[np.int32]) -> set[frozenset[int]]:
-    """Voxels that touch, found one neighbour at a time."""
+    """Voxels that touch, found one neighbor at a time."""
     row = {tuple(v): n for n, v in enumerate(voxels.tolist())}
     found, seen = set(), set()
     for start in row:
@@ -65,7 +65,7 @@ def test_compiled_components_are_the_same(seed: int) -> None:
     assert len(np.unique(label_components(apart))) == 40
 
 
-def test_each_of_26_neighbours_connects_and_no_other_does() -> None:
+def test_each_of_26_neighbors_connects_and_no_other_does() -> None:
     for step in product((-2, -1, 0, 1, 2), repeat=3):
         if any(step):
             touching = max(map(abs, step)) == 1
@@ -79,7 +79,7 @@ def test_components_far_from_the_origin() -> None:
     assert component[0] == component[1] != component[2]
 
 
-def test_region_has_faces_centroid_and_volume_in_metres() -> None:
+def test_region_has_faces_centroid_and_volume_in_meters() -> None:
     room = occupancy(box((-3, 8, 1), (-1, 12, 2), feature(SOFA=1)), origin=(10.0, 20.0, -5.0))
     (result,) = query(room, WORDS, ["couch"])
     (region,) = result.regions
@@ -89,7 +89,7 @@ def test_region_has_faces_centroid_and_volume_in_metres() -> None:
     np.testing.assert_allclose(region.centroid, (9.8, 21.0, -4.85))
     assert region.voxels == 8
     assert region.volume_m3 == pytest.approx(0.008)
-    assert region.score == pytest.approx(8 / 9, abs=1e-3)  # 8 litres that match, 1 of doubt
+    assert region.score == pytest.approx(8 / 9, abs=1e-3)  # 8 liters that match, 1 of doubt
     assert region.confidence > 0.99
     np.testing.assert_allclose(result.scores, 1, atol=1e-3)
 
@@ -256,7 +256,7 @@ def test_contrast_words_of_the_scene_compete_like_the_encoders_own() -> None:
 
 
 @pytest.mark.parametrize("scores", ["softmax", "relevancy"])
-def test_probabilities_tell_apart_what_cosines_hardly_do(scores: str) -> None:
+def test_probabilities_separate_what_cosines_hardly_do(scores: str) -> None:
     """Every cosine is 0.8 to 1; "lamp" is nearest to nothing that is there."""
 
     class WithCanonical(CloseWords):
@@ -298,7 +298,7 @@ def test_words_in_other_scripts_are_not_understood_in_a_sentence(word: str) -> N
     assert "not understood" in result.note
 
 
-def test_a_word_that_is_misspelt_is_told_what_it_may_mean() -> None:
+def test_a_misspelled_word_gets_suggestions() -> None:
     sofa, canoe = query(occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1))), WORDS, ["Soffa", "canoe"])
     assert sofa.note.startswith("'Soffa' is not understood (did you mean 'sofa'?): this map knows only")
     assert canoe.note.startswith("'canoe' is not understood: ")
@@ -356,7 +356,7 @@ def test_occupied_voxels_are_kept_and_cannot_be_changed() -> None:
     assert len(room.replace(state=np.zeros_like(room.state)).occupied_voxels()) == 0
 
 
-def test_what_is_tiny_beside_the_largest_region_is_a_speck_whatever_the_voxels() -> None:
+def test_what_is_tiny_compared_with_the_largest_region_is_a_speck_whatever_the_voxels() -> None:
     patch = box((20, 0, 0), (22, 2, 1), feature(CUP=1))
     room = occupancy(box((0, 0, 0), (17, 17, 17), feature(CUP=1)) | patch)
     assert [r.voxels for r in query(room, WORDS, ["cup"])[0].regions] == [17**3]
@@ -365,7 +365,7 @@ def test_what_is_tiny_beside_the_largest_region_is_a_speck_whatever_the_voxels()
     assert [r.voxels for r in query(small, WORDS, ["cup"])[0].regions] == [1000, 4]
 
 
-def test_a_few_voxels_are_a_speck_beside_a_thing_and_neither_far_from_it_nor_beside_their_like() -> None:
+def test_a_few_voxels_are_a_speck_next_to_a_thing_and_neither_far_from_it_nor_next_to_their_like() -> None:
     def found(first: int, thing: dict, **options: Any) -> list[int]:
         """Voxels of the regions where three in a row begin at voxel ``first`` along x."""
         few = box((first, 0, 0), (first + 3, 1, 1), feature(CUP=1))
@@ -373,7 +373,7 @@ def test_a_few_voxels_are_a_speck_beside_a_thing_and_neither_far_from_it_nor_bes
         return sorted(region.voxels for region in regions)
 
     thing = box((0, 0, 0), (4, 4, 4), feature(CUP=1))
-    assert found(9, thing) == [64]  # half a metre
+    assert found(9, thing) == [64]  # half a meter
     assert found(10, thing) == [3, 64]
     assert found(9, thing, min_share=0.0) == [3, 64]
     assert found(8, box((0, 0, 0), (5, 1, 1), feature(CUP=0.8, SOFA=0.6))) == [3, 5]

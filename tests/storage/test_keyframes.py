@@ -23,7 +23,7 @@ def kept(tmp_path: Path) -> Keyframes:
     return keyframes
 
 
-def test_depth_comes_back_to_half_a_millimetre_and_its_sigma_to_a_quarter(kept: Keyframes) -> None:
+def test_depth_comes_back_to_half_a_millimeter_and_its_sigma_to_a_quarter(kept: Keyframes) -> None:
     sensor, stereo = Keyframes.load(kept.folder)
     assert sensor.depth_sigma_m is None
     np.testing.assert_allclose(sensor.depth_m, 2.0, atol=5e-4)

@@ -55,7 +55,7 @@ def test_missing_and_truncated_files_are_named(copy, name) -> None:
 
 
 @pytest.mark.parametrize("name", ["occupancy.npz", "features.npz"])
-def test_damage_that_keeps_the_size_is_told_when_it_is_read(copy, name) -> None:
+def test_damage_that_keeps_the_size_is_reported_when_it_is_read(copy, name) -> None:
     data = bytearray((copy / name).read_bytes())
     middle = len(data) // 2
     data[middle : middle + 200] = bytes(b ^ 0x5A for b in data[middle : middle + 200])
@@ -66,7 +66,7 @@ def test_damage_that_keeps_the_size_is_told_when_it_is_read(copy, name) -> None:
 
 
 @pytest.mark.parametrize("levels", [31, -1, 0.5, [0]])
-def test_levels_that_no_map_has_are_told(copy, levels) -> None:
+def test_levels_that_no_map_has_are_reported(copy, levels) -> None:
     with np.load(copy / "occupancy.npz") as file:
         arrays = dict(file)
     levels = np.array(levels) if isinstance(levels, list) else np.full(len(arrays["keys"]), levels)
@@ -123,7 +123,7 @@ def test_names_that_only_one_of_many_keyframes_has_are_left_out(copy, monkeypatc
 @pytest.mark.parametrize(
     "named", ["sofa", {"names": {}}, {"keyframes": [], "names": ["sofa"]}, {"keyframes": [], "names": {"sofa": 3}}]
 )
-def test_a_damaged_vocabulary_is_told(copy, named) -> None:
+def test_a_damaged_vocabulary_is_reported(copy, named) -> None:
     edit(copy, vocabulary=named)
     with pytest.raises(MapError, match="'vocabulary"):
         SavedMap.open(copy)

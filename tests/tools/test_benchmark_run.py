@@ -52,7 +52,7 @@ def test_lifting_has_a_row_for_each_grid() -> None:
     ]
 
 
-def test_poses_from_colour_have_a_line_for_each_pipeline() -> None:
+def test_poses_from_color_have_a_line_for_each_pipeline() -> None:
     one = {"placed": 1.0, "ate_rmse_m": 0.0123, "seconds": {"features": 3.0, "mapping": 4.0}, "cpu_seconds": 9.0}
     lines = poses_from_color.tabulate_poses_from_color(
         [
@@ -66,7 +66,7 @@ def test_poses_from_colour_have_a_line_for_each_pipeline() -> None:
     assert poses_from_color.tabulate_poses_from_color([]) == []
 
 
-def test_what_moved_is_told_by_figure() -> None:
+def test_what_moved_is_reported_by_figure() -> None:
     def results(**figures: Any) -> dict[str, Any]:
         return {"rows": [{"capture": "a", "variant": "rgbd", **figures}, {"capture": "a", "variant": "x"}]}
 
@@ -102,7 +102,7 @@ def test_the_ablations_of_the_paper_are_there_by_name() -> None:
     assert {"mono_mast3r_slam", "mono_vggt_slam", "mono_seem", "mono_dinov2"} <= set(known)
     for variant in known.values():
         assert "\n" not in variant.lacking
-        # A variant that cannot run says so in words of its own: a misspelt key of one that could would show here.
+        # A variant that cannot run says so in words of its own: a misspelled key of one that could would show here.
         assert variant.lacking == "" or variant.lacking.startswith("needs ")
 
 
@@ -114,5 +114,5 @@ def test_the_ablations_of_the_paper_are_there_by_name() -> None:
         (("--captures", ".", "--frames", "2"), "at least 3"),
     ],
 )
-def test_mistakes_are_told(arguments: tuple[str, ...], said: str) -> None:
+def test_mistakes_are_reported(arguments: tuple[str, ...], said: str) -> None:
     assert said in run_benchmark(*arguments, code=2)

@@ -41,6 +41,6 @@ def test_exports_of_a_map_are_measured_in_processes_of_their_own(tmp_path, monke
     assert "| 10 s, 2 GB |" in lines
 
 
-def test_exports_that_were_not_measured_are_told() -> None:
+def test_exports_that_were_not_measured_are_reported() -> None:
     lines = report.write_markdown({"rows": [], "measurements": {"exports": [{"capture": "a", "error": "no poses"}]}})
     assert lines.splitlines()[-1] == "exports of a: not available, no poses"

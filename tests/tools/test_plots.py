@@ -84,6 +84,6 @@ def test_nothing_measured_is_an_empty_picture(tmp_path) -> None:
     assert (tmp_path / "stages.png").is_file()
 
 
-def test_more_names_than_colours_are_told_apart() -> None:
+def test_more_names_than_colors_are_distinguished() -> None:
     looks = plots._looks(str(n) for n in range(30))
     assert len({(look["color"], look["hatch"]) for look in looks.values()}) == 30

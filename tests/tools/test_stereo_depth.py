@@ -19,6 +19,6 @@ def test_figures_of_the_room(monkeypatch: pytest.MonkeyPatch) -> None:
     assert head.count("|") == line.count("|")
 
 
-def test_what_failed_is_told() -> None:
+def test_what_failed_is_reported() -> None:
     assert "no folder" in stereo_depth.tabulate_stereo([{"capture": "room", "error": "no folder"}])[-1]
     assert stereo_depth.tabulate_stereo([]) == []

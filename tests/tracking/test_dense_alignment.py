@@ -248,7 +248,7 @@ def test_a_step_is_the_exponential_map() -> None:
     np.testing.assert_allclose(moved, expm(twist) @ T, atol=1e-9)
 
 
-def test_directions_without_information_are_left_out_and_told() -> None:
+def test_directions_without_information_are_left_out_and_reported() -> None:
     H = np.diag((4.0, 4.0, 4.0, 1.0, 1.0, 1.0)) * 1e5
     kept, _, determined = dense_alignment.remove_undetermined(H, np.ones(6))
     assert determined

@@ -48,7 +48,7 @@ def images_on_a_line(count: int) -> list[np.ndarray]:
     return [*images[:-1], images[0]]
 
 
-def test_a_video_is_told_from_photographs_and_loops_are_proposed() -> None:
+def test_a_video_is_distinguished_from_photographs_and_loops_are_proposed() -> None:
     alike = pair_selection.compare_images(images_on_a_line(40))
     assert pair_selection.is_sequence(alike)
     mixed = np.random.default_rng(3).permutation(40)

@@ -52,7 +52,7 @@ def worst(poses, true) -> tuple[float, float]:
 # Places
 
 
-def test_similar_places_are_told_from_others(views) -> None:
+def test_similar_places_are_distinguished_from_others(views) -> None:
     described = [view.features.descriptors for view in views]
     vocabulary = place_recognition.Vocabulary(described)
     histograms = np.stack([vocabulary.histogram(d) for d in described])

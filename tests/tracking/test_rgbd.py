@@ -115,7 +115,7 @@ def test_frames_that_show_nothing_are_lost_and_tracking_goes_on_after_them(bedro
     assert (trajectory.confidence[5:9] == 0).all()
 
 
-def test_a_short_gap_is_filled_and_told_so(bedroom) -> None:
+def test_a_short_gap_is_filled_and_reported(bedroom) -> None:
     frames = [bedroom[i] for i in range(0, 24, 2)]
     frames[4] = replace(frames[4], depth_m=np.zeros_like(frames[4].depth_m))
     _, trajectory = follow(frames)

@@ -159,7 +159,7 @@ def test_two_scenes_become_one_map_and_frames_apart(tmp_path: Path) -> None:
     assert "2 models" in found.warnings[0].text
 
 
-def test_scans_that_give_no_poses_are_told_apart(tmp_path: Path) -> None:
+def test_scans_that_give_no_poses_are_distinguished(tmp_path: Path) -> None:
     images, _, camera = walk()
     rng = np.random.default_rng(0)
     still = [np.clip(images[0] + rng.normal(0, 3, images[0].shape), 0, 255).astype(np.uint8) for _ in range(8)]

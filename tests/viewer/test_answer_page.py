@@ -88,7 +88,7 @@ def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path, monkeyp
     assert "nowhere" not in text
 
 
-def test_a_crop_holds_the_box_in_the_words_colour() -> None:
+def test_a_crop_holds_the_box_in_the_words_color() -> None:
     image = np.full((120, 160, 3), 90, np.uint8)
     image[40:60, 50:90] = 255
     crop = decoded(answer_page._crop(image, RegionView(0, (50, 40, 89, 59), 1.0), (255, 60, 30)))

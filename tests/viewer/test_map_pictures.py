@@ -90,7 +90,7 @@ def test_by_class_and_height(tmp_path) -> None:
     map_pictures.write_map_picture(room, tmp_path / "class.png", by="class")
     assert shown(tmp_path / "class.png", assign_class_colors(["red"])[1], 45) > 500
     map_pictures.write_map_picture(room, tmp_path / "height.png", by="height")
-    assert shown(tmp_path / "height.png", (68, 1, 84), 40) > 10_000  # the floor has viridis' darkest colour
+    assert shown(tmp_path / "height.png", (68, 1, 84), 40) > 10_000  # the floor has viridis' darkest color
     with pytest.raises(ExportError, match="rgb, class or height"):
         map_pictures.write_map_picture(room, tmp_path / "x.png", by="colour")
 
@@ -109,7 +109,7 @@ def test_a_query_picture_shows_matches_strongly_and_nothing_else(tmp_path) -> No
     assert shown(tmp_path / "nothing.png", HIGHLIGHTS[0], 40) <= 1.2 * legend
 
 
-def test_an_empty_map_and_an_unwritable_place_are_told(tmp_path) -> None:
+def test_an_empty_map_and_an_unwritable_place_are_reported(tmp_path) -> None:
     room = room_map(tmp_path)
     with pytest.raises(ExportError, match="Cannot write"):
         map_pictures.write_map_picture(room, tmp_path / "missing" / "map.png")
@@ -159,7 +159,7 @@ def test_the_legend_tells_regions_and_scores() -> None:
 
 
 @pytest.mark.parametrize("by", ["rgb", "class", "height"])
-def test_an_empty_map_is_refused_however_it_is_coloured(tmp_path, by) -> None:
+def test_an_empty_map_is_refused_however_it_is_colored(tmp_path, by) -> None:
     room = room_map(tmp_path)
     room.occupancy = occupancy_of([])
     with pytest.raises(ExportError, match="no occupied voxel"):

@@ -12,7 +12,7 @@ from freeocc3d.gaussians.rasterizers import cpu
 from freeocc3d.viewer import render_pictures
 
 
-def test_a_view_is_drawn_beside_what_was_captured(tmp_path: Path) -> None:
+def test_a_view_is_drawn_next_to_what_was_captured(tmp_path: Path) -> None:
     frame = wall_frame(2.0)
     view = rendered_views.prepare_captured_view(frame, np.eye(4), 320, torch.device("cpu"))
     rows = [(7, view), (9, view)]

@@ -62,7 +62,7 @@ def test_the_way_its_keyframes_and_closures_are_drawn(tmp_path) -> None:
     assert pixels(picture, trajectory_picture._WRONG) > pixels(plain, trajectory_picture._WRONG) + 50
 
 
-def test_submaps_apart_stand_beside_it(tmp_path) -> None:
+def test_submaps_apart_stand_next_to_it(tmp_path) -> None:
     status = [*STATUS, "apart", "apart"]
     one = [submap(range(7), [0, 3, 6])]
     alone = drawn(tmp_path / "a.png", one, status)
