@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import sys
-import warnings
 from typing import Annotated
 
 import typer
@@ -59,7 +58,6 @@ def main(arguments: list[str] | None = None) -> None:
     for stream, errors in ((sys.stdin, "replace"), (sys.stdout, "backslashreplace")):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors=errors)
-    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"  # without the place in the code
     try:
         app(args=[argument for argument in arguments if argument != "--debug"], prog_name="freeocc3d")
     except FreeOccError as error:

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple
 
 Code = Literal[
+    "option-renamed",
+    "option-removed",
     "images-left-out",
     "depth-scale-doubtful",
     "intrinsics-unknown",

@@ -44,6 +44,7 @@ def reconstruct(
     check(resolved)
     output = Path(output)
     work = WorkFolder.open(output, overwrite, resume)
+    work.warn(progress, *resolved.notices)
     try:
         opened = _open(capture, resolved, progress, work)
         work.begin([absolute(opened.path), len(opened), __version__], resolved)

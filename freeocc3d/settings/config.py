@@ -18,6 +18,7 @@ import msgspec
 import yaml
 
 from ..core.errors import ConfigError
+from ..core.warnings import Notice
 from . import registry, renamed, stages
 from .presets import find_preset
 from .typed_options import TypedOptions, build, field_types, nearest
@@ -66,6 +67,8 @@ class Settings(msgspec.Struct, frozen=True):
     carving: stages.CarvingOptions
     backends: dict[str, BackendValues] = {}
     """Section -> the values given for its backends; other options have their defaults."""
+    notices: tuple[Notice, ...] = ()
+    """Warnings about names that changed."""
 
     def changed(self, section: str, **values: Any) -> Settings:
         """Returns a copy with other values in a section (a field of this class). Raises ConfigError."""
@@ -196,19 +199,19 @@ def _resolve(values: Mapping[Any, Any], saved: bool) -> Settings:
         if name not in outer:
             raise ConfigError(f"Unknown section '{name}'{nearest(name, outer)}.")
     found: dict[str, Any] = {"backends": {}}
+    notices: list[Notice] = []
     for name in outer:
         section, where = SECTIONS[name], f"{name}."
-        given = renamed.current_keys(_section(values, name), where, warn=not saved)
+        given = renamed.current_keys(_section(values, name), where, notices)
         nested = [inner for inner, other in SECTIONS.items() if other.within == name]
         for inner in nested:
-            below = renamed.current_keys(_lines(given.pop(inner, None), where + inner), f"{where}{inner}.", not saved)
+            below = renamed.current_keys(_lines(given.pop(inner, None), where + inner), f"{where}{inner}.", notices)
             found[inner] = build(SECTIONS[inner].options, below, f"{where}{inner}.")
-        own, backends = _divided(name, given, nested, warn=not saved)
+        own, backends = _divided(name, given, nested, notices)
         if section.choice and isinstance(own.get(section.choice), str):
             current = renamed.current_backend(section.folder, own[section.choice])
-            if not saved:
-                named = f"{where}{section.choice}="
-                renamed.warn_if_renamed(named + own[section.choice], named + current)
+            named = f"{where}{section.choice}="
+            notices += renamed.compare_names(named + own[section.choice], named + current)
             own[section.choice] = current
         found[name] = build(section.options, own, where)
         if saved and section.choice:
@@ -218,10 +221,12 @@ def _resolve(values: Mapping[Any, Any], saved: bool) -> Settings:
             backends = {backend: _checked(name, backend, lines) for backend, lines in backends.items()}
         if backends := {backend: lines for backend, lines in backends.items() if lines}:
             found["backends"][name] = backends
-    return Settings(**found)
+    return Settings(**found, notices=() if saved else tuple(notices))
 
 
-def _divided(name: str, given: dict[Any, Any], nested: list[str], warn: bool) -> tuple[dict[Any, Any], BackendValues]:
+def _divided(
+    name: str, given: dict[Any, Any], nested: list[str], notices: list[Notice]
+) -> tuple[dict[Any, Any], BackendValues]:
     """Separates a section's own options from those of its backends. Raises ConfigError for a key that is neither."""
     section, own, backends = SECTIONS[name], {}, {}
     known = field_types(section.options)
@@ -230,10 +235,9 @@ def _divided(name: str, given: dict[Any, Any], nested: list[str], warn: bool) ->
         if key in known:
             own[key] = value
         elif section.folder and registry.is_backend(section.folder, str(backend)):
-            if warn:
-                renamed.warn_if_renamed(f"{name}.{key}", f"{name}.{backend}")
+            notices += renamed.compare_names(f"{name}.{key}", f"{name}.{backend}")
             where = f"{name}.{backend}"
-            backends[backend] = renamed.current_keys(_lines(value, where), f"{where}.", warn)
+            backends[backend] = renamed.current_keys(_lines(value, where), f"{where}.", notices)
         else:
             others = registry.backends(section.folder) if section.folder else ()
             raise ConfigError(f"Unknown key '{name}.{key}'{nearest(key, [*known, *nested, *others])}.")

@@ -15,8 +15,6 @@ from freeocc3d.cli.main import app
 from freeocc3d.settings import config, registry
 from freeocc3d.settings.presets import find_preset
 
-pytestmark = pytest.mark.filterwarnings("error::freeocc3d.settings.renamed.RenamedWarning")
-
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 EXAMPLES = {"tripod", "brightness", "csv"}
@@ -74,7 +72,7 @@ def test_a_documented_command_parses(command: str, monkeypatch: pytest.MonkeyPat
     if values.get("config_file") and values["config_file"] != Path("my.yaml"):
         assert "MAP" in str(values["config_file"]) or find_preset(str(values["config_file"])).is_file()
     if name in ("reconstruct", "evaluate"):
-        config.load(None, [override for override in given if "…" not in override])
+        assert not config.load(None, [override for override in given if "…" not in override]).notices
     if name == "export" and values["format_name"] not in EXAMPLES | {"NAME"}:
         known = {option.name for option in registry.backend("export", str(values["format_name"])).options}
         assert {override.partition("=")[0] for override in given} <= known
@@ -88,11 +86,12 @@ def test_documented_settings_exist(page: Path) -> None:
     for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL):
         values = yaml.safe_load(block)
         if isinstance(values, dict) and set(values) <= set(config.SECTIONS):
-            config.load(None, [f"{s}.{key}={value}" for s, keys in values.items() for key, value in keys.items()])
+            given = [f"{s}.{key}={value}" for s, keys in values.items() for key, value in keys.items()]
+            assert not config.load(None, given).notices
     for said in re.findall(rf"`((?:{sections})(?:\.[a-z_]+)+(?:=[^`…]+)?)`", text):
         name, _, value = said.partition("=")
         if not EXAMPLES & set(re.split(r"[.=]", said)) and not re.search(r"\.(npz|ply|png|py|txt|yaml)$", name):
-            config.load(None, [f"{name}={value or default_of(name)}"])
+            assert not config.load(None, [f"{name}={value or default_of(name)}"]).notices
 
 
 def default_of(name: str) -> str:

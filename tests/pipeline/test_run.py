@@ -106,6 +106,21 @@ def test_an_existing_map_is_not_touched_without_overwrite(tmp_path, room) -> Non
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
 
 
+def test_an_old_name_is_warned_of_at_once_and_in_the_report(tmp_path) -> None:
+    said = []
+
+    class Heard(Progress):
+        def warn(self, text: str) -> None:
+            said.append(text)
+
+    given = {"capture": {**ROOM["capture"], "stop": 4}, "gaussians": {"initialisation": "isotropic"}}
+    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", given, progress=Heard())
+    (notice,) = (notice for notice in notices(made) if notice.code == "option-renamed")
+    assert notice.text in said
+    assert "gaussians.initialization" in notice.text
+    assert made.settings.notices == ()
+
+
 def test_a_folder_that_is_no_map_is_never_overwritten(tmp_path) -> None:
     precious = tmp_path / "home"
     precious.mkdir()

@@ -1,13 +1,11 @@
 """Old names of options and backends: accepted with a warning, and silently in saved maps."""
 
-import warnings
 from pathlib import Path
 
 import pytest
 
 from freeocc3d.core.errors import ConfigError
 from freeocc3d.settings import config, registry, renamed
-from freeocc3d.settings.renamed import RenamedWarning
 from freeocc3d.settings.typed_options import field_types
 
 OLD = {
@@ -18,9 +16,9 @@ OLD = {
 
 
 def test_old_names_are_accepted_with_a_warning_each() -> None:
-    with pytest.warns(RenamedWarning) as caught:
-        settings = config.resolve(OLD)
-    said = [str(warning.message) for warning in caught]
+    settings = config.resolve(OLD)
+    assert {notice.code for notice in settings.notices} == {"option-renamed"}
+    said = [notice.text for notice in settings.notices]
     assert settings.gaussians.initialization == "isotropic"
     assert settings.stereo.neighbors == 3
     assert settings.given("tracking", "rgbd") == {"neighbors": 5}
@@ -42,9 +40,8 @@ def test_the_old_and_the_new_name_of_one_option_are_too_much() -> None:
 
 def test_saved_maps_load_without_a_word(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(str(OLD).replace("'", ""))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        settings = config.load_saved(tmp_path / "config.yaml")
+    settings = config.load_saved(tmp_path / "config.yaml")
+    assert settings.notices == ()
     assert settings.gaussians.initialization == "isotropic"
     assert settings.language.encoder == "color"
     assert settings.backend("language")[1].stride == 2
@@ -52,29 +49,28 @@ def test_saved_maps_load_without_a_word(tmp_path: Path) -> None:
 
 
 def test_overrides_take_old_names_too() -> None:
-    with pytest.warns(RenamedWarning):
-        assert config.load(None, ["gaussians.initialisation=isotropic"]).gaussians.initialization == "isotropic"
+    settings = config.load(None, ["gaussians.initialisation=isotropic"])
+    assert settings.gaussians.initialization == "isotropic"
+    assert len(settings.notices) == 1
 
 
 def test_a_backend_loads_by_its_old_name() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert registry.load("language.encoders", "colour") is registry.load("language.encoders", "color")
+    assert registry.load("language.encoders", "colour") is registry.load("language.encoders", "color")
 
 
 def test_options_that_are_gone_are_left_out_with_a_warning(tmp_path: Path) -> None:
-    with pytest.warns(RenamedWarning, match=r"'fitting\.window' has no effect"):
-        assert config.resolve({"fitting": {"window": 3, "passes": 2}}).fitting.passes == 2
+    settings = config.resolve({"fitting": {"window": 3, "passes": 2}})
+    assert settings.fitting.passes == 2
+    (notice,) = settings.notices
+    assert notice.code == "option-removed"
+    assert notice.text.startswith("'fitting.window' has no effect")
     (tmp_path / "config.yaml").write_text("fitting: {window: 3, window_passes: 2, passes: 2}\n")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert config.load_saved(tmp_path / "config.yaml").fitting.passes == 2
+    saved = config.load_saved(tmp_path / "config.yaml")
+    assert (saved.fitting.passes, saved.notices) == (2, ())
 
 
 def test_todays_names_are_not_warned_of() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        config.resolve(config.resolve({}).to_dict())
+    assert config.resolve(config.resolve({}).to_dict()).notices == ()
 
 
 def test_the_table_names_what_exists() -> None:
