@@ -1,1 +1,1 @@
-"""LAYER 3: language-aligned features on the Gaussians."""
+"""LAYER 3: language-aligned features of the Gaussians."""

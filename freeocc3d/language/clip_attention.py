@@ -1,15 +1,16 @@
-"""What replaces the attention of a CLIP's last block, so that its patches, not its class token alone, mean something in
-words. Training-free: the weights stay as they are.
+"""Replacements for the attention of CLIP's last block, so that patches, and not only the class token, have a meaning in
+words. They need no training: the weights stay as they are.
 
-    plain       softmax(q k^T s) v, residual and feed-forward part kept: the network as it was trained
+    plain       softmax(q k^T s) v, with the residual and the feed-forward part: the network as it was trained
     maskclip    v: every patch attends to itself (Zhou et al., Extract Free Dense Labels from CLIP, ECCV 2022)
-    sclip       (softmax(q q^T s) + softmax(k k^T s)) v, residual and feed-forward part kept (Wang et al., ECCV 2024)
+    sclip       (softmax(q q^T s) + softmax(k k^T s)) v, with the residual and the feed-forward part (Wang et al.,
+                ECCV 2024)
     clearclip   softmax(q q^T s) v, without both (Lan et al., ECCV 2024)
     naclip      softmax(k k^T s + w) v, without both; w_ij = exp(-|p_i - p_j|^2 / (2 5^2)) of patches i and j at p, in
                 patches (Hajimiri et al., Pay Attention to Your Neighbours, WACV 2025)
 
 with s = 1 / sqrt(d). On the same eight benchmarks with ViT-B/16, SCLIP's paper reports a mean IoU of 14.1 for plain and
-38.2 for sclip, and NACLIP's paper is ahead of the earlier ones on most of them: hence naclip as the default.
+38.2 for sclip. NACLIP's paper reports better results than the earlier ones on most of them, so naclip is the default.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 KEEPS_REST = {"plain": True, "maskclip": False, "sclip": True, "clearclip": False, "naclip": False}
-"""Attention -> whether the block's residual and feed-forward part are kept."""
+"""Attention -> whether the block keeps its residual and feed-forward part."""
 
-NEIGHBOURHOOD = 5.0
-"""Standard deviation in patches of naclip's window."""
+NEIGHBORHOOD = 5.0
+"""Standard deviation of naclip's window, in patches."""
 
 
 def mix_values(
@@ -31,8 +32,8 @@ def mix_values(
     values: NDArray[np.float32],
     grid: tuple[int, int],
 ) -> NDArray[np.float32]:
-    """(B, N, heads d) mixed values of (B, heads, N, d) queries, keys and values, of which the last h w = N - prefix are
-    those of a grid of (h, w) patches."""
+    """(B, N, heads d) mixed values from (B, heads, N, d) queries, keys and values. The last h w = N - prefix of them
+    belong to a grid of (h, w) patches."""
     if attention == "maskclip":
         return join_heads(values)
     if attention == "plain":
@@ -56,15 +57,15 @@ def _products(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.floa
 
 
 def weigh_neighbors(height: int, width: int) -> NDArray[np.float32]:
-    """(h w, h w) naclip's w: near patches attend to each other."""
+    """(h w, h w) naclip's w, by which near patches attend to each other."""
     rows, columns = (
-        np.exp(-0.5 * ((np.arange(n)[:, None] - np.arange(n)) / NEIGHBOURHOOD) ** 2) for n in (height, width)
+        np.exp(-0.5 * ((np.arange(n)[:, None] - np.arange(n)) / NEIGHBORHOOD) ** 2) for n in (height, width)
     )
     return np.kron(rows, columns).astype(np.float32)
 
 
 def apply_softmax(logits: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Over the last axis; the argument is overwritten."""
+    """Softmax over the last axis; overwrites its argument."""
     logits -= logits.max(axis=-1, keepdims=True)
     np.exp(logits, out=logits)
     logits /= logits.sum(axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Scores of very many coded features, compiled: each is unpacked and compared within the processor's cache."""
+"""Scores of very many coded features, compiled: each feature is unpacked and compared within the CPU's cache."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def compute_coded_cosines(
     offset: NDArray[np.float32],
     text: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """``Codec.cosines`` with (W, R) texts in the codec's coordinates. fours, twos: bytes that hold levels of 4 and of 2
-    bits, behind those of 8."""
+    """``Codec.cosines`` with (W, R) texts in the codec's coordinates. fours, twos: the number of bytes that contain
+    levels of 4 and of 2 bits; they follow the bytes with levels of 8 bits."""
     eights = codes.shape[1] - fours - twos
     out = np.empty((len(text), len(codes)), np.float32)
     for tile in prange((len(codes) + _TILE - 1) // _TILE):
@@ -92,8 +92,8 @@ def compute_coded_confidences(
     competes: NDArray[np.bool_],
     inverse_temperature: np.float32,
 ) -> NDArray[np.float32]:
-    """``word_matching.compute_confidences``. The other word that fits a voxel best is asked first, which beats most
-    words."""
+    """``word_matching.compute_confidences``. It compares first with the other word that fits a voxel best, because that
+    word beats most words."""
     words, rivals = competes.shape
     out = np.zeros((len(scores), words), np.float32)
     for tile in prange((len(scores) + _TILE - 1) // _TILE):

@@ -1,9 +1,10 @@
-"""Small features: transform coding. A feature's coordinates along the directions in which features vary most are kept,
-with 8, 4 or 2 bits each, by what each of them adds to the error; at most 48 bytes a feature, whatever its dimension.
+"""Makes features small by transform coding: a feature keeps its coordinates along the directions in which features vary
+most, with 8, 4 or 2 bits each, according to their share of the error. A feature takes no more than 48 bytes, whatever
+its dimension.
 
-``tools/benchmark.py --variants voxels`` measures what coding loses; low rank with 8 bits throughout and product
-quantization lose more at the same size. Source of the optimal uniform quantisers' steps: J. Max, Quantizing
-for Minimum Distortion, IRE Trans. Inf. Theory 6(1), 1960.
+``tools/benchmark.py --variants voxels`` measures the loss. A low rank with 8 bits throughout and product quantization
+lose more at the same size. Source of the steps of the optimal uniform quantizers: J. Max, Quantizing for Minimum
+Distortion, IRE Trans. Inf. Theory 6(1), 1960.
 """
 
 from __future__ import annotations
@@ -20,29 +21,29 @@ from numpy.typing import NDArray
 from .word_matching import MANY
 
 MOST_BYTES = 48
-"""Of a code. Features of at most so many dimensions keep their own axes, 8 bits each: what never is negative decodes to
-exact zeros."""
+"""Largest size of a code in bytes. Features with no more dimensions than this keep their own axes, 8 bits each, so that
+values that are never negative decode to exact zeros."""
 _BITS = (8, 4, 2)
 _STEPS = {4: 0.335, 2: 0.996}  # in standard deviations of a normal distribution (Max, table II)
-_ERRORS = {8: 1.0e-4, 4: 0.01154, 2: 0.1188}  # what is left of the variance
+_ERRORS = {8: 1.0e-4, 4: 0.01154, 2: 0.1188}  # the share of the variance that remains as error
 _HARDLY = 1e-4
-"""Share of the energy of which nobody misses the loss: 0.00005 of the cosine."""
+"""Share of the energy that may be lost without a noticeable effect: 0.00005 of the cosine."""
 _LEVELS = 254
-"""8-bit codes 1…255 are levels; the code of zeros is the zero feature, of which nothing is known."""
+"""8-bit codes 1…255 are levels; a code of zeros is the zero feature, whose meaning is unknown."""
 _MARGIN = 0.02
-"""By which an 8-bit range is widened on either side: a normalised mean of features can lie outside of it."""
-_ROWS = 8192  # worked on at once, so that float32 copies of all rows never exist
-_ONE_THREAD = 1 << 18  # multiplications of a matrix product that OpenBLAS does on one thread
-_SAMPLE = 20000  # rows that quantisers are fitted to
+"""Widens an 8-bit range on either side, because a normalized mean of features can be outside the range."""
+_ROWS = 8192  # rows in one batch, so that float32 copies of all rows never exist
+_ONE_THREAD = 1 << 18  # multiplications of a matrix product that OpenBLAS runs on one thread
+_SAMPLE = 20000  # rows to which the quantizers are fitted
 
 
 @dataclass(frozen=True)
 class Codec:
-    """(V, D) unit features to (V, M) uint8 and back.
+    """Encodes (V, D) unit features to (V, M) uint8, and decodes them.
 
-    basis: (R, D) float32 orthonormal directions.  bits: (R,) uint8, 8s, then 4s, then 2s; those of 4 are a multiple of
-    two, those of 2 of four.  offset, scale: (R,) float32; coordinate = offset + scale * level. The row of values that
-    the coordinates give is normalised.
+    basis: (R, D) float32 orthonormal directions.  bits: (R,) uint8, 8s, then 4s, then 2s; the number of 4s is a
+    multiple of two, that of 2s a multiple of four.  offset, scale: (R,) float32; coordinate = offset + scale * level.
+    The row of values from the coordinates is normalized.
     """
 
     basis: NDArray[np.float32]
@@ -57,7 +58,7 @@ class Codec:
 
     @classmethod
     def fit(cls, features: NDArray[np.floating], most_bytes: int = MOST_BYTES) -> Codec:
-        """The codec that (N, D) features, rows of zeros left out, lose least with."""
+        """Makes the codec with the least loss for (N, D) features; ignores rows of zeros."""
         dimension = features.shape[1]
         known = np.flatnonzero(features.any(axis=1))
         if dimension <= most_bytes or not len(known):
@@ -84,7 +85,7 @@ class Codec:
         return cls(basis, bits, offset, scale)
 
     def encode(self, features: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """(V, D) features to codes; coordinates outside a range are clipped to it."""
+        """Encodes (V, D) features; coordinates outside their range are clipped to it."""
         codes = np.empty((len(features), self.code_bytes), np.uint8)
         lowest = np.where(self.bits == 8, 1, 0)
         highest = (1 << self.bits.astype(np.int64)) - 1
@@ -104,7 +105,7 @@ class Codec:
         return codes
 
     def decode(self, codes: NDArray[np.uint8]) -> NDArray[np.float16]:
-        """(V, M) codes to unit features; the zero feature comes back exactly."""
+        """Decodes (V, M) codes to unit features; the zero feature comes back exactly."""
         features = np.empty((len(codes), self.basis.shape[1]), np.float16)
         for rows, out in zip(_chunks(codes), _chunks(features), strict=True):
             values = (self._levels(rows) * self.scale + self.offset) @ self.basis
@@ -114,23 +115,23 @@ class Codec:
         return features
 
     def inverse_norms(self, codes: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(V,) one over the norms of the rows of coordinates that codes stand for, 0 for zero features."""
+        """(V,) 1 over the norms of the rows of coordinates that the codes mean; 0 for zero features."""
         inverse = np.zeros(len(codes), np.float32)
         for rows, out in zip(_chunks(codes), _chunks(inverse), strict=True):
             values = self._levels(rows)
             values *= self.scale
             values += self.offset
             squared = np.einsum("vr,vr->v", values, values)
-            something = (rows[:, 0] > 0) & (squared > 0)  # the first is an 8-bit level
+            something = (rows[:, 0] > 0) & (squared > 0)  # the first level has 8 bits
             np.divide(1, np.sqrt(squared), out=out, where=something)
         return inverse
 
     def cosines(
         self, codes: NDArray[np.uint8], text: NDArray[np.floating], inverse: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
-        """(V, W) cosines of coded features with (W, D) unit text features, without decoding: with levels c and text t
-        in the codec's coordinates, the dot product is c (scale t) + offset t. Zero features give zero. inverse: their
-        ``inverse_norms`` where these are known already."""
+        """(V, W) cosines of coded features with (W, D) unit text features, without decoding. With levels c and text t
+        in the codec's coordinates, the dot product is c (scale t) + offset t. Zero features give zero. inverse: the
+        ``inverse_norms`` of the codes, if known."""
         t = _product(text.astype(np.float32), self.basis.T)
         if _compiled(len(codes)):
             from . import coded_scores
@@ -139,7 +140,7 @@ class Codec:
             return np.asarray(coded_scores.compute_coded_cosines(codes, fours, twos, self.scale, self.offset, t))
         linear, constant = (t * self.scale).T, t @ self.offset
         inverse = self.inverse_norms(codes) if inverse is None else inverse
-        scores = np.empty((len(text), len(codes)), np.float32).T  # a word's scores lie together
+        scores = np.empty((len(text), len(codes)), np.float32).T  # the scores of a word are contiguous
         for rows, length, out in zip(_chunks(codes), _chunks(inverse), _chunks(scores), strict=True):
             np.multiply(_product(self._levels(rows), linear) + constant, length[:, None], out=out)
         return scores
@@ -157,12 +158,12 @@ class Codec:
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def tables(self) -> dict[str, NDArray[Any]]:
-        """What ``from_tables`` needs."""
+        """The tables that ``from_tables`` needs."""
         return {"basis": self.basis, "bits": self.bits, "offset": self.offset, "scale": self.scale}
 
     @classmethod
     def from_tables(cls, tables: Mapping[str, NDArray[Any]]) -> Codec:
-        """The codec that a map was saved with. Raises ValueError for tables that do not belong together."""
+        """Restores the codec that a map was saved with. Raises ValueError if the tables do not belong together."""
         basis, bits, offset, scale = (tables[name] for name in ("basis", "bits", "offset", "scale"))
         fit = basis.ndim == 2 and bits.shape == offset.shape == scale.shape == basis.shape[:1]
         counts = {b: int(np.count_nonzero(bits == b)) for b in _BITS}
@@ -176,7 +177,7 @@ class Codec:
 
 @dataclass(frozen=True)
 class CodedFeatures:
-    """(V, D) unit features that stay coded: (V, M) ``codes``. ``np.asarray`` decodes them."""
+    """(V, D) unit features that stay encoded as (V, M) ``codes``; ``np.asarray`` decodes them."""
 
     codec: Codec
     codes: NDArray[np.uint8]
@@ -189,7 +190,7 @@ class CodedFeatures:
 
     @functools.cached_property
     def inverse_norms(self) -> NDArray[np.float32]:
-        """(V,) ``Codec.inverse_norms``, kept, for many words are asked of the same features."""
+        """(V,) ``Codec.inverse_norms``, kept because many words are compared with the same features."""
         return self.codec.inverse_norms(self.codes)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -217,19 +218,19 @@ def compute_cosines(features: Features, text: NDArray[np.floating]) -> NDArray[n
 
 
 def mask_known(features: Features) -> NDArray[np.bool_]:
-    """(V,) whether anything is known of each feature: whether it is not zero."""
-    rows = features.codes[:, :1] if isinstance(features, CodedFeatures) else features  # its first level says it
+    """(V,) whether each feature is known, that is, not zero."""
+    rows = features.codes[:, :1] if isinstance(features, CodedFeatures) else features  # level 0: only a zero feature
     return np.asarray(rows.any(axis=1))
 
 
 def _compiled(count: int) -> bool:
-    """Whether so many scores are left to numba, which takes longer to import than fewer to compute."""
+    """Whether numba computes ``count`` scores. For fewer scores, importing numba takes longer than computing them."""
     return count >= MANY or f"{__package__}.coded_scores" in sys.modules
 
 
 def _product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(V, R) @ (R, W) in tiles that OpenBLAS does not share out among threads. To wait for these takes longer than so
-    small a product where other programs are running, as on a robot: 10 to 20 ms each time."""
+    """(V, R) @ (R, W) in tiles that OpenBLAS does not split between threads. If other programs are running, as on a
+    robot, waiting for these threads takes longer than such a small product: 10 to 20 ms each time."""
     tile = max(1, _ONE_THREAD // max(b.size, 1))
     count = len(a) // tile
     whole = count * tile
@@ -250,7 +251,7 @@ def _directions(features: NDArray[np.floating]) -> tuple[NDArray[np.float32], ND
 
 
 def _fewest(energy: NDArray[np.float64], most_bytes: int) -> NDArray[np.uint8]:
-    """``_shared_out`` of as few bytes as leave hardly more energy than all would."""
+    """``_shared_out`` for the smallest number of bytes that leaves hardly more energy than all bytes."""
     _, least = _shared_out(energy, most_bytes)
     for count in range(8, most_bytes, 8):
         bits, left = _shared_out(energy, count)
@@ -260,8 +261,8 @@ def _fewest(energy: NDArray[np.float64], most_bytes: int) -> NDArray[np.uint8]:
 
 
 def _shared_out(energy: NDArray[np.float64], most_bytes: int) -> tuple[NDArray[np.uint8], float]:
-    """(R,) bits of the first R directions: of all ways to spend the bytes on 8, 4 and 2 bits, the one that leaves the
-    least energy; and that energy."""
+    """(R,) bits of the first R directions, and the remaining energy. Of all ways to spend the bytes on 8, 4 and 2 bits,
+    this one leaves the least energy."""
     below = np.concatenate(([0.0], np.cumsum(energy)))
     eights, fours = np.meshgrid(np.arange(1, most_bytes + 1), np.arange(most_bytes), indexing="ij")
     twos = most_bytes - eights - fours
@@ -278,7 +279,7 @@ def _shared_out(energy: NDArray[np.float64], most_bytes: int) -> tuple[NDArray[n
 
 
 def _coarse(values: NDArray[np.float32], bits: int) -> tuple[float, float]:
-    """Offset and step of the uniform quantiser with the least squared error, about Max's for a normal distribution."""
+    """Offset and step of the uniform quantizer with the least squared error, near Max's for a normal distribution."""
     mean, deviation = float(values.mean()), max(float(values.std()), 1e-6)
     top = (1 << bits) - 1
     best, least = (0.0, 1.0), np.inf

@@ -1,16 +1,17 @@
-"""Features of Gaussians from many views: a weighted mean, without the parts of views that the other views contradict.
+"""Fuses features of Gaussians from many views: a weighted mean without the parts of views that other views contradict.
 
     f_k = sum_t w_t z_t(u_t) / |sum_t w_t z_t(u_t)|,   u_t the pixel of mu_k in keyframe t,
 
-with the weights of ``visibility``. Encoders err by things, not by pixels: what a network takes for something else it
-takes so over the whole of it. So agreement is judged by regions of a view, connected cells of like features. A region's
-disagreement is the mean of 1 - cos(z_t(u_t), f_k without view t) over the Gaussians in it that other views show,
-in units of what two random places of the scene differ by, 1 - |mean f|^2: 0 is agreement, 1 no more of it than by
-chance, for any encoder. Regions beyond ``disagreement`` are taken out, with what no other view shows in them: of a wall
-that is mistaken, also the part that is seen once. But of views that all contradict each other, the one that does so
-least stays: what is mistaken differently each time does not take with it what is right most often.
+with the weights of ``visibility``. Encoders make mistakes by things, not by pixels: a network that takes a thing for
+another does so over the whole thing. So agreement is judged by regions of a view, which are connected cells with
+similar features. A region's disagreement is the mean of 1 - cos(z_t(u_t), f_k without view t) over its Gaussians that
+other views show, in units of the difference between two random places of the scene, 1 - |mean f|^2. For any encoder, 0
+is agreement, and 1 is agreement no better than chance. Regions above ``disagreement`` are removed, including what no
+other view shows of them, such as the part of a wrongly named wall that is seen once. If all views of a place contradict
+each other, the one that does so least stays. So mistakes that differ from view to view do not remove the most frequent
+right result.
 
-The regions are judged by all views and taken out together, the worst first, so that the order of views matters only to
+All views judge the regions, and the regions are removed together, the worst first. So the order of views affects only
 rounding.
 """
 
@@ -30,30 +31,31 @@ from ..core.union_find import find_root, join_sets
 from .visibility import VisibleGaussians
 
 _ALIKE = 0.9
-"""Least cosine of neighbouring cells' features that belong to one region."""
+"""Smallest cosine of the features of neighboring cells in one region."""
 _SAME = 0.9995
-"""Least cosine of cells of a region whose features are kept as one."""
+"""Smallest cosine of cells of a region that share one stored feature."""
 _FIRST = 1.0
-"""The disagreement beyond which regions are taken out first: where several views are wrong, those that are right are
-contradicted, too, until the worst are out."""
-_ROUNDS = 2  # after that
+"""Regions with more disagreement than this are removed first: where several views are wrong, they contradict the right
+ones, too, until the worst are removed."""
+_ROUNDS = 2  # after the first
 _NOTHING_LEFT = 1e-3
-"""Share of a Gaussian's weight, below which all of its views are taken out: what remains is rounding."""
+"""If all views of a Gaussian are removed, less than this share of its weight remains, from rounding."""
 _TIED = 1e-3
-"""Regions whose disagreement differs by less are contradicted equally."""
+"""Regions whose disagreement differs by less than this are equal."""
 _IN_MEMORY = 512 << 20
-"""Bytes of views' codes that are kept in memory; more are kept in a temporary file."""
+"""Codes of views up to this many bytes are kept in memory; others are kept in a temporary file."""
 _LEAST_CONTRAST = 0.05
-"""Of a scene that looks the same everywhere: differences below this share of it are noise."""
+"""Smallest difference between random places: in a scene that looks the same everywhere, smaller differences are
+noise."""
 
 
 @dataclass
 class _View:
-    """What is kept of a view, to be able to take parts of it out.
+    """The data of a view that are needed to remove parts of it.
 
-    rows: (M,) int32 of the Gaussians that it has something to say of.  slots: (M,) int32, row of ``codes``.
-    weights: (M,) float32.  codes, scales: (U, D) int8 and (U,) float32, the features that any of them has: codes *
-    scales is of unit length.  region: (U,) int32.  kept: (R,) bool, which regions are in the sum.
+    rows: (M,) int32 the Gaussians that it gives features for.  slots: (M,) int32, row of ``codes``.
+    weights: (M,) float32.  codes, scales: (U, D) int8 and (U,) float32, the distinct features; codes * scales has unit
+    length.  region: (U,) int32.  kept: (R,) bool, which regions are in the sum.
     """
 
     rows: NDArray[np.int32]
@@ -66,11 +68,11 @@ class _View:
 
 
 class FeatureFusion:
-    """Running weighted mean of the features of N Gaussians over views that come one by one.
+    """Running weighted mean of the features of N Gaussians over views that are added one by one.
 
-    Memory: 4 D + 4 bytes a Gaussian (float32 ``sum`` (N, D) and ``weights`` (N,)); and of each view, unless all are
-    kept, 12 bytes a Gaussian that it shows and D + 8 a feature, which all Gaussians on like cells of a region share.
-    Features of many views, beyond 512 MB, lie in a temporary file.
+    Memory: 4 D + 4 bytes per Gaussian (float32 ``sum`` (N, D) and ``weights`` (N,)). Unless all regions are kept, each
+    view also takes 12 bytes per Gaussian that it shows, and D + 8 per feature; all Gaussians on similar cells of a
+    region share a feature. Codes beyond 512 MB are in a temporary file.
     disagreement: see above; None keeps all.
     """
 
@@ -83,7 +85,8 @@ class FeatureFusion:
         self._file: Any = None
 
     def add(self, seen: VisibleGaussians, features: NDArray[np.float16]) -> None:
-        """Fuse the (h, w, D) features of a frame that shows ``seen``; their lengths are weights, zeros say nothing."""
+        """Adds the (h, w, D) features of a frame that shows ``seen``; their lengths are weights, zeros have no
+        effect."""
         h, w, dimension = features.shape
         cells = _widened(np.ascontiguousarray(features, np.float16).view(np.uint16))
         first, shared = _regions(cells, np.float32(_ALIKE), np.float32(_SAME))
@@ -106,20 +109,20 @@ class FeatureFusion:
         self._views.append(_View(rows, slot_of[own], weights, codes, scales, region, kept))
 
     def _stowed(self, codes: NDArray[np.int8]) -> NDArray[np.int8]:
-        """The same codes, in a file that has no name if there are many already. Raises OSError: the disk is full."""
+        """Returns the codes; if there are already many, in an unnamed file. Raises OSError if the disk is full."""
         self._in_memory += codes.nbytes
         if self._in_memory <= _IN_MEMORY:
             return codes
         self._in_memory -= codes.nbytes
         if self._file is None:
-            self._file = tempfile.TemporaryFile(prefix="freeocc3d-")  # noqa: SIM115 - it is open as long as it is mapped
+            self._file = tempfile.TemporaryFile(prefix="freeocc3d-")  # noqa: SIM115 - stays open while it is mapped
         start = self._file.seek(0, 2)
         self._file.write(codes.tobytes())
         self._file.flush()
         return np.asarray(np.memmap(self._file, np.int8, "r", start, codes.shape))
 
     def features(self) -> NDArray[np.float16]:
-        """(N, D) unit features; zero for a Gaussian that no view had anything to say of that others bear out."""
+        """(N, D) unit features; zero for a Gaussian for which no view has a feature that the other views confirm."""
         for view in self._views:
             self._keep(view, np.ones_like(view.kept))
         little = _NOTHING_LEFT * self.weights
@@ -135,7 +138,7 @@ class FeatureFusion:
         return (self.sum / norms[:, None]).astype(np.float16)
 
     def _limits(self) -> list[float]:
-        """Of the disagreement, in the rounds of judging."""
+        """The limits of the disagreement, one for each round."""
         limit = self.disagreement
         return [] if limit is None else [max(_FIRST, limit), *_ROUNDS * [limit]]
 
@@ -147,8 +150,8 @@ class FeatureFusion:
         return max(1.0 - float(mean @ mean), _LEAST_CONTRAST)
 
     def _disagreement(self, view: _View, little: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(R,) mean of 1 - cosine of each of the view's regions with the other views, NaN where no other view shows any
-        of it. little: (N,) weights that are rounding."""
+        """(R,) mean of 1 - cosine of each region of the view with the other views; NaN if no other view shows any of
+        it. little: (N,) weights that are only rounding."""
         own = np.where(view.kept[view.region[view.slots]], view.weights, np.float32(0))
         cosine = _agreement(view.rows, view.slots, own, view.codes, view.scales, self.sum, self.weights - little)
         other = np.isfinite(cosine)
@@ -158,7 +161,7 @@ class FeatureFusion:
         return np.where(shown > 0, off / np.maximum(shown, 1), np.nan).astype(np.float32)
 
     def _least(self, off: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-        """(N,) least disagreement of the regions that show each Gaussian; infinite where only one does."""
+        """(N,) least disagreement of the regions that show each Gaussian; infinite if only one does."""
         least, views = np.full(len(self.weights), np.inf, np.float32), np.zeros(len(self.weights), np.int32)
         for view, own in zip(self._views, off, strict=True):
             least[view.rows] = np.fmin(least[view.rows], own[view.region[view.slots]])
@@ -169,15 +172,15 @@ class FeatureFusion:
     def _agreeing(
         self, view: _View, off: NDArray[np.float32], least: NDArray[np.float32], most: float
     ) -> NDArray[np.bool_]:
-        """(R,) the view's regions that the other views do not contradict, or not more than any other region at half of
-        the Gaussians that others show; those that no other view shows are kept. most: mean of 1 - cosine."""
+        """(R,) the regions of the view to keep: the other views do not contradict them, or contradict the other regions
+        no less at half of the Gaussians that others show, or no other view shows them. most: mean of 1 - cosine."""
         region, least = view.region[view.slots], least[view.rows]
         rivalled = np.bincount(region, np.isfinite(least), len(off))
         best = np.bincount(region, np.isfinite(least) & (off[region] <= least + _TIED), len(off))
         return np.asarray(~(off > most) | (2 * best >= rivalled))
 
     def _keep(self, view: _View, kept: NDArray[np.bool_]) -> None:
-        """Take regions out of the sum, or back in."""
+        """Removes regions from the sum, or adds them again."""
         change = kept.astype(np.float32) - view.kept
         if change.any():
             step = change[view.region[view.slots]]
@@ -189,7 +192,7 @@ class FeatureFusion:
 
 @njit(parallel=True, cache=True)
 def _widened(halves: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """The float32 of finite float16 (h, w, D), given by their bits."""
+    """The float32 of finite float16 (h, w, D), given as their bits."""
     bits = np.empty(halves.shape, np.int32)
     wide = bits.view(np.float32)
     for row in prange(halves.shape[0]):
@@ -212,8 +215,8 @@ def _alike(a: NDArray[np.float32], b: NDArray[np.float32], least: np.float32) ->
 def _regions(
     features: NDArray[np.float32], alike: np.float32, same: np.float32
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Of each cell of (h, w, D) features, row by row: the first cell of its connected region of like features, and the
-    cell whose direction it shares, which is that one or itself. A zero feature is a region of its own."""
+    """For each cell of (h, w, D) features, row by row: the first cell of its connected region of similar features, and
+    the cell whose direction it shares, which is that first cell or itself. A zero feature is a region of its own."""
     h, w, _ = features.shape
     left, above = np.zeros((h, w), np.bool_), np.zeros((h, w), np.bool_)
     for row in prange(h):
@@ -231,7 +234,8 @@ def _regions(
 
 @njit(cache=True)
 def _first_connected(left: NDArray[np.bool_], above: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """(h * w,) first cell of each one's connected region, given which are connected to the left and above."""
+    """(h * w,) first cell of the connected region of each cell, given which cells are connected to the left and
+    above."""
     h, w = left.shape
     parent = np.arange(h * w).astype(np.int32)
     for row in range(h):
@@ -248,8 +252,7 @@ def _first_connected(left: NDArray[np.bool_], above: NDArray[np.bool_]) -> NDArr
 
 @njit(parallel=True, cache=True, fastmath={"reassoc", "contract"})
 def _coded(features: NDArray[np.float32], used: NDArray[np.int64]) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
-    """Some rows of (C, D) features, none of them zero, as (U, D) int8 and the (U,) factors that make unit features of
-    these."""
+    """Encodes nonzero rows of (C, D) features as (U, D) int8 and (U,) factors that give unit features."""
     codes, scales = np.empty((len(used), features.shape[1]), np.int8), np.empty(len(used), np.float32)
     for n in prange(len(used)):
         own = features[used[n]]
@@ -293,7 +296,7 @@ def _agreement(
     total: NDArray[np.float32],
     weights: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """(M,) cosine of each unit feature scales * features with the sum without it; NaN where no weight is left then."""
+    """(M,) cosine of each unit feature scales * features with the sum without it; NaN if no weight is left."""
     cosine = np.full(len(rows), np.float32(np.nan), np.float32)
     for n in prange(len(rows)):
         g, own = rows[n], features[slots[n]]

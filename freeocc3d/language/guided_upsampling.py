@@ -1,10 +1,10 @@
-"""Patch features to finer ones, guided by the image: joint bilateral upsampling.
+"""Upsamples patch features with the image as a guide: joint bilateral upsampling.
 
     F(p) = sum_q w_pq f(q) / |sum_q w_pq f(q)|,   w_pq = exp(-|p - q|^2 / (2 s^2) - |I(p) - J(q)|^2 / (2 r^2)),
 
-over the patches q around p, with the frame's colour I at p and the mean colour J of the patch. Source: J. Kopf et al.,
-Joint Bilateral Upsampling, SIGGRAPH 2007. s and r are those that assign most of the pixels within 16 of a class edge to
-their class, with patches of 16 pixels and the class images of the built-in room and of house/bedroom: 96.9 and 93.9 %
+over the patches q around p, with the frame's color I at p and the mean color J of the patch. Source: J. Kopf et al.,
+Joint Bilateral Upsampling, SIGGRAPH 2007. With these s and r, most of the pixels within 16 of a class edge get the
+right class, for patches of 16 pixels and the class images of the built-in room and of house/bedroom: 96.9 and 93.9 %
 (bilinear 95.5 and 91.9, nearest patch 88.9 and 83.0).
 """
 
@@ -18,20 +18,20 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 RADIUS = 2
-"""Patches to each side that are looked at."""
+"""Number of patches to each side that count."""
 SPATIAL = 0.7
 """s, in patches."""
 RANGE = 0.12
-"""r, as a share of a colour channel's range."""
+"""r, as a share of a color channel's range."""
 _MOST = 12.0
-"""Of the colours' part of the exponent: where no patch is alike, the nearest decides."""
+"""Limit of the color part of the exponent: if no patch is similar, the nearest decides."""
 
 
 def upsample_features(
     features: NDArray[np.floating], rgb: NDArray[np.uint8], stride: int, spatial: float = SPATIAL, range_: float = RANGE
 ) -> NDArray[np.float16]:
-    """(ceil(H / stride), ceil(W / stride), D) unit features of a frame's (H, W, 3) pixels, from (h, w, D) of patches
-    that cover it evenly. Zero features say nothing, and stay zero where there is nothing else around."""
+    """(ceil(H / stride), ceil(W / stride), D) unit features of a frame's (H, W, 3) pixels, from (h, w, D) patch
+    features that cover it evenly. Zero features have no effect, and stay zero if all features around them are zero."""
     fine, coarse = _guides(features, rgb, stride)
     out = np.empty((*fine.shape[:2], features.shape[2]), np.float32)
     values = np.ascontiguousarray(features, np.float32)
@@ -42,7 +42,7 @@ def upsample_features(
 def upsample_features_reference(
     features: NDArray[np.floating], rgb: NDArray[np.uint8], stride: int, spatial: float = SPATIAL, range_: float = RANGE
 ) -> NDArray[np.float64]:
-    """``upsample_features`` in plain NumPy, a patch offset at a time."""
+    """``upsample_features`` in plain NumPy, one patch offset at a time."""
     fine, coarse = _guides(features, rgb, stride)
     (rows, columns), (h, w) = fine.shape[:2], features.shape[:2]
     y = (np.arange(rows) + 0.5)[:, None] * h / rows - 0.5
@@ -64,7 +64,7 @@ def upsample_features_reference(
 def _guides(
     features: NDArray[np.floating], rgb: NDArray[np.uint8], stride: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Colours 0…1 at the finer features' places, and of the patches."""
+    """Colors 0…1 at the places of the finer features, and of the patches."""
     height, width = -(-rgb.shape[0] // stride), -(-rgb.shape[1] // stride)
     fine, coarse = (
         cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(255)

@@ -1,9 +1,9 @@
-"""Lifts image features onto the Gaussians that an image shows, and fuses them over keyframes.
+"""Lifts image features to the Gaussians that an image shows, and fuses them over keyframes.
 
 Paper, Sec. "Open-vocabulary Semantic Association": per-pixel embeddings z_t(u) are lifted to 3D with the depth and
-attached to the Gaussian anchored there. Here each Gaussian collects them from every keyframe that sees it
-(``visibility``), those that the other keyframes contradict are left out (``fusion``), and an encoder that takes long is
-given only the keyframes that say the most (``choice``).
+attached to the Gaussian anchored there. Here each Gaussian collects features from every keyframe that sees it
+(``visibility``). Features that other keyframes contradict are left out (``feature_fusion``). A slow encoder may get
+only the keyframes that show most (``keyframe_choice``).
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ def lift_features(
     options: Options | None = None,
     progress: Progress | None = None,
 ) -> NDArray[np.float16]:
-    """(N, D) unit features of the Gaussians from some keyframes at their poses (K, 4, 4); zero where nothing is known.
+    """(N, D) unit features of the Gaussians from keyframes at their poses (K, 4, 4); zero where nothing is known.
 
-    A keyframe that cannot be encoded is left out, with a warning: the others see most of what it showed.
+    A keyframe that cannot be encoded is left out, with a warning: the others see most of what it shows.
     """
     options, progress = options or Options(), progress or Progress()
     fusion = FeatureFusion(len(gaussians), encoder.dimension, options.disagreement)
@@ -52,17 +52,17 @@ def lift_features(
 
 
 def _encoded(encoder: Encoder, frame: Frame) -> NDArray[np.float16]:
-    """The frame's features. Raises FrameError if they are not finite: a network in half precision may overflow."""
+    """The frame's features. Raises FrameError if they are not finite, as a network in half precision may overflow."""
     features = encoder.encode(frame)
     if not np.isfinite(features).all():
-        raise FrameError(f"The encoder gives numbers that are not finite for frame {frame.index}: it is left out.")
+        raise FrameError(f"The encoder's features of frame {frame.index} are not finite: the frame is left out.")
     return features
 
 
 def choose_encoded_keyframes(
     gaussians: Gaussians, frames: Sequence[Frame], T_world_cam: NDArray[np.float64], options: Options
 ) -> list[int]:
-    """Rows of the keyframes that are encoded, ascending: as many as ``options.keyframes`` allows."""
+    """Rows of the keyframes to encode, ascending; ``options.keyframes`` gives their number."""
     count = len(frames)
     most = max(1, round(options.keyframes * count)) if options.keyframes <= 1 else int(options.keyframes)
     if most >= count:

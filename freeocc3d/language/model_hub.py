@@ -1,8 +1,8 @@
-"""Fetches model packages, or checkpoints to make them of, from the Hugging Face hub.
+"""Fetches model packages, or checkpoints to export, from the Hugging Face hub.
 
-Every file is compared with the hub's hash before it gets its name, an interrupted download goes on where it stopped,
-and a package is whole or it is not there. Only ONNX, safetensors, JSON, YAML and plain text are fetched. The
-environment variable HF_ENDPOINT names another hub.
+Every file is compared with the hub's hash before it gets its name. An interrupted download continues where it stopped.
+A package is fetched completely or not at all. Only ONNX, safetensors, JSON, YAML and plain text are fetched. The
+environment variable HF_ENDPOINT selects another hub.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ NAMES = {
     "dinov2-b14": "facebook/dinov2-base",
     "sam-b": "facebook/sam-vit-base",
 }
-"""Short names of repositories whose checkpoints ``freeocc3d models export`` takes."""
+"""Short names of repositories whose checkpoints ``freeocc3d models export`` accepts."""
 
 CHECKPOINTS = ".checkpoints"
-"""Folder in the models folder for what is not a package yet."""
+"""Subfolder of the models folder for what is not yet a package."""
 
 _CONFIGS = ("config.json", "open_clip_config.json", "preprocessor_config.json", "README.md")
 _WEIGHTS = ("open_clip_model.safetensors", "model.safetensors")
@@ -39,7 +39,7 @@ _TIMEOUT_S = 15
 
 @dataclass(frozen=True)
 class _Remote:
-    """A file on the hub: its size in bytes, and its sha256, or else its git blob's sha1."""
+    """A file on the hub: its size in bytes, and its sha256, or otherwise the sha1 of its git blob."""
 
     name: str
     size: int
@@ -58,17 +58,17 @@ class _Remote:
 
 
 def pull_package(name: str, revision: str = "main", progress: Progress | None = None) -> Path:
-    """Fetch the repository OWNER/NAME, or one of NAMES, and return the folder that it is in: a package by its name in
-    the models folder, a checkpoint in its sub-folder CHECKPOINTS. What is there already, and whole, is not fetched.
+    """Fetches the repository OWNER/NAME, or one of NAMES, and returns its folder: for a package, the one with its name
+    in the models folder; for a checkpoint, one in the subfolder CHECKPOINTS. Complete files are not fetched again.
 
-    Raises ModelError: no network, no such repository, nothing usable in it, or content that differs from its hash.
+    Raises ModelError if the network fails, the repository does not exist or has no usable files, or a hash differs.
     """
     progress = progress or Progress()
     repository = NAMES.get(name, name)
     if not re.fullmatch(r"[\w.-]+/\w[\w.-]*", repository):
         raise ModelError(
-            f"'{name}' is not OWNER/NAME of a repository on the hub{model_packages.nearest(name, NAMES)}; "
-            f"short names are {', '.join(NAMES)}."
+            f"'{name}' is not a repository OWNER/NAME of the hub{model_packages.nearest(name, NAMES)}. "
+            f"Short names are {', '.join(NAMES)}."
         )
     local = name if name in NAMES else repository.split("/")[1]
     remote = _listed(repository, revision)
@@ -89,12 +89,12 @@ def pull_package(name: str, revision: str = "main", progress: Progress | None = 
         else:
             wanted = _checkpoint_files(repository, remote)
         if lacking := [file for file in wanted if file not in remote]:
-            raise ModelError(f"{repository} lacks {', '.join(lacking)}, which its manifest lists.")
+            raise ModelError(f"{repository} lacks files of its manifest: {', '.join(lacking)}.")
         for file in wanted:
             _fetch(repository, revision, remote[file], partial, progress)
         if manifest:
             model_packages.verify_files(model_packages.read_package(partial))
-        for rest in partial.glob("*.incomplete"):  # of another revision
+        for rest in partial.glob("*.incomplete"):  # from another revision
             rest.unlink()
         partial.rename(target)
     except OSError as error:
@@ -103,12 +103,12 @@ def pull_package(name: str, revision: str = "main", progress: Progress | None = 
 
 
 def _checkpoint_files(repository: str, remote: dict[str, _Remote]) -> list[str]:
-    """Names of what an export needs of a checkpoint. Raises ModelError if its weights are not safetensors."""
+    """Names of the files of a checkpoint that an export needs. Raises ModelError if its weights are not safetensors."""
     weights = next((file for file in _WEIGHTS if file in remote), None)
     if weights is None:
         raise ModelError(
-            f"{repository} holds neither a model package ({model_packages.MANIFESTS[0]}) nor weights as "
-            "safetensors; other weights are not read, for they may run code."
+            f"{repository} has neither a model package ({model_packages.MANIFESTS[0]}) nor weights as safetensors. "
+            "Other weights are not read, because they may run code."
         )
     words = ["tokenizer.json"] if "tokenizer.json" in remote else ["vocab.json", "merges.txt"]
     return [file for file in (*_CONFIGS, *words, weights) if file in remote]
@@ -119,13 +119,13 @@ def _endpoint() -> str:
 
 
 def _listed(repository: str, revision: str) -> dict[str, _Remote]:
-    """The repository's files by name; those in sub-folders are left out."""
+    """The repository's files by name, without those in subfolders."""
     hub = _library()
     try:
         info = hub.HfApi(endpoint=_endpoint()).model_info(
             repository, revision=revision, files_metadata=True, timeout=_TIMEOUT_S
         )
-    except Exception as error:  # the library's transport, whose exceptions these are, changes with its versions
+    except Exception as error:  # raised by the library's transport, which changes between versions
         raise _told(error, repository, revision) from error
     return {
         file.rfilename: _Remote(file.rfilename, file.size or 0, file.lfs.sha256 if file.lfs else None, file.blob_id)
@@ -135,7 +135,7 @@ def _listed(repository: str, revision: str) -> dict[str, _Remote]:
 
 
 def _fetch(repository: str, revision: str, remote: _Remote, folder: Path, progress: Progress) -> None:
-    """Bring one file to the folder, going on where an earlier download of the same content stopped."""
+    """Fetches one file into the folder; continues an earlier download of the same content."""
     path = folder / remote.name
     if path.is_file() and remote.is_content_of(path):
         return
@@ -147,7 +147,7 @@ def _fetch(repository: str, revision: str, remote: _Remote, folder: Path, progre
     incomplete = folder / f"{remote.name}.{remote.identity}.incomplete"
     free = shutil.disk_usage(folder).free
     if remote.size > free:
-        raise ModelError(f"{remote.name} needs {remote.size:,} bytes, of which {folder} has {free:,} free.")
+        raise ModelError(f"{remote.name} needs {remote.size:,} bytes, but {folder} has {free:,} free: make room.")
     with incomplete.open("ab") as stream:
         done = stream.tell()
         if done > remote.size:
@@ -159,16 +159,14 @@ def _fetch(repository: str, revision: str, remote: _Remote, folder: Path, progre
             if done < remote.size:
                 http_get(url, stream, resume_size=done, headers=headers, expected_size=remote.size)
         except OSError as error:
-            if error.filename is not None:  # ours, not the network's
+            if error.filename is not None:  # an error of the disk, not of the network
                 raise
             raise _told(error, repository, revision) from error
         except Exception as error:
             raise _told(error, repository, revision) from error
     if not remote.is_content_of(incomplete):
         incomplete.unlink()
-        raise ModelError(
-            f"{remote.name} of {repository} is not what the hub's hash says that it is: it was dropped; pull again."
-        )
+        raise ModelError(f"{remote.name} of {repository} does not match the hub's hash and was deleted: pull again.")
     incomplete.rename(path)
 
 
@@ -178,22 +176,22 @@ def _library() -> Any:
         from huggingface_hub.utils import logging
     except ImportError as error:
         raise ModelError("Pulling models needs huggingface_hub: pip install 'freeocc3d[models]'.") from error
-    logging.set_verbosity_error()  # what goes wrong is told here
+    logging.set_verbosity_error()  # this module reports the errors
     return huggingface_hub
 
 
 def _told(error: Exception, repository: str, revision: str) -> ModelError:
-    """What went wrong between here and the hub, in one sentence."""
+    """Describes a failure on the way to the hub in one sentence."""
     status = getattr(getattr(error, "response", None), "status_code", None)
     if status in (401, 403, 404):
         return ModelError(
-            f"{_endpoint()} has no repository {repository} with revision {revision} that anyone can read: check its "
-            "name, or log in with 'hf auth login'."
+            f"{_endpoint()} has no readable repository {repository} with revision {revision}: check its name, or log "
+            "in with 'hf auth login'."
         )
     if status is not None:
-        return ModelError(f"{_endpoint()} answered {status} when asked for {repository}: try again later.")
+        return ModelError(f"{_endpoint()} answered {status} to the request for {repository}: try again later.")
     said = " ".join(str(error).split())[:120] or type(error).__name__
     return ModelError(
-        f"{repository} could not be fetched from {_endpoint()}: {said}. What is there already is kept: pull again once "
-        f"the network is back, or copy the model's folder to {model_packages.find_models_folder()}."
+        f"Cannot fetch {repository} from {_endpoint()}: {said}. Fetched data are kept: pull again when the network "
+        f"works, or copy the model's folder to {model_packages.find_models_folder()}."
     )

@@ -1,11 +1,11 @@
-"""Model packages: a folder with a manifest, networks as ONNX files and a tokenizer, that an encoder is made of.
+"""Model packages: folders with a manifest, networks as ONNX files and a tokenizer, from which encoders are made.
 
-    manifest.yaml (or .json)   what the package is, the parts it has, and the sha256 of every file
+    manifest.yaml (or .json)   what the package is, its parts, and the sha256 of every file
     image.onnx  head.onnx  text.onnx  tokenizer.json   … by kind, see ``KINDS``
 
-``freeocc3d models`` exports checkpoints as packages, and fetches, lists and verifies packages. They lie in the
-models folder (the environment variable FREEOCC3D_MODELS, else ~/.cache/freeocc3d/models) or anywhere else. Nothing in
-a package is ever unpickled.
+``freeocc3d models`` exports checkpoints as packages, and fetches, lists and verifies packages. Packages are in the
+models folder (the environment variable FREEOCC3D_MODELS, else ~/.cache/freeocc3d/models) or anywhere else. Nothing in a
+package is ever unpickled.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ MANIFESTS = ("manifest.yaml", "manifest.json")
 FORMAT = 1
 SUFFIXES = (".onnx", ".safetensors", ".json", ".yaml")
 Precision = Literal["fp32", "fp16", "int8"]
-"""Of a package's weights."""
-"""Of the files that a package may hold."""
+"""Precision of a package's weights."""
+"""Suffixes of the files that a package may contain."""
 
 _LARGEST_MANIFEST = 1 << 20
 _CHUNK = 1 << 20
@@ -38,7 +38,7 @@ _CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class Graph:
-    """Names of the inputs and outputs that a part of a package must have; more outputs may be there."""
+    """Names of the required inputs and outputs of a part of a package; it may have more outputs."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -62,14 +62,14 @@ KINDS: dict[str, dict[str, Graph]] = {
 }
 """Kind of package -> its networks. B images of H x W pixels; N = prefix tokens + h w patches, row by row.
 
-clip (CLIP and SigLIP): ``image`` (B, 3, H, W), normalised, runs up to the last block, and gives that block's
-``queries``, ``keys`` and ``values``, each (B, heads, N, d), and its residual ``stream`` (B, N, heads d). What attention
-makes of the values, ``mixed`` (B, N, heads d), goes into ``head``: ``features`` (B, N, D) with the block's residual and
-its feed-forward part, ``reduced`` (B, N, D) without both, ``pooled`` (B, D) the embedding of the whole image. ``text``:
-``tokens`` (T, L) int64 to ``features`` (T, D).
-dense: patch ``features`` (B, h, w, D) that are in the text's space already.
+clip (CLIP and SigLIP): ``image`` (B, 3, H, W), normalized, runs up to the last block, and returns that block's
+``queries``, ``keys`` and ``values``, each (B, heads, N, d), and its residual ``stream`` (B, N, heads d). Attention
+mixes the values to ``mixed`` (B, N, heads d), the input of ``head``, which returns ``features`` (B, N, D) with the
+block's residual and feed-forward part, ``reduced`` (B, N, D) without both, and ``pooled`` (B, D), the embedding of the
+whole image. ``text``: ``tokens`` (T, L) int64 to ``features`` (T, D).
+dense: patch ``features`` (B, h, w, D) that are already in the text's space.
 masks: ``masks`` (B, Q, h, w) logits and ``embeddings`` (B, Q, D) in the text's space.
-backbone: patch ``features`` (B, h, w, C) of their own space.
+backbone: patch ``features`` (B, h, w, C) in their own space.
 sam: ``features`` (B, C, h, w) and the last block's ``attention`` (B, h w, h w), mean over heads; ``masks`` takes
 ``points`` (B, P, 2), x and y in the pixels of the input, and gives for each ``masks`` (B, P, 3, 4 h, 4 w) logits and
 ``scores`` (B, P, 3), the network's own estimates of their IoU.
@@ -78,11 +78,12 @@ sam: ``features`` (B, C, h, w) and the last block's ``attention`` (B, h w, h w),
 
 @dataclass(frozen=True)
 class Package:
-    """A model package whose manifest has been read and found whole.
+    """A model package with a complete manifest.
 
     parts: part ("image", "text", "tokenizer"…) -> file name.  files: file name -> sha256.  dimension: D of features.
-    mean, std: (3,) of RGB in 0…1.  patch: edge of a patch in pixels.  input_size: edge in pixels of the images that it
-    was trained on.  prefix_tokens: tokens before those of the patches.  logit_scale: factor of the cosines in training,
+    mean, std: (3,) of RGB in 0…1.  patch: edge of a patch in pixels.  input_size: edge of the training images in
+    pixels.  prefix_tokens: number of tokens before those of the patches.  logit_scale: factor of the cosines in
+    training,
     one over the softmax temperature.
     """
 
@@ -104,28 +105,28 @@ class Package:
 
     @property
     def bytes(self) -> int:
-        """Size of its files."""
+        """Total size of its files."""
         return sum((self.folder / name).stat().st_size for name in self.files)
 
     @property
     def text_sha256(self) -> str:
-        """What tells text sides apart: a hash of the text network's and the tokenizer's."""
+        """Identifies the text part: a hash of the hashes of the text network and the tokenizer."""
         own = "".join(self.files[self.parts[part]] for part in ("text", "tokenizer"))
         return hashlib.sha256(own.encode()).hexdigest()
 
     def file(self, part: str) -> Path:
-        """The part's file, its content checked. Raises ModelError."""
+        """The part's file, after a check of its content. Raises ModelError."""
         path = self.folder / self.parts[part]
         found = hash_file(path)
         if found != self.files[self.parts[part]]:
             raise ModelError(
-                f"{path} is damaged: its sha256 is {found[:12]}…, the manifest says "
-                f"{self.files[self.parts[part]][:12]}…: pull or export the model again."
+                f"{path} is damaged: its sha256 is {found[:12]}…, but the manifest states "
+                f"{self.files[self.parts[part]][:12]}…. Pull or export the model again."
             )
         return path
 
     def session(self, part: str, device: str = "cpu") -> Any:
-        """The part's network, its inputs, outputs and dimension checked. Raises ModelError."""
+        """The part's network, after a check of its inputs, outputs and dimension. Raises ModelError."""
         path = self.file(part)
         session = load_session(path, device)
         expected = KINDS[self.kind][part]
@@ -133,9 +134,9 @@ class Package:
         outputs = {node.name: node.shape for node in session.get_outputs()}
         if sorted(inputs) != sorted(expected.inputs) or set(expected.outputs) - set(outputs):
             raise ModelError(
-                f"{path} takes {', '.join(inputs)} and gives {', '.join(outputs)}; the {part} network of a "
-                f"'{self.kind}' model takes {', '.join(expected.inputs)} and gives {', '.join(expected.outputs)}: "
-                "export it again with 'freeocc3d models export'."
+                f"{path} takes {', '.join(inputs)} and gives {', '.join(outputs)}, but the {part} network of a "
+                f"'{self.kind}' model takes {', '.join(expected.inputs)} and gives {', '.join(expected.outputs)}. "
+                "Export it again with 'freeocc3d models export'."
             )
         for name in ("features", "reduced", "pooled", "embeddings") if "text" in self.parts else ():
             if part == "image" and self.kind == "clip":
@@ -143,25 +144,25 @@ class Package:
             last = (outputs.get(name) or [None])[-1]
             if isinstance(last, int) and last != self.dimension:
                 raise ModelError(
-                    f"{path} gives {name} of {last} dimensions, the manifest says {self.dimension}: image and text "
-                    "networks must be of one model."
+                    f"{path} gives {name} of {last} dimensions, but the manifest states {self.dimension}: export the "
+                    "image and text networks from one model."
                 )
         return session
 
 
 def find_models_folder() -> Path:
-    """Where packages are looked for by name."""
+    """The folder in which packages are found by name."""
     given = os.environ.get("FREEOCC3D_MODELS")
     return Path(given) if given else Path.home() / ".cache" / "freeocc3d" / "models"
 
 
 def find_model(model: str, kinds: tuple[str, ...], option: str) -> Package:
-    """The package of one of ``kinds`` in the folder ``model``, or of that name in the models folder; ``option`` is the
-    key that named it. Raises ModelError."""
+    """Finds the package of one of ``kinds`` in the folder ``model``, or with that name in the models folder. ``option``
+    is the key that selected it. Raises ModelError."""
     if not model:
         raise ModelError(
-            f"{option} names no model: give the folder of one, or its name ({_known()}); "
-            "'freeocc3d models export' makes them, 'freeocc3d models pull' fetches them."
+            f"{option} is empty: set it to the folder of a model, or to its name ({_known()}). 'freeocc3d models "
+            "export' makes models, 'freeocc3d models pull' fetches them."
         )
     folder = Path(model).expanduser()
     if not folder.is_dir():
@@ -171,12 +172,14 @@ def find_model(model: str, kinds: tuple[str, ...], option: str) -> Package:
         folder = find_models_folder() / model
     package = read_package(folder)
     if package.kind not in kinds:
-        raise ModelError(f"{option} needs a model of kind {' or '.join(kinds)}; {folder} is of kind {package.kind}.")
+        raise ModelError(
+            f"{option} needs a model of kind {' or '.join(kinds)}, but {folder} is of kind {package.kind}."
+        )
     return package
 
 
 def find_text_model(name: str, folder: str, text_sha256: str) -> Package:
-    """The package with that text side: in ``folder``, by its name, or by any other. Raises ModelError."""
+    """Finds the package with that text part: in ``folder``, by its name, or under any name. Raises ModelError."""
     for candidate in (Path(folder), find_models_folder() / Path(name).name, *_folders()):
         try:
             package = read_package(candidate)
@@ -185,13 +188,13 @@ def find_text_model(name: str, folder: str, text_sha256: str) -> Package:
         if "text" in package.parts and package.text_sha256 == text_sha256:
             return package
     raise ModelError(
-        f"The words of this map need the text side of the model '{name}' ({text_sha256[:12]}…), which is neither in "
-        f"{folder} nor in {find_models_folder()}: copy its folder there, or map again with a model that is there."
+        f"The words of this map need the text part of the model '{name}' ({text_sha256[:12]}…), but it is neither in "
+        f"{folder} nor in {find_models_folder()}. Copy its folder there, or reconstruct the map with another model."
     )
 
 
 def list_installed() -> dict[str, Package | ModelError]:
-    """Name -> package in the models folder, or what is wrong with it."""
+    """Name -> package in the models folder, or the error in it."""
     found: dict[str, Package | ModelError] = {}
     for folder in _folders():
         try:
@@ -202,47 +205,47 @@ def list_installed() -> dict[str, Package | ModelError]:
 
 
 def verify_files(package: Package) -> None:
-    """Compare every file's content with the manifest's hash. Raises ModelError for the first that differs."""
+    """Compares every file's content with the manifest's hash. Raises ModelError for the first that differs."""
     by_file = {name: part for part, name in package.parts.items()}
     for name in package.files:
         package.file(by_file[name])
 
 
 def read_package(folder: Path) -> Package:
-    """The package in a folder: its manifest is checked, and that its files are there; not yet what is in them.
+    """Reads the package in a folder: checks its manifest and that its files exist, but not yet their content.
 
     Raises ModelError.
     """
     if not folder.is_dir():
-        raise ModelError(f"There is no model folder {folder}.")
+        raise ModelError(f"The model folder {folder} does not exist.")
     path = next((folder / name for name in MANIFESTS if (folder / name).is_file()), None)
     if path is None:
         raise ModelError(
-            f"{folder} is no model package: it lacks a {MANIFESTS[0]}; 'freeocc3d models export' writes one."
+            f"{folder} is not a model package: it has no {MANIFESTS[0]}. 'freeocc3d models export' writes one."
         )
     package = parse_manifest(load_manifest(path), folder, path)
     for name in package.files:
         if not (folder / name).is_file():
-            raise ModelError(f"The model {folder} lacks its {name}: pull or export it again.")
+            raise ModelError(f"The model {folder} lacks its file {name}: pull or export it again.")
     return package
 
 
 def load_manifest(path: Path) -> Any:
-    """What a manifest file holds. Raises ModelError."""
+    """The content of a manifest file. Raises ModelError."""
     try:
         if path.stat().st_size > _LARGEST_MANIFEST:
-            raise ModelError(f"{path} is no manifest: it has more than a megabyte.")
+            raise ModelError(f"{path} is not a manifest: it is larger than a megabyte.")
         text = path.read_text(encoding="utf-8")
         return json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
-        raise ModelError(f"{path} cannot be read: {' '.join(str(error).split())}.") from error
+        raise ModelError(f"Cannot read {path}: {' '.join(str(error).split())}.") from error
 
 
 def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:
-    """The package that a manifest describes; ``path`` is named in errors. Raises ModelError."""
+    """The package that a manifest describes; errors name ``path``. Raises ModelError."""
 
     def refuse(why: str) -> ModelError:
-        return ModelError(f"{path} is no usable manifest: {why}.")
+        return ModelError(f"{path} is not a usable manifest: {why}.")
 
     def get(key: str, kind: type, default: Any = None) -> Any:
         value = manifest.get(key, default)
@@ -252,7 +255,7 @@ def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:
         return value
 
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise refuse(f"it must state format: {FORMAT}")
+        raise refuse(f"it must contain format: {FORMAT}")
     kind = get("kind", str)
     if kind not in KINDS:
         raise refuse(f"kind '{kind}' is not one of {', '.join(KINDS)}")
@@ -264,7 +267,7 @@ def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:
         if not isinstance(name, str) or Path(name).name != name or name.startswith(".") or "\\" in name:
             raise refuse(f"'{name}' is not the plain name of a file in its folder")
         if not name.endswith(SUFFIXES):
-            raise refuse(f"'{name}' is not a file of {', '.join(SUFFIXES)}")
+            raise refuse(f"'{name}' does not end with {', '.join(SUFFIXES)}")
         if not isinstance(digest, str) or len(digest) != 64 or set(digest) - set("0123456789abcdef"):
             raise refuse(f"the sha256 of '{name}' is not 64 hexadecimal digits")
     if sorted(map(str, parts.values())) != sorted(files):
@@ -279,7 +282,7 @@ def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:
     if min(dimension, patch, input_size, *std, logit_scale) <= 0 or max(dimension, input_size) > 1 << 16:
         raise refuse("'dimension', 'patch', 'input_size', 'std' and 'logit_scale' must be greater than 0, and usual")
     if prefix_tokens < 0 or input_size < patch:
-        raise refuse("'prefix_tokens' must not be negative, nor 'input_size' less than 'patch'")
+        raise refuse("'prefix_tokens' must not be negative, and 'input_size' must not be less than 'patch'")
     return Package(
         folder=folder,
         name=get("name", str),
@@ -320,4 +323,4 @@ def _folders() -> list[Path]:
 
 def _known() -> str:
     names = ", ".join(path.name for path in _folders())
-    return f"in {find_models_folder()} there are: {names}" if names else f"there are none in {find_models_folder()} yet"
+    return f"{find_models_folder()} contains: {names}" if names else f"{find_models_folder()} contains none yet"

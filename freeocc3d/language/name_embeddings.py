@@ -1,14 +1,14 @@
-"""Text embeddings of many names, of which some mean one of a few classes: "couch" a sofa, where no list of synonyms
-says so.
+"""Text embeddings of many names, to find names that mean one of a few classes: "couch" means a sofa, even if no list of
+synonyms contains it.
 
 Similarities of text embeddings are close together (with CLIP, sofa and couch 0.95, sofa and chair 0.85, sofa and banana
-0.74), and closer for some names than for others, so that no cosine means "the same". What is compared instead is how
-near two names are to each other with how near each is to its own neighbours among all names:
+0.74), and closer for some names than for others, so no fixed cosine means "the same". Instead, the similarity of two
+names is compared with the similarity of each to its own neighbors among all names:
 
     csls(w, c) = 2 cos(w, c) - r(w) - r(c),   r(x) the mean cosine of x to its K nearest other names.
 
-A name means its nearest class where this is at least a margin. Source: cross-domain similarity local scaling,
-A. Conneau et al., Word Translation Without Parallel Data, ICLR 2018, eq. 3, K = 10 as there; within one list here.
+A name means its nearest class if this value is at least a margin. Source: cross-domain similarity local scaling, A.
+Conneau et al., Word Translation Without Parallel Data, ICLR 2018, eq. 3, with its K = 10; here within one list.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from ..core.arrays import read_arrays
 from ..core.errors import ConfigError, MapError
 from .synonyms import find_synonyms, make_key
 
-_NEIGHBOURS = 10
+_NEIGHBORS = 10
 _ROWS = 1024
 _MARGIN = 0.04
-"""With CLIP's embeddings of 1374 names it finds 73 % of the vocabulary's synonyms and takes 1.8 names a class; a plain
-cosine that finds as many takes 4.5."""
+"""With CLIP's embeddings of 1374 names, this margin finds 73 % of the vocabulary's synonyms and gives each class 1.8
+names. A plain cosine that finds the same share gives 4.5."""
 _LEAST_NAMES = 100
-"""Fewer names are no neighbourhood that a similarity could be compared with."""
+"""Fewer names are not enough neighbors to compare a similarity with."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class NameEmbeddings:
 
     @classmethod
     def read(cls, path: Path) -> NameEmbeddings:
-        """From an .npz file with ``names`` (N,) and ``embeddings`` (N, D), of any length. Raises ConfigError."""
+        """Reads an .npz file with ``names`` (N,) and ``embeddings`` (N, D) of any length. Raises ConfigError."""
         if not path.is_file():
-            raise ConfigError(f"There are no embeddings {path}: give an .npz file with 'names' and 'embeddings'.")
+            raise ConfigError(f"There is no file {path}: give an .npz file with 'names' and 'embeddings'.")
         try:
             arrays = read_arrays(path, {"names": ("U", 1), "embeddings": ("f", 2)})
         except MapError as error:
@@ -53,15 +53,16 @@ class NameEmbeddings:
         names, embeddings = arrays["names"], arrays["embeddings"].astype(np.float32)
         lengths = np.linalg.norm(embeddings, axis=1)
         if len(names) != len(embeddings) or not (np.isfinite(lengths) & (lengths > 0)).all():
-            raise ConfigError(f"{path} must hold one finite embedding other than zero for each of its names.")
+            raise ConfigError(f"{path} must contain one finite, nonzero embedding for each of its names.")
         if len(names) < _LEAST_NAMES:
-            raise ConfigError(f"{path} holds {len(names)} names; at least {_LEAST_NAMES} are needed to compare with.")
+            raise ConfigError(f"{path} contains {len(names)} names, but the comparison needs at least {_LEAST_NAMES}.")
         return cls(tuple(map(str, names)), embeddings / lengths[:, None])
 
     def meaning(self, classes: Sequence[str]) -> dict[str, int]:
-        """Of the names that mean a class: ``vocabulary.key_of`` each, and the row of the class.
+        """The names that mean a class: their ``synonyms.make_key`` -> the row of the class.
 
-        A class that is not among the names is known by a synonym that is; one without any is reached by no name.
+        A class that is not among the names is represented by a synonym that is; without such a synonym, no name means
+        it.
         """
         row = {make_key(name): n for n, name in reversed(list(enumerate(self.names)))}
         known = [
@@ -90,5 +91,5 @@ class NameEmbeddings:
         for start in range(0, len(out), _ROWS):
             cosine = self.embeddings[start : start + _ROWS] @ self.embeddings.T
             cosine[np.arange(len(cosine)), start + np.arange(len(cosine))] = -np.inf
-            out[start : start + _ROWS] = np.partition(cosine, -_NEIGHBOURS, axis=1)[:, -_NEIGHBOURS:].mean(axis=1)
+            out[start : start + _ROWS] = np.partition(cosine, -_NEIGHBORS, axis=1)[:, -_NEIGHBORS:].mean(axis=1)
         return out

@@ -1,4 +1,4 @@
-"""From a frame to the images that a ViT takes, and from its patches back to the frame: resizing, windows, splicing."""
+"""Turns frames into images for a ViT, and its patches back into the frame: resizing, windows, joining."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .model_packages import Package
 
 _BATCH_PATCHES = 4096
-"""Of windows that are encoded at once, so that memory does not grow with the frame."""
+"""Number of windows to encode at once, so that memory does not grow with the frame."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Tiling:
 
     @classmethod
     def of(cls, height: int, width: int, package: Package, short_side: int, window: int) -> Tiling:
-        """Of a frame that is resized to ``short_side`` pixels; windows of at most ``window`` pixels (0 = the whole
-        frame) that overlap by half."""
+        """The tiling of a frame resized to ``short_side`` pixels; windows have up to ``window`` pixels (0 = the whole
+        frame) and overlap by half."""
         scale = short_side / min(height, width)
         rows, columns = (max(1, round(size * scale / package.patch)) for size in (height, width))
         most = max(1, window // package.patch) if window else max(rows, columns)
@@ -39,7 +39,7 @@ class Tiling:
         return cls((rows, columns), (h, w), _starts(rows, h), _starts(columns, w), package.patch)
 
     def image(self, rgb: NDArray[np.uint8], mean: tuple[float, ...], std: tuple[float, ...]) -> NDArray[np.float32]:
-        """(3, rows patch, columns patch) the frame resized, and normalised as the network wants it."""
+        """(3, rows patch, columns patch) the frame, resized and normalized for the network."""
         rows, columns = self.grid
         size = columns * self.patch, rows * self.patch
         shrinks = size[0] < rgb.shape[1]
@@ -59,7 +59,7 @@ class Tiling:
 
 
 class Splice:
-    """The mean over windows of what each says of the patches that it covers."""
+    """Averages the features of overlapping windows."""
 
     def __init__(self, tiling: Tiling, dimension: int):
         self.tiling = tiling
@@ -67,7 +67,7 @@ class Splice:
         self._count = np.zeros(tiling.grid, np.float32)
 
     def add(self, features: NDArray[np.float32], corners: list[tuple[int, int]]) -> None:
-        """Take (B, h, w, C) features of windows in."""
+        """Adds (B, h, w, C) features of windows."""
         h, w = self.tiling.window
         for own, (top, left) in zip(features, corners, strict=True):
             self._sum[top : top + h, left : left + w] += own
@@ -85,10 +85,10 @@ def encode_windows(
     window: int | None,
     encode: Callable[[NDArray[np.float32], Tiling], NDArray[np.float32]],
 ) -> NDArray[np.float32]:
-    """(rows, columns, D) unit features of the patches of (H, W, 3) pixels, spliced from windows.
+    """(rows, columns, D) unit features of the patches of (H, W, 3) pixels, joined from windows.
 
-    window: in pixels; None = the size of the model's training images.  encode: (B, 3, h patch, w patch) windows of a
-    tiling to their (B, h, w, D) features.
+    window: in pixels; None = the size of the model's training images.  encode: turns (B, 3, h patch, w patch) windows
+    of a tiling into their (B, h, w, D) features.
     """
     tiling = Tiling.of(
         rgb.shape[0], rgb.shape[1], package, short_side, package.input_size if window is None else window
@@ -100,8 +100,8 @@ def encode_windows(
 
 
 def finish_patches(patches: NDArray[np.float32], rgb: NDArray[np.uint8], stride: int) -> NDArray[np.float16]:
-    """Unit features (rows, columns, D) of patches as an encoder gives them: upsampled along the edges of the frame's
-    (H, W, 3) pixels, one feature every ``stride`` of them; 0 = as they are."""
+    """Turns unit features (rows, columns, D) of patches into an encoder's result: upsampled along the edges of the
+    frame's (H, W, 3) pixels, with one feature every ``stride`` pixels; 0 = unchanged."""
     if stride == 0:
         return patches.astype(np.float16)
     from .guided_upsampling import upsample_features
@@ -110,24 +110,24 @@ def finish_patches(patches: NDArray[np.float32], rgb: NDArray[np.uint8], stride:
 
 
 def resample_patches(features: NDArray[np.float32], grid: tuple[int, int]) -> NDArray[np.float32]:
-    """(h, w, C) features at the cells of another grid that covers the same, linearly in between."""
+    """Resamples (h, w, C) features linearly on the cells of another grid that covers the same area."""
     rows, columns = (_linear(own, wanted) for own, wanted in zip(features.shape[:2], grid, strict=True))
     return np.asarray(np.einsum("ri,cj,ijk->rck", rows, columns, features, optimize=True), np.float32)
 
 
 def _linear(own: int, wanted: int) -> NDArray[np.float32]:
-    """(wanted, own) weights of linear interpolation between the centres of cells; constant beyond the outermost."""
+    """(wanted, own) weights of linear interpolation between cell centers; constant beyond the outermost."""
     at = np.clip((np.arange(wanted) + 0.5) * own / wanted - 0.5, 0, own - 1)
     return np.maximum(1 - np.abs(at[:, None] - np.arange(own)), 0).astype(np.float32)
 
 
 def normalize_patches(features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(..., D) of unit length; zeros stay."""
+    """(..., D) features of unit length; zeros stay."""
     norms = np.linalg.norm(features, axis=-1, keepdims=True)
     return np.asarray(features / np.where(norms > 0, norms, 1), np.float32)
 
 
 def _starts(length: int, window: int) -> tuple[int, ...]:
-    """Where windows begin that cover ``length``, half of one apart, the last ending with it."""
+    """The starts of windows that cover ``length``, half a window apart; the last window ends with it."""
     step = max(1, window // 2)
     return (*range(0, length - window, step), length - window)

@@ -1,10 +1,10 @@
-"""Names of what a scene holds, by a vision-language model: off unless an endpoint is given.
+"""Names of the things in a scene from a vision-language model; off unless an endpoint is given.
 
 Paper, supplement, "Open-vocabulary semantic cue generation": a VLM (Qwen3-VL there) names the object categories that it
-sees in each frame; aggregated over time, they are the scene's vocabulary. Here a budget of keyframes is asked, evenly
-spread; names are brought to normal form and counted. What an encoder of open vocabulary is asked for then has to match
-better than all these (``query``), and pictures by class use them. A model that does not answer, or not with names,
-costs names and a warning, never the map.
+sees in each frame; aggregated over time, they are the scene's vocabulary. Here the questions are about a limited number
+of keyframes, evenly spread. The names are normalized and counted. For an encoder of open vocabulary, a queried word
+must then match better than all these names (``query``), and pictures by class use them. If a model does not
+answer, or answers without names, there is a warning and there are fewer names; the map is still made.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ QUESTION = (
 )
 
 _MOST_NAMES = 100
-"""In one picture: a model that lists more is repeating itself."""
+"""Most names in one picture: a model that lists more repeats itself."""
 _LONGEST_NAME = 40
 _MOST_WORDS = 4
 _MOSTLY = 0.8
-"""Share of the entries of a list without JSON that must be names: sentences have commas, too."""
+"""Share of the entries of a list without JSON that must be names, because sentences have commas, too."""
 _SENTENCE = {"i", "it", "you", "we", "is", "are", "there", "can", "cannot", "not", "sorry", "and", "or", "see", "which"}
-"""Words that no name has."""
+"""Words that no name contains."""
 _MOST_FAILURES = 3
-"""Questions in a row that are not answered before the others are not asked."""
-_WIDTH = 768  # of the pictures that are sent
+"""After this many questions in a row without an answer, the others are not asked."""
+_WIDTH = 768  # of the pictures in the questions
 _JPEG_QUALITY = 85
 
 
 class Namer:
-    """Asks for the names in keyframes, and keeps the answers in a file as they come, for a run that goes on later."""
+    """Asks for the names in keyframes, and saves each answer in a file, so that an interrupted run can continue."""
 
     def __init__(self, options: Options, server: VisionServer):
         self.options = options
@@ -58,10 +58,10 @@ class Namer:
     def names(
         self, keyframes: Sequence[Frame], path: Path, advance: Callable[[int], None]
     ) -> tuple[dict[str, Any], list[Notice]]:
-        """What a map keeps: the model, the frames that were answered, and the names with their counts and frames, the
-        most frequent first; and warnings of what did not work.
+        """What a map saves: the model, the frames with an answer, and the names with their counts and frames, the most
+        frequent first; and warnings of failures.
 
-        path: where answers are kept meanwhile.
+        path: the file that keeps answers in the meantime.
         """
         answers = self._restored(path)
         asked: list[int] = []
@@ -91,13 +91,14 @@ class Namer:
         if nothing:
             shown = shorten_to_line(nothing[0], 60) or "nothing"
             text = (
-                f"{len(nothing)} of {len(answered)} answers of {self.options.model} name nothing, the first: '{shown}'."
+                f"{len(nothing)} of {len(answered)} answers of {self.options.model} contain no names. "
+                f"The first: '{shown}'."
             )
             warnings.append(Notice("vocabulary-empty-answers", text))
         return aggregate_names(answered, self.options.model), warnings
 
     def _marks(self) -> str:
-        """Of what answers depend on."""
+        """Identifies everything that answers depend on."""
         asked = [self.options.endpoint, self.options.model, QUESTION]
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:16]
 
@@ -105,7 +106,7 @@ class Namer:
         replace_text(path, json.dumps({"of": self._marks(), "answers": answers}))
 
     def _restored(self, path: Path) -> dict[int, list[str]]:
-        """Answers of an interrupted run to the same questions; none where there are none that can be read."""
+        """Answers of an interrupted run to the same questions; empty if there is no readable file."""
         try:
             kept = json.loads(path.read_text(encoding="utf-8"))
             if kept["of"] != self._marks():
@@ -116,25 +117,27 @@ class Namer:
 
 
 def load_namer(options: Options) -> Namer | None:
-    """What asks, None if no endpoint is given. Raises ConfigError: the endpoint is no address, or the key's environment
-    variable is not set."""
+    """Makes the namer; None if no endpoint is given. Raises ConfigError if the endpoint is not an address, or if the
+    environment variable of the key is not set."""
     if options.endpoint is None:
         return None
     resolve_address(options.endpoint)
     key = os.environ.get(options.api_key_env, "").strip() if options.api_key_env else None
     if options.api_key_env and not key:
         raise ConfigError(
-            f"The environment variable {options.api_key_env}, which vocabulary.api_key_env names, is not set: it must "
-            "hold the server's key."
+            f"The environment variable {options.api_key_env}, named by vocabulary.api_key_env, is not set: set it to "
+            "the server's key."
         )
     if key and not (key.isascii() and key.isprintable()):
-        raise ConfigError(f"The key in the environment variable {options.api_key_env} is none: it is not plain text.")
+        raise ConfigError(
+            f"The environment variable {options.api_key_env} does not contain a key: it is not plain text."
+        )
     server = VisionServer(options.endpoint, options.model, key, options.timeout, options.retries)
     return Namer(options, server)
 
 
 def aggregate_names(answers: dict[int, list[str]], model: str) -> dict[str, Any]:
-    """Names over frames, as a map keeps them: plain numbers and strings."""
+    """Names over frames, as a map saves them: plain numbers and strings."""
     frames: dict[str, list[int]] = {}
     for frame, names in answers.items():
         for name in dict.fromkeys(names):
@@ -145,10 +148,10 @@ def aggregate_names(answers: dict[int, list[str]], model: str) -> dict[str, Any]
 
 
 def parse_names(text: str) -> list[str] | None:
-    """The names in an answer in normal form, each once; None for an answer that is no list of names.
+    """The names in an answer in normal form, without repetition; None if the answer is not a list of names.
 
-    Taken are a JSON list, alone or with words around it, a JSON object that holds one, lines with bullets or numbers,
-    and names with commas between. What a model thinks aloud first (<think>) is passed over.
+    Accepts a JSON list, alone or with words around it, a JSON object that contains one, lines with bullets or numbers,
+    and names separated by commas. Ignores what a model thinks aloud first (<think>).
     """
     text = re.sub(r"<think>.*?(</think>|\Z)", " ", text, flags=re.DOTALL)
     names = list(filter(None, map(_name, _json_list(text))))
@@ -161,7 +164,7 @@ def parse_names(text: str) -> list[str] | None:
 
 
 def _json_list(text: str) -> list[Any]:
-    """The first JSON list of a text that is not empty."""
+    """The first JSON list in a text that is not empty."""
     decoder = json.JSONDecoder()
     for match in list(re.finditer(r"\[", text))[:20]:
         try:
@@ -174,12 +177,12 @@ def _json_list(text: str) -> list[Any]:
 
 
 def _lines(text: str) -> list[str]:
-    """What follows the bullets or numbers of a list."""
+    """The text after the bullets or numbers of a list."""
     return re.findall(r"^\s*(?:[-*•]|\d{1,3}[.)])\s+(.+?)\s*$", text, flags=re.MULTILINE)
 
 
 def _name(entry: Any) -> str:
-    """A name in normal form, empty for what is none."""
+    """A name in normal form; empty if the entry is not a name."""
     if isinstance(entry, dict):
         entry = next((entry[key] for key in ("name", "object", "label") if key in entry), None)
     if not isinstance(entry, str) or len(entry) > 4 * _LONGEST_NAME:
@@ -192,7 +195,7 @@ def _name(entry: Any) -> str:
 
 
 def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
-    """A picture as it is sent."""
+    """A picture as JPEG, at the size for questions."""
     import cv2
 
     height, width = rgb.shape[:2]

@@ -1,7 +1,8 @@
-"""What people call things in rooms: normal forms, synonyms, and which words include which others.
+"""What people call things in rooms: normal forms, synonyms, and words that include other words.
 
-The lists are small on purpose, written for this project, and hold only what indoor data sets name and people ask for.
-A word that they do not know still finds a class of its own name, and a class that is a kind of it by its last word.
+The lists are small on purpose. They were written for this project, and contain only what indoor data sets name and
+people ask for. A word that is not in them still finds a class with its own name, and by its last word a class that is a
+kind of it.
 """
 
 from __future__ import annotations
@@ -78,7 +79,8 @@ INCLUDES: dict[str, tuple[str, ...]] = {
         "shelf", "chest of drawers",
     ),
 }  # fmt: skip
-"""A wider word and narrower ones that it includes beyond those that end with it ("dining table" is a table)."""
+"""A wider word -> narrower words that it includes, in addition to those that end with it ("dining table" is a
+table)."""
 
 _IRREGULAR = {
     "shelves": "shelf", "bookshelves": "bookshelf", "knives": "knife", "people": "person", "men": "man",
@@ -100,12 +102,12 @@ def normalize_phrase(phrase: str) -> str:
 
 
 def match_names(phrase: str, names: list[str]) -> tuple[list[int], str]:
-    """Which of some class names a phrase means, and the part of the phrase that was used; no match: ([], "").
+    """Returns the class names that a phrase means, and the part of the phrase that was used; no match: ([], "").
 
-    The whole phrase is tried first, then the ends of what stands before a preposition ("red chair by the window":
-    "red chair", "chair"), since the last word of an English noun phrase says what the thing is. A part means the names
-    that are equal to it or a kind of it ("table": "coffee table" and "side table"), failing those its synonyms', and
-    failing all that, the names of a wider word that includes it ("mug": "tableware").
+    The whole phrase is tried first, then the ends of the part before a preposition ("red chair by the window": "red
+    chair", "chair"), since the last word of an English noun phrase says what the thing is. A part means the names that
+    are equal to it or a kind of it ("table": "coffee table" and "side table"). If there are none, it means those of its
+    synonyms; if there are none either, the names of a wider word that includes it ("mug": "tableware").
     """
     known = [make_key(name) for name in names]
     kinds = [_tail_keys(name) for name in names]
@@ -122,7 +124,7 @@ def match_names(phrase: str, names: list[str]) -> tuple[list[int], str]:
 
 @functools.cache
 def find_synonyms(word: str) -> frozenset[str]:
-    """The normal forms that mean the same as ``word``, itself included."""
+    """The normal forms with the same meaning as ``word``, including ``word``."""
     same = {normalize_phrase(word)}
     for group in SYNONYMS:
         if make_key(word) in {make_key(member) for member in group}:
@@ -132,7 +134,7 @@ def find_synonyms(word: str) -> frozenset[str]:
 
 @functools.cache
 def find_narrower(word: str) -> frozenset[str]:
-    """The normal forms of what ``word`` includes, at any remove, with their synonyms."""
+    """The normal forms of the words that ``word`` includes, directly or through others, with their synonyms."""
     found: set[str] = set()
     for inner in INCLUDES.get(normalize_phrase(word), ()):
         found |= find_synonyms(inner) | find_narrower(inner)
@@ -141,7 +143,7 @@ def find_narrower(word: str) -> frozenset[str]:
 
 @functools.cache
 def find_wider(word: str) -> frozenset[str]:
-    """The normal forms of what includes ``word``."""
+    """The normal forms of the words that include ``word``."""
     key = make_key(word)
     return frozenset(
         normalize_phrase(wide) for wide in INCLUDES if key in {make_key(inner) for inner in INCLUDES[wide]}
@@ -158,7 +160,7 @@ def split_phrase(phrase: str) -> list[str]:
 
 
 def _named(words: frozenset[str], known: list[str], kinds: list[frozenset[str]]) -> list[int]:
-    """Rows of the names that are one of ``words``, or a kind of one."""
+    """Rows of the names that are in ``words``, or a kind of one of them."""
     keys = {make_key(word) for word in words}
     keys |= {make_key(name) for word in words for name in find_narrower(word)}
     return [row for row, name in enumerate(known) if name in keys or kinds[row] & keys]
@@ -170,13 +172,14 @@ def _exactly(words: set[str], known: list[str]) -> list[int]:
 
 
 def make_key(name: str) -> str:
-    """Equal for "night stand", "Nightstand" and "nightstands"."""
+    """A key that is equal for "night stand", "Nightstand" and "nightstands"."""
     return normalize_phrase(name).replace(" ", "")
 
 
 @functools.lru_cache(maxsize=4096)
 def _tail_keys(name: str) -> frozenset[str]:
-    """Keys of what a name of several words is a kind of: of "small office chair", "office chair" and "chair"."""
+    """Keys of the names that a name of several words is a kind of: for "small office chair", "office chair" and
+    "chair"."""
     words = normalize_phrase(name).split()
     return frozenset("".join(words[start:]) for start in range(1, len(words)))
 

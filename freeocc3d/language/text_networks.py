@@ -1,7 +1,7 @@
-"""The word side of an encoder whose text network is a part of a model package.
+"""The text part of an encoder whose text network is in a model package.
 
-Restored from what a map saved, it finds the package again by its content, not by trust in a path. onnxruntime and
-tokenizers are imported when a word is encoded for the first time ever: embeddings are kept on disk, and a repeated
+It is restored from the state that a map saved, and finds the package by its content, not by its path. onnxruntime and
+tokenizers are imported only when a word is encoded for the first time: embeddings are kept on disk, and a repeated
 query needs neither.
 """
 
@@ -23,23 +23,23 @@ from .encoders.base import TextEncoder, TextFeatures
 
 TEMPLATES = ("a photo of a {}.", "a photo of the {} in a room.", "there is a {} in the scene.", "a bad photo of a {}.",
              "a photo of a small {}.", "a photo of a large {}.", "{}")  # fmt: skip
-"""Prompts whose mean stands for a word: the form of CLIP's own ensemble, for things in rooms."""
+"""Prompts for a word; their mean is its meaning. The form is that of CLIP's own ensemble, for things in rooms."""
 
 CONTRAST = (
     "wall", "floor", "ceiling", "door", "window", "table", "chair", "sofa", "bed", "cabinet", "shelf", "desk",
     "curtain", "lamp", "picture", "plant", "pillow", "television", "sink", "toilet", "object", "things", "stuff",
     "texture",
 )  # fmt: skip
-"""What a voxel could be instead: what most rooms hold, and LERF's "canonical" words."""
+"""What else a voxel could be: things in most rooms, and LERF's "canonical" words."""
 
-_KEPT = 4096  # embeddings that a cache file holds, the latest
-_LONGEST = 200  # characters of a word that is worth keeping
+_KEPT = 4096  # the latest embeddings, kept in a cache file
+_LONGEST = 200  # characters of a word; longer ones are not cached
 _AT_ONCE = 64
 
 
 @dataclass(frozen=True)
 class Wording:
-    """How words become prompts, and what they compete with."""
+    """How words become prompts, and the words that they compete with."""
 
     templates: tuple[str, ...] = TEMPLATES
     contrast: tuple[str, ...] = CONTRAST
@@ -48,12 +48,12 @@ class Wording:
     def check(self) -> None:
         """Raises ConfigError for templates without a place for the word."""
         if not self.templates or any("{}" not in template for template in self.templates):
-            raise ConfigError("'templates' must each hold {}, where the word goes.")
+            raise ConfigError("Each of 'templates' must contain {}, the place of the word.")
         if any(not word.strip() for word in self.contrast):
-            raise ConfigError("'contrast' must not hold empty words.")
+            raise ConfigError("'contrast' must not contain empty words.")
 
     def state(self, package: model_packages.Package) -> dict[str, Any]:
-        """What ``ModelWords`` is restored from."""
+        """The state that ``ModelWords`` is restored from."""
         return {
             "model": package.name,
             "folder": str(package.folder.resolve()),
@@ -67,7 +67,7 @@ class Wording:
 
 
 class ModelWords(TextEncoder):
-    """Any words; those that it was never trained on come out somewhere all the same."""
+    """Any words; words that the network was not trained on get a feature, too."""
 
     open_vocabulary = True
     knows = "words in the language of its text network"
@@ -80,7 +80,7 @@ class ModelWords(TextEncoder):
             self._contrast = [str(word) for word in state["contrast"]]
             self._model, self._folder, self._sha256 = (str(state[k]) for k in ("model", "folder", "text_sha256"))
         except (KeyError, TypeError, ValueError) as error:
-            raise MapError(f"The map's encoder is damaged: its state lacks a usable {error}.") from error
+            raise MapError(f"The map's encoder is damaged: its state has no usable {error}.") from error
         key = hashlib.sha256("\n".join((self._sha256, *self._templates)).encode()).hexdigest()[:32]
         self._cache = model_packages.find_models_folder() / ".embeddings" / f"{key}.npz"
         self._known: dict[str, NDArray[np.float32]] | None = None
@@ -90,7 +90,7 @@ class ModelWords(TextEncoder):
         return self._contrast
 
     def encode_words(self, words: list[str]) -> TextFeatures:
-        """(W, D) unit means of the prompts' embeddings. Raises ModelError if the text side cannot be found."""
+        """(W, D) unit means of the prompts' embeddings. Raises ModelError if the text part is not found."""
         plain = [" ".join(word.lower().split()) for word in words]
         if self._known is None:
             self._known = _read_cache(self._cache, self._dimension)
@@ -101,8 +101,8 @@ class ModelWords(TextEncoder):
                 self._text = TextNetwork(package)
                 if package.dimension != self._dimension:
                     raise ModelError(
-                        f"The text side of {package.folder} has {package.dimension} dimensions, the map's features "
-                        f"{self._dimension}: map again."
+                        f"The text part of {package.folder} has {package.dimension} dimensions, but the map's features "
+                        f"have {self._dimension}: reconstruct the map."
                     )
             prompts = [template.replace("{}", word) for word in new for template in self._templates]
             embedded = self._text.embed(prompts).reshape(len(new), len(self._templates), -1).mean(axis=1)
@@ -115,7 +115,7 @@ class ModelWords(TextEncoder):
 
 
 class TextNetwork:
-    """A package's text network with its tokenizer. Raises ModelError for files that do not fit."""
+    """A package's text network with its tokenizer. Raises ModelError for unusable files."""
 
     def __init__(self, package: model_packages.Package):
         try:
@@ -131,11 +131,11 @@ class TextNetwork:
         self._session = package.session("text")
 
     def tokens(self, texts: list[str]) -> NDArray[np.int64]:
-        """(T, L) token numbers; the tokenizer file says how texts are cut and padded."""
+        """(T, L) token numbers; the tokenizer file defines how texts are cut and padded."""
         rows = [encoding.ids for encoding in self._tokenizer.encode_batch(texts)]
         if len({len(row) for row in rows}) > 1:
             raise ModelError(
-                f"{self._package.folder}/{self._package.parts['tokenizer']} does not pad: export it again."
+                f"{self._package.folder}/{self._package.parts['tokenizer']} does not pad texts: export it again."
             )
         return np.array(rows, np.int64)
 
@@ -148,14 +148,14 @@ class TextNetwork:
         features = np.concatenate(parts).astype(np.float32)
         if features.shape[1] != self._package.dimension or not np.isfinite(features).all():
             raise ModelError(
-                f"The text network of {self._package.folder} gives {features.shape[1]} dimensions or numbers that are "
-                f"not finite; its manifest says {self._package.dimension} dimensions."
+                f"The text network of {self._package.folder} gives {features.shape[1]} dimensions, or numbers that are "
+                f"not finite; its manifest states {self._package.dimension} dimensions."
             )
         return features
 
 
 def _read_cache(path: Path, dimension: int) -> dict[str, NDArray[np.float32]]:
-    """Embeddings by word; a file that cannot be used counts as none."""
+    """Embeddings by word; empty if the file is unusable."""
     try:
         arrays = read_arrays(path, {"words": ("U", 1), "features": ("f", 2)})
     except MapError:
@@ -168,7 +168,7 @@ def _read_cache(path: Path, dimension: int) -> dict[str, NDArray[np.float32]]:
 
 
 def _write_cache(path: Path, known: dict[str, NDArray[np.float32]]) -> None:
-    """Keep embeddings for later processes; where that is not possible, they are computed again."""
+    """Saves embeddings for later processes; if that fails, they compute the embeddings again."""
     kept = [word for word in list(known)[-_KEPT:] if len(word) <= _LONGEST]
     arrays = {"words": np.array(kept, dtype=str), "features": np.array([known[word] for word in kept])}
     with contextlib.suppress(OSError):

@@ -1,13 +1,13 @@
-"""Which Gaussians an image shows, at which pixels, and how well.
+"""Finds the Gaussians that an image shows, their pixels, and how well they are visible.
 
-A Gaussian is seen where the depth image has a surface at its depth, |d_t(u) - z| <= tolerance. Where nothing was
-measured (dark and shiny things, depth edges, beyond the sensor's range) the Gaussians' own rendered depth decides: what
-is not behind the nearest of them is seen. A depth that was measured is never overruled by a rendered one: that is as
-thick as the Gaussians are, and on surfaces at a slant hides what lies on them.
+A Gaussian is visible where the depth map has a surface at its depth, |d_t(u) - z| <= tolerance. Where no depth was
+measured (dark and shiny things, depth edges, beyond the sensor's range), the rendered depth of the Gaussians is used:
+everything not behind the nearest of them is visible. A rendered depth never replaces a measured one, because it is as
+thick as the Gaussians, and on slanted surfaces hides what lies on them.
 
-What is seen weighs w = cos(theta) b / z^2: a near and frontal view has more pixels on the surface. theta is the angle
-between the viewing ray and the normal that the depth image has there, and b <= 1 grows from the image's edge inwards,
-where encoders see things cut off.
+The weight of a visible Gaussian is w = cos(theta) b / z^2: a near and frontal view has more pixels on the surface.
+theta is the angle between the viewing ray and the normal of the depth map, and b <= 1 increases inward from the image's
+edge, where encoders see things cut off.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from ..core.types import Frame, Gaussians
 from ..settings.stages import LanguageOptions
 
 _MIN_COSINE = np.float32(0.05)
-"""Of a view along the surface, and of one next to a depth edge, where pixels mix both sides."""
+"""Smallest cosine: for a view along the surface, and for one next to a depth edge, where pixels mix both sides."""
 _EDGE = np.float32(0.25)
 """b at the edge of the image."""
 _RENDERED_PIXELS = 4
 """Edge in pixels of the blocks of the rendered depth."""
 _NEAR = np.float32(0.05)
-"""Metres, from where Gaussians are rendered."""
+"""Meters; nearer Gaussians are not rendered."""
 _WIDEST = 16
-"""Blocks, to either side, that one Gaussian covers at most."""
+"""Largest number of blocks, to each side, that one Gaussian covers."""
 
 
 @dataclass(frozen=True)
 class VisibleGaussians:
     """The M Gaussians that a frame shows.
 
-    rows: (M,) int32, ascending.  pixels: (M,) int32, row * width + column of each one's pixel.
-    weights: (M,) float32, how well it is seen.  shape: (height, width) of the frame.
+    rows: (M,) int32, ascending.  pixels: (M,) int32, row * width + column of the pixel of each Gaussian.
+    weights: (M,) float32, how well each is visible.  shape: (height, width) of the frame.
     """
 
     rows: NDArray[np.int32]
@@ -58,7 +58,7 @@ class VisibleGaussians:
 def find_visible(
     gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: LanguageOptions
 ) -> VisibleGaussians:
-    """What a frame shows of N Gaussians."""
+    """Finds which of N Gaussians a frame shows."""
     camera, depth_m = frame.intrinsics, frame.depth_m
     pinhole = np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32)
     T = invert(T_world_cam).astype(np.float32)
@@ -76,7 +76,7 @@ def find_visible(
 def find_visible_reference(
     gaussians: Gaussians, frame: Frame, T_world_cam: NDArray[np.float64], options: LanguageOptions
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(N,) pixels and (N,) weights, 0 for what is not seen: plain NumPy, all Gaussians at once."""
+    """(N,) pixels and (N,) weights, 0 for hidden Gaussians: plain NumPy, all Gaussians at once."""
     camera, depth_m = frame.intrinsics, frame.depth_m
     height, width = depth_m.shape
     T = invert(T_world_cam)
@@ -101,7 +101,7 @@ def find_visible_reference(
     facing = measured + (column - camera.cx) * dz_du + (row - camera.cy) * dz_dv
     normal_length = np.sqrt((camera.fx * dz_du) ** 2 + (camera.fy * dz_dv) ** 2 + facing**2)
     cosine = measured / np.where(normal_length > 0, normal_length * ray_length, 1.0)
-    cosine = np.maximum(cosine, float(_MIN_COSINE))  # unmeasured pixels, too
+    cosine = np.maximum(cosine, float(_MIN_COSINE))  # for unmeasured pixels, too
     margin = np.minimum(np.minimum(row, height - 1 - row), np.minimum(column, width - 1 - column)) + 0.5
     inwards = np.minimum(1.0, margin / max(options.border * min(height, width), 1e-6))
     weight = cosine * (_EDGE + (1 - _EDGE) * inwards) / np.maximum(safe, options.near) ** 2
@@ -127,8 +127,8 @@ def _rendered_reference(
 def _slope(
     depth_m: NDArray[np.float32], row: NDArray[np.int64], column: NDArray[np.int64], axis: int
 ) -> NDArray[np.float64]:
-    """Depth per pixel along an image axis, at some pixels: over two pixels where both neighbours are measured, over
-    one where one is, else 0."""
+    """Change of depth per pixel along an image axis, at some pixels: over two pixels if both neighbors have a depth,
+    over one pixel if one has, else 0."""
     padded = np.pad(depth_m.astype(np.float64), 1)
     down, right = (1, 0) if axis == 0 else (0, 1)
     here = padded[row + 1, column + 1]
@@ -146,8 +146,8 @@ def _rendered(
     camera: NDArray[np.float32],
     shape: tuple[int, int],
 ) -> NDArray[np.float32]:
-    """Depth in blocks of pixels, of the nearest Gaussian that reaches each within a standard deviation; infinite where
-    none does."""
+    """Depth, in blocks of pixels, of the nearest Gaussian that reaches each block within a standard deviation; infinite
+    if none does."""
     height, width = -(-shape[0] // _RENDERED_PIXELS), -(-shape[1] // _RENDERED_PIXELS)
     nearest = np.full((height, width), np.float32(np.inf), np.float32)
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]

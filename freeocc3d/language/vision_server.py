@@ -1,6 +1,7 @@
-"""Asks a vision-language model behind an OpenAI-compatible endpoint: vLLM, Ollama, llama.cpp, or a hosted one.
+"""Queries a vision-language model with an OpenAI-compatible endpoint: vLLM, Ollama, llama.cpp, or a hosted one.
 
-One call, POST …/chat/completions, with a picture as a data URL; what may go wrong on the way is told in one sentence.
+A query is one call, POST …/chat/completions, with a picture as a data URL. Each failure gives a message of one
+sentence.
 Standard library only. Source: the chat completions API, https://platform.openai.com/docs/api-reference/chat.
 """
 
@@ -19,18 +20,19 @@ from urllib.parse import urlsplit
 
 from ..core.errors import ConfigError, FreeOccError
 
-_MOST_BYTES = 1 << 20  # of an answer
+_MOST_BYTES = 1 << 20  # largest answer
 _MOST_TOKENS = 1024
 _LONGEST_PAUSE_S = 30.0
 _AGAIN = {408, 409, 425, 429, 500, 502, 503, 504}
-"""Statuses after which the same question may be answered later."""
+"""Status codes after which the same question may succeed later."""
 _FOREVER = {301, 302, 303, 307, 308, 401, 403, 404, 405}
-"""Statuses that any other question would have, too."""
+"""Status codes that every other question would get, too."""
 _LOCAL = {"localhost", "127.0.0.1", "::1"}
 
 
 class ServerError(FreeOccError):
-    """An endpoint did not answer; the message is one sentence. final: whether it will not answer other questions."""
+    """An endpoint did not answer; the message is one sentence. final: whether other questions will get no answer
+    either."""
 
     def __init__(self, text: str, final: bool):
         super().__init__(text)
@@ -39,8 +41,8 @@ class ServerError(FreeOccError):
 
 @dataclass(frozen=True)
 class VisionServer:
-    """endpoint: http or https address, with or without /v1 and /chat/completions.  key: sent as a bearer token, and
-    never part of a message.  timeout: seconds for one answer.  retries: how often a question is asked again."""
+    """endpoint: http or https address, with or without /v1 and /chat/completions.  key: sent as a bearer token, never
+    part of a message.  timeout: seconds for one answer.  retries: number of times that a question is repeated."""
 
     endpoint: str
     model: str
@@ -50,7 +52,7 @@ class VisionServer:
     sleep: Callable[[float], None] = time.sleep
 
     def ask(self, question: str, jpeg: bytes) -> str:
-        """The text of the answer, empty for a refusal. Raises ServerError."""
+        """Returns the text of the answer; empty for a refusal. Raises ServerError."""
         picture = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
         content = [{"type": "text", "text": question}, {"type": "image_url", "image_url": {"url": picture}}]
         body = {
@@ -96,8 +98,8 @@ class VisionServer:
             raise _Again(f"{url} cannot be reached: {self._cleaned(str(reason) or 'the connection broke')}") from error
 
     def _read(self, response: IO[bytes], deadline: float) -> bytes:
-        """The body, of which no more is kept than an answer may have. A server that sends a byte now and then does not
-        hold a run up: ``timeout`` is for all of it."""
+        """Reads the body, up to the size limit of an answer. ``timeout`` covers the whole body, so that a server that
+        sends single bytes cannot delay a run."""
         body = bytearray()
         while chunk := response.read1(65536):  # type: ignore[attr-defined]
             body += chunk
@@ -117,7 +119,7 @@ class VisionServer:
         except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
             said = self._cleaned(body[:80].decode(errors="replace"))
             raise ServerError(
-                f"{resolve_address(self.endpoint)} does not answer as a chat does: '{said}'", False
+                f"{resolve_address(self.endpoint)} does not answer like a chat endpoint: '{said}'", False
             ) from error
         if isinstance(content, list):  # parts, as some servers send them
             texts = [part.get("text") for part in content if isinstance(part, dict)]
@@ -130,24 +132,25 @@ class VisionServer:
 
 
 def shorten_to_line(text: str, length: int) -> str:
-    """The start of a text that came from elsewhere, fit to be shown."""
+    """The start of a text from another program, made safe to print on one line."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:length]
 
 
 def resolve_address(endpoint: str) -> str:
-    """Where chats are completed. Raises ConfigError for what is no http or https address, or holds a password."""
+    """The URL for chat completions. Raises ConfigError for other than http or https addresses, or one with a
+    password."""
     try:
         parts = urlsplit(endpoint)
         usable = parts.scheme in ("http", "https") and bool((parts.hostname or "").encode("idna"))
         _ = parts.port
-    except ValueError:  # a port or a host that cannot be one
+    except ValueError:  # an impossible port or host
         usable = False
     if not usable or not endpoint.isascii() or any(c.isspace() or not c.isprintable() for c in endpoint):
-        raise ConfigError(f"The endpoint '{endpoint}' must be an address like http://localhost:8000/v1.")
+        raise ConfigError(f"The endpoint '{endpoint}' must be an address such as http://localhost:8000/v1.")
     if parts.username or parts.password or parts.query or parts.fragment:
         raise ConfigError(
-            "The endpoint must hold neither a password nor a query, for it is written to the map: name the environment "
-            "variable that has the key with vocabulary.api_key_env."
+            "The endpoint must not contain a password or a query, because it is saved in the map. Put the key into an "
+            "environment variable, and name the variable in vocabulary.api_key_env."
         )
     path = parts.path.rstrip("/")
     if not path.endswith("/chat/completions"):
@@ -156,7 +159,7 @@ def resolve_address(endpoint: str) -> str:
 
 
 class _Again(Exception):
-    """A question that may be asked again."""
+    """The question may be asked again."""
 
     def __init__(self, text: str, pause_s: float = 0.0, final: bool = True):
         super().__init__(text)
@@ -164,14 +167,14 @@ class _Again(Exception):
 
 
 class _NoRedirects(urllib.request.HTTPRedirectHandler):
-    """A redirect would take the key to another address."""
+    """Refuses redirects, which would send the key to another address."""
 
     def redirect_request(self, *_: Any) -> None:
         return None
 
 
 def _excerpt(error: urllib.error.HTTPError) -> str:
-    """What a server says about an error: its message, or the start of its body."""
+    """A server's message about an error, or the start of its body."""
     try:
         text = error.read(4096).decode(errors="replace")
     except (OSError, http.client.HTTPException):
@@ -184,5 +187,5 @@ def _excerpt(error: urllib.error.HTTPError) -> str:
 
 
 def _seconds(text: str | None) -> float:
-    """Of a Retry-After header; dates and nonsense are 0."""
+    """Seconds in a Retry-After header; 0 for dates and invalid text."""
     return float(text) if text and text.isascii() and text.isdigit() and len(text) < 6 else 0.0

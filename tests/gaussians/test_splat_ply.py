@@ -50,7 +50,7 @@ def test_files_that_hold_no_gaussians_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FreeOccError, match="lack opacity, scale_0"):
         read_standard_ply(tmp_path / "points.ply")
     write_gaussian_ply(random_gaussians(5, seed=0), tmp_path / "own.ply")
-    with pytest.raises(FreeOccError, match="map's own file"):
+    with pytest.raises(FreeOccError, match="internal file of a map"):
         read_standard_ply(tmp_path / "own.ply")
     whole = write_standard_ply(tmp_path / "whole.ply", random_gaussians(500, seed=0)).read_bytes()
     (tmp_path / "half.ply").write_bytes(whole[: len(whole) // 2])

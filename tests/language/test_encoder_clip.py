@@ -183,8 +183,8 @@ def test_other_precisions_stay_near(folder: Path, tmp_path: Path, precision: str
         ({"short_side": 3}, "'short_side' must be from 16 to 4096"),
         ({"window": -1}, "'window' must be from 0 to 4096"),
         ({"stride": -1}, "'stride' must be at least 0"),
-        ({"templates": ("a photo",)}, "'templates' must each hold {}"),
-        ({"contrast": ("wall", " ")}, "'contrast' must not hold empty words"),
+        ({"templates": ("a photo",)}, "Each of 'templates' must contain {}"),
+        ({"contrast": ("wall", " ")}, "'contrast' must not contain empty words"),
     ],
 )
 def test_options_out_of_range_are_reported(options: dict[str, Any], message: str) -> None:
@@ -201,5 +201,5 @@ def test_a_device_that_is_not_there_is_reported(folder: Path) -> None:
 
 def test_no_model_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FREEOCC3D_MODELS", str(tmp_path))
-    with pytest.raises(ModelError, match=r"language\.clip\.model names no model"):
+    with pytest.raises(ModelError, match=r"language\.clip\.model is empty"):
         clip.load(clip.Options())

@@ -207,7 +207,7 @@ def test_state_is_plain_and_restores_the_words() -> None:
 
 @pytest.mark.parametrize("state", [{}, {"terms": ["red"]}, {"terms": list(TERMS), "colours": ["red"]}])
 def test_a_map_with_other_colors_is_refused(state: dict) -> None:
-    with pytest.raises(MapError, match="make the map again"):
+    with pytest.raises(MapError, match="reconstruct the map again"):
         load_text(state)
 
 

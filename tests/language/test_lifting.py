@@ -77,7 +77,7 @@ def test_a_broken_frame_is_left_out_with_a_warning_and_others_faults_are_reporte
     assert lift_features(WALL, frames(7, 2), poses(2), Halves(), None, told).any()
     assert told.said == ["Frame 7 is broken."]
     assert np.isfinite(lift_features(WALL, frames(9, 2), poses(2), Halves(), None, told)).all()
-    assert "not finite for frame 9" in told.said[1]
+    assert "features of frame 9 are not finite" in told.said[1]
     with pytest.raises(CaptureError):
         lift_features(WALL, frames(8), poses(1), Halves())
 

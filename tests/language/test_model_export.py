@@ -200,7 +200,7 @@ def test_sam_equals_transformers_forward_pass(tmp_path: Path) -> None:
 
 def test_what_is_no_checkpoint_is_reported(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text('{"model_type": "bert"}')
-    assert "is no checkpoint of CLIP, SigLIP, DINO" in run(tmp_path, "-o", tmp_path / "x", code=1)
+    assert "does not contain a checkpoint of CLIP, SigLIP, DINO" in run(tmp_path, "-o", tmp_path / "x", code=1)
     assert not (tmp_path / "x").exists()
 
 
@@ -214,14 +214,14 @@ def test_weights_that_are_pickled_are_not_read(tmp_path: Path) -> None:
 
 def test_a_tokenizer_that_is_lacking_is_reported(tmp_path: Path) -> None:
     tiny_models.clip().save_pretrained(tmp_path)
-    with pytest.raises(ModelError, match=r"holds neither tokenizer\.json nor vocab.json"):
+    with pytest.raises(ModelError, match=r"has neither tokenizer\.json nor vocab.json"):
         read_checkpoint(str(tmp_path), None, None, None)
 
 
 def test_open_clip_weights_that_do_not_fit_are_reported(tmp_path: Path) -> None:
     source = write_open_clip(tmp_path / "source", quick=True)
     save_file({"logit_scale": torch.zeros(())}, source / "open_clip_model.safetensors")
-    with pytest.raises(ModelError, match="is no OpenCLIP ViT in its usual form"):
+    with pytest.raises(ModelError, match="is not a usual OpenCLIP ViT"):
         read_checkpoint(str(source), None, None, None)
 
 

@@ -46,7 +46,7 @@ def test_a_wrong_hash_is_reported(tmp_path: Path) -> None:
     (folder / "text.onnx").write_bytes(content)
     package = model_packages.read_package(folder)
     for check in (lambda: model_packages.verify_files(package), lambda: package.session("text")):
-        with pytest.raises(ModelError, match=r"text\.onnx is damaged: its sha256 is .*…, the manifest says"):
+        with pytest.raises(ModelError, match=r"text\.onnx is damaged: its sha256 is .*…, but the manifest states"):
             check()
     package.session("image")
 
@@ -72,7 +72,7 @@ def test_what_is_not_onnx_is_reported(tmp_path: Path) -> None:
         (
             {"image": [1, 3, 8, 8]},
             {"features": [1, 2, 2, 16]},
-            r"gives features of 16 dimensions, the manifest says 8: image and text networks must be of one model",
+            r"gives features of 16 dimensions, but the manifest states 8: export the image and text networks from one",
         ),
     ],
 )
@@ -87,13 +87,13 @@ def test_other_inputs_and_outputs_are_reported(tmp_path: Path, inputs: Any, outp
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": 2}, "it must state format: 1"),
+        ({"format": 2}, "it must contain format: 1"),
         ({"kind": "diffusion"}, "kind 'diffusion' is not one of clip"),
         ({"dimension": "8"}, "'dimension' is missing or not a int"),
         ({"dimension": True}, "'dimension' is missing or not a int"),
         ({"dimension": 0}, "must be greater than 0"),
         ({"dimension": 1 << 40}, "must be greater than 0, and usual"),
-        ({"patch": 300}, "nor 'input_size' less than 'patch'"),
+        ({"patch": 300}, "and 'input_size' must not be less than 'patch'"),
         ({"mean": [0.5]}, "'mean' and 'std' must be three numbers"),
         ({"std": [0.5, 0.5, 0.0]}, "must be greater than 0"),
         ({"std": [0.5, 0.5, float("nan")]}, "must be finite"),
@@ -121,27 +121,27 @@ def test_no_file_lies_outside_of_its_folder(tmp_path: Path, name: str) -> None:
 def test_other_formats_are_no_part_of_a_package(tmp_path: Path, name: str) -> None:
     parts = {"image": "image.onnx", "text": name, "tokenizer": "tokenizer.json"}
     folder = dense_package(tmp_path / "tiny", parts=parts, files=dict.fromkeys(parts.values(), "0" * 64))
-    with pytest.raises(ModelError, match=r"is not a file of \.onnx, \.safetensors"):
+    with pytest.raises(ModelError, match=r"does not end with \.onnx, \.safetensors"):
         model_packages.read_package(folder)
 
 
 def test_manifests_run_nothing(tmp_path: Path) -> None:
     folder = dense_package(tmp_path / "tiny")
     (folder / "manifest.yaml").write_text("!!python/object/apply:os.system ['true']\n")
-    with pytest.raises(ModelError, match=r"manifest\.yaml cannot be read"):
+    with pytest.raises(ModelError, match=r"Cannot read .*manifest\.yaml"):
         model_packages.read_package(folder)
     (folder / "manifest.yaml").write_text("a: " + "x" * (1 << 20))
-    with pytest.raises(ModelError, match="more than a megabyte"):
+    with pytest.raises(ModelError, match="larger than a megabyte"):
         model_packages.read_package(folder)
 
 
 def test_what_is_lacking_is_reported(tmp_path: Path, home: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ModelError, match="lacks a manifest"):
+    with pytest.raises(ModelError, match="has no manifest"):
         model_packages.read_package(tmp_path / "empty")
     folder = dense_package(tmp_path / "tiny")
     (folder / "text.onnx").unlink()
-    with pytest.raises(ModelError, match=r"lacks its text\.onnx"):
+    with pytest.raises(ModelError, match=r"lacks its file text\.onnx"):
         model_packages.read_package(folder)
 
 
@@ -170,7 +170,7 @@ def test_the_command_lists_and_verifies(home: Path, capsys: pytest.CaptureFixtur
     succeed(["models", "list", "--json"])
     listed = json.loads(capsys.readouterr().out)["models"]
     assert listed["good"]["dimension"] == 8
-    assert "lacks a manifest" in listed["strange"]["error"]
+    assert "has no manifest" in listed["strange"]["error"]
     succeed(["models", "list"])
     assert "unusable" in capsys.readouterr().out
     succeed(["models", "verify", "good"])
@@ -183,4 +183,4 @@ def test_the_command_lists_and_verifies(home: Path, capsys: pytest.CaptureFixtur
     said = capsys.readouterr()
     assert "good: 3 files match their hashes" in said.out
     assert "text.onnx is damaged" in said.err
-    assert "strange is no model package" in said.err
+    assert "strange is not a model package" in said.err

@@ -99,7 +99,9 @@ def test_answers_that_name_nothing_are_reported_and_cost_nothing_else(tmp_path: 
         found, warnings = named(namer(server.url), tmp_path)
     assert found["names"] == {"chair": {"count": 2, "keyframes": [10, 30]}}
     assert len(warnings) == 1
-    assert warnings[0].text.startswith("2 of 4 answers of a-model name nothing, the first: 'I'm sorry, [31m I can't.'")
+    assert warnings[0].text.startswith(
+        "2 of 4 answers of a-model contain no names. The first: 'I'm sorry, [31m I can't.'"
+    )
 
 
 def test_a_server_that_fails_now_and_then_costs_its_keyframes(tmp_path: Path) -> None:

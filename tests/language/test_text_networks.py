@@ -196,12 +196,12 @@ def test_the_text_side_is_found_by_its_content(package: model_packages.Package, 
     asked = {**state(package), "folder": str(tmp_path / "gone")}
     assert clip.load_text(asked).encode_words(["chair"]).features.any()
     asked["text_sha256"] = "0" * 64
-    with pytest.raises(ModelError, match=r"need the text side of the model 'tiny-clip' \(000000000000…\)"):
+    with pytest.raises(ModelError, match=r"need the text part of the model 'tiny-clip' \(000000000000…\)"):
         clip.load_text(asked).encode_words(["lamp"])
 
 
 def test_a_text_side_of_another_dimension_is_reported(package: model_packages.Package, home: Path) -> None:
-    with pytest.raises(ModelError, match="has 24 dimensions, the map's features 32"):
+    with pytest.raises(ModelError, match="has 24 dimensions, but the map's features have 32"):
         clip.load_text({**state(package), "dimension": 32}).encode_words(["chair"])
 
 

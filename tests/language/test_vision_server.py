@@ -208,7 +208,7 @@ def test_an_endless_answer_is_not_read_to_its_end() -> None:
     ],
 )  # fmt: skip
 def test_answers_that_are_none_are_reported(body: bytes) -> None:
-    failing(lambda handler, _: send(handler, body), "does not answer as a chat does", False)
+    failing(lambda handler, _: send(handler, body), "does not answer like a chat endpoint", False)
 
 
 @pytest.mark.parametrize(

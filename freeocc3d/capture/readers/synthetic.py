@@ -1,4 +1,4 @@
-"""Renders the built-in room, with exact poses, class images and ground truth of occupancy. Needs no download."""
+"""Renders the built-in room, with exact poses, class images and occupancy ground truth. Needs no download."""
 
 from __future__ import annotations
 

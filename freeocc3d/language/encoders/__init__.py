@@ -1,1 +1,1 @@
-"""Image and text encoders, one file each; base.py is their contract."""
+"""Image and text encoders, one file each; ``base`` is their contract."""

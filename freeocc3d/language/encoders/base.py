@@ -1,10 +1,11 @@
-"""The contract of an encoder: images to dense features, words to unit features in the same space.
+"""The contract of an encoder: it turns images into dense features, and words into unit features in the same space.
 
-An encoder is one file of this folder with ``load(options, capture) -> Encoder`` for building a map, and
-``load_text(state) -> TextEncoder`` for asking one; one that asks nothing of the capture says ``NEEDS_CAPTURE = False``;
-one that needs files of its own, such as networks, has ``check(options)``, which raises ModelError where they are not.
-The second half must import fast (numpy only where it can): it runs in ``tools/query.py``, where neither the capture nor
-the images are at hand.
+An encoder is one file of this folder with ``load(options, capture) -> Encoder`` to build a map, and ``load_text(state)
+-> TextEncoder`` to query it. An encoder that needs nothing from the capture sets ``NEEDS_CAPTURE = False``. An encoder
+that needs files of its own, such as networks, has ``check(options)``, which raises ModelError if they are missing.
+
+The text part must import fast (numpy only where possible): ``tools/query.py`` runs it without the capture or the
+images.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from ...core.types import Frame
 class TextFeatures:
     """Words in the encoder's space.
 
-    features: (W, D) float32 unit rows; a zero row for a word that the encoder cannot express at all.
-    understood: for each word the part that was used ("white" of "white sofa"), empty if none was.
-    attainable: (W,) float32 in 0…1, the cosine that a thing which fits the word perfectly reaches; None stands for 1.
-        It is less for a word that covers several kinds: of "table" over coffee, dining and side tables, each an axis of
-        its own, a coffee table reaches 1/√3. A query divides by it, so that general and special words compare.
+    features: (W, D) float32 unit rows; zero for a word that the encoder cannot express.
+    understood: the part of each word that was used ("white" of "white sofa"); empty if no part was.
+    attainable: (W,) float32 in 0…1, the cosine of a thing that fits the word perfectly; None means 1. It is less than 1
+        for a word that covers several kinds. If "table" covers coffee, dining and side tables, each an axis of its own,
+        a coffee table reaches 1/√3. A query divides by it, so that general and specific words are comparable.
     """
 
     features: NDArray[np.float32]
@@ -36,33 +37,34 @@ class TextFeatures:
 
 
 class TextEncoder(ABC):
-    """The word side of an encoder, restored from what the map saved."""
+    """The text part of an encoder, restored from the state that the map saved."""
 
     threshold: float
-    """Score (cosine over the attainable cosine) from which a voxel matches a word that beats the contrast words."""
+    """A voxel matches a word that beats the contrast words if its score (cosine / attainable cosine) is at least
+    this."""
     temperature: float
-    """Softmax temperature that turns scores into a confidence against the contrast words."""
+    """Softmax temperature that turns scores into a confidence relative to the contrast words."""
     same_word: float = 0.9
-    """A contrast word whose text feature has at least this cosine to the asked word's says the same, or a part of it:
-    it does not compete."""
+    """A contrast word does not compete if its text feature has at least this cosine to that of the query word: it means
+    the same, or a part of it."""
     open_vocabulary: bool = False
-    """Whether any word has a meaning of its own: what a model names in a scene then competes with what is asked for,
-    and pictures by class show it."""
+    """Whether every word has its own meaning. If so, the names that a model found in the scene compete with the query,
+    and pictures by class use them."""
     knows: str = "words like those that it was trained on"
-    """What can be asked, in words, for the note about a word that is not understood."""
+    """Describes the possible queries, for the note about a word that is not understood."""
 
     @abstractmethod
     def encode_words(self, words: list[str]) -> TextFeatures:
-        """Words or phrases, any case, to unit features."""
+        """Unit features of words or phrases, in upper or lower case."""
 
     @abstractmethod
     def contrast_words(self) -> list[str]:
-        """What a voxel could be instead: a word matches only where it scores at least as high as each of these (but
-        for those that say the same, see ``same_word``)."""
+        """What else a voxel could be. A word matches only where its score is at least that of each of these words,
+        except those that mean the same (see ``same_word``)."""
 
 
 class Encoder(ABC):
-    """The image side of an encoder."""
+    """The image part of an encoder."""
 
     name: ClassVar[str]
     dimension: int
@@ -70,11 +72,11 @@ class Encoder(ABC):
 
     @abstractmethod
     def encode(self, frame: Frame) -> NDArray[np.float16]:
-        """(h, w, D) float16 features that cover the frame's image evenly (h, w may be smaller than H, W). Of each the
-        direction is what the encoder says, and the length how sure of it the encoder is: 1 for one that does not say,
-        0 where it has nothing to say. It is the weight of that feature when views are fused."""
+        """(h, w, D) float16 features that cover the frame's image evenly (h, w may be smaller than H, W). The direction
+        of a feature is its meaning. Its length is the encoder's confidence, and its weight when views are fused: 1 for
+        an encoder that gives no confidence, 0 where the encoder has no result."""
 
     @abstractmethod
     def text_state(self) -> dict[str, Any]:
-        """What ``load_text`` needs to restore the word side: numbers, strings, lists and dicts only (it is saved as
-        YAML in the map's manifest)."""
+        """The state that ``load_text`` needs to restore the text part: numbers, strings, lists and dicts only (the
+        map's manifest saves it as YAML)."""

@@ -1,4 +1,4 @@
-"""Any CLIP or SigLIP ViT as a model package: dense features by another attention in the last block, any words."""
+"""Any CLIP or SigLIP ViT as a model package: dense features by a changed last attention; understands any words."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ Attention = Literal["plain", "maskclip", "sclip", "clearclip", "naclip"]
 
 
 class Options(PatchOptions, frozen=True):
-    """Which model, and how its patches become features of pixels."""
+    """The model, and how its patches become features of pixels."""
 
     model: str = ""
-    """Folder of a model package of kind "clip", or its name in the models folder (freeocc3d models list)."""
+    """Folder of a model package of kind "clip", or its name in the models folder (see freeocc3d models list)."""
     attention: Advanced[Attention] = "naclip"
-    """Attention of the last block; naclip is the best by the papers' tables."""
+    """Attention of the last block; "naclip" has the best results in the papers."""
     threshold: Cosine = 0.15
-    """Least cosine of a match; those of CLIP's images and words lie between 0.1 and 0.35, SigLIP's from 0 to 0.2."""
+    """Smallest cosine of a match. Cosines of images and words are usually 0.1 to 0.35 with CLIP, 0 to 0.2 with
+    SigLIP."""
 
 
 class ClipEncoder(Encoder):
-    """Patch features in the space of words, spliced from windows, upsampled along the image's edges."""
+    """Patch features in the space of words, joined from windows and upsampled along the image's edges."""
 
     name: ClassVar[str] = "clip"
 
@@ -45,7 +46,7 @@ class ClipEncoder(Encoder):
         self._image, self._head = (package.session(part, options.device) for part in ("image", "head"))
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
-        """(ceil(H / stride), ceil(W / stride), D) float16, or (rows, columns, D) of patches."""
+        """(ceil(H / stride), ceil(W / stride), D) float16; (rows, columns, D) of patches if stride is 0."""
         from ..patch_features import finish_patches
 
         return finish_patches(self.patches(frame.color), frame.color, self.options.stride)
@@ -70,8 +71,8 @@ class ClipEncoder(Encoder):
         return np.asarray(features[:, -h * w :].reshape(len(images), h, w, -1))
 
     def pooled(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(B, D) the network's own embeddings of (B, 3, H, W) normalised images, by which a test compares a package
-        with its checkpoint; H and W multiples of the patch."""
+        """(B, D) the network's own embeddings of (B, 3, H, W) normalized images; H and W are multiples of the patch. A
+        test compares a package with its checkpoint by them."""
         from .. import clip_attention
 
         q, k, v, stream = self._image.run(["queries", "keys", "values", "stream"], {"image": images})
@@ -84,19 +85,19 @@ class ClipEncoder(Encoder):
 
 
 NEEDS_CAPTURE = False
-"""The keyframes alone are enough to encode them again."""
+"""Encoding keyframes again needs only the keyframes."""
 
 
 def check(options: Options) -> model_packages.Package:
-    """The model that is named. Raises ModelError if it is not there."""
+    """Finds the model that the options name. Raises ModelError if it does not exist."""
     return model_packages.find_model(options.model, ("clip",), "language.clip.model")
 
 
 def load(options: Options, capture: object = None) -> ClipEncoder:
-    """The encoder; it needs nothing of the capture. Raises ModelError."""
+    """Makes the encoder; it needs nothing from the capture. Raises ModelError."""
     return ClipEncoder(check(options), options)
 
 
 def load_text(state: dict[str, Any]) -> ModelWords:
-    """The word side; the text network is looked for when a word is encoded."""
+    """Restores the text part; it looks for the text network when it first encodes a word."""
     return ModelWords(state)

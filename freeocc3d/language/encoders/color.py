@@ -1,17 +1,17 @@
-"""Color names, no network: "red", "dark blue" and "white sofa" (as white) have a meaning.
+"""Color names, without a network: "red", "dark blue" and "white sofa" (as white) have a meaning.
 
-A pixel belongs softly to named colors: its membership in color c is m_c = exp(-d_c^2 / 2 sigma^2), normalised to sum
-1, where d_c is the CIE94 difference to the nearest of c's centroids, with lightness at half weight because shading
-changes it within an object. Colors gather in basic terms ("dark blue" is blue), mu = M m, and the feature is
+A pixel belongs partly to several named colors. Its membership in color c is m_c = exp(-d_c^2 / 2 sigma^2), normalized
+to sum 1. d_c is the CIE94 difference to the nearest of c's centroids; lightness has half weight because shading changes
+it within an object. Colors are grouped into basic terms ("dark blue" is blue), mu = M m, and the feature is
 
     f = (sqrt(mu / 2), sqrt(m / 2)),   of unit length because mu and m each sum to 1.
 
-A term's text feature is its axis in the first half; that of another name, with its distribution q over the colors, is
-(sqrt(M q / 5), sqrt(4 q / 5)), so that "dark blue" is a little like any blue. Each half of a cosine is a Bhattacharyya
-coefficient.
+The text feature of a term is its axis in the first half. The text feature of another name, with the distribution q over
+the colors, is (sqrt(M q / 5), sqrt(4 q / 5)), so that "dark blue" is somewhat similar to every blue. Each half of a
+cosine is a Bhattacharyya coefficient.
 
 Source: the names are the eleven basic terms of B. Berlin and P. Kay (Basic Color Terms, 1969) with light and dark
-variants and a few more that people say of rooms; the centroids are our own choice in CIELAB; nothing is trained.
+variants, and a few more that people use for rooms. The centroids are our own choice in CIELAB. Nothing is trained.
 CIE94: CIE publication 116-1995.
 """
 
@@ -82,7 +82,7 @@ TERMS: dict[str, Meaning] = {
     "brown": {"brown": 1.0, "light brown": 0.9, "dark brown": 1.0, "olive": 0.2},
     "beige": {"beige": 1.0, "light brown": 0.1},
 }
-"""Basic terms, and the share of each color that they have: the matrix M."""
+"""Basic terms, and the share of each color in them: the matrix M."""
 
 _GOLD = {"yellow": 0.6, "light brown": 0.4}
 
@@ -118,7 +118,7 @@ NAMES: dict[str, Meaning] = {
     "teal": {"turquoise": 0.8, "dark green": 0.2},
     "violet": {"purple": 0.8, "light purple": 0.2},
 }
-"""What other color names mean."""
+"""The meaning of other color names."""
 
 _DARK: dict[str, Meaning] = {
     "red": {"dark red": 0.9, "red": 0.1},
@@ -156,14 +156,14 @@ _BRIGHT: dict[str, Meaning] = {
     "white": {"white": 1.0},
 }
 MODIFIERS = {"dark": _DARK, "deep": _DARK, "light": _LIGHT, "pale": _LIGHT, "bright": _BRIGHT, "vivid": _BRIGHT}
-"""What a color name means after a modifier; one that is not listed under it keeps its own meaning."""
+"""The meaning of a color name after a modifier; a name that is not listed keeps its own meaning."""
 
 _SPELLINGS = {"gray": "grey"}
 
-_SIGMA = 3.5  # of a membership, in units of CIE94
+_SIGMA = 3.5  # of a membership, in CIE94 units
 _LIGHTNESS_WEIGHT = 0.5
-_TERM_SHARE = 0.2  # of the squared text feature of a shade, for the term that it is a shade of
-_TABLE_BITS = 5  # of each channel that the look-up table tells apart
+_TERM_SHARE = 0.2  # of the squared text feature of a shade, for its basic term
+_TABLE_BITS = 5  # resolution of the look-up table per channel
 
 
 Channel = Annotated[float, Meta(ge=16, le=255)]
@@ -175,8 +175,8 @@ class Options(TypedOptions, frozen=True):
     stride: PositiveInt = 4
     """Edge in pixels of the blocks whose memberships are averaged into one feature."""
     white: tuple[Channel, Channel, Channel] | None = None
-    """RGB (16 to 255) that something white has in this capture, for scans under colored or dim light; null = colors
-    are taken as they are."""
+    """RGB (16 to 255) of a white thing in this capture, for scans in colored or dim light; null = colors are not
+    corrected."""
 
 
 class ColorEncoder(Encoder):
@@ -199,7 +199,7 @@ class ColorEncoder(Encoder):
         bottom, right = height * stride - rgb.shape[0], width * stride - rgb.shape[1]
         if bottom or right:
             rgb = cv2.copyMakeBorder(rgb, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
-        samples = max(1, stride // 2)  # a side: pixels are averaged in pairs first, for less noise and less work
+        samples = max(1, stride // 2)  # per side: averaging pixels in pairs first reduces noise and work
         rgb = cv2.resize(rgb, (width * samples, height * samples), interpolation=cv2.INTER_AREA)
         entry = self._bins[0][rgb[..., 0]] + self._bins[1][rgb[..., 1]] + self._bins[2][rgb[..., 2]]
         total = np.zeros((height, width, self.dimension), np.float32)
@@ -213,12 +213,12 @@ class ColorEncoder(Encoder):
 
 
 class ColorWords(TextEncoder):
-    """Color names, with modifiers, in any phrase; its other words are passed over."""
+    """Color names, with modifiers, in any phrase; other words of the phrase are ignored."""
 
     threshold = 0.6
     temperature = 0.1
     same_word = 0.3
-    knows = "color names (it needs no image network, and has none)"
+    knows = "color names (its encoder uses no network)"
 
     def __init__(self) -> None:
         self._pure = np.sqrt(features_squared(np.eye(len(CENTROIDS))))
@@ -232,7 +232,7 @@ class ColorWords(TextEncoder):
             understood.append(", ".join(meanings))
             if meanings:
                 features[row] = np.sqrt(np.mean([_text_squared(m) for m in meanings.values()], axis=0))
-                attainable[row] = (self._pure @ features[row]).max()  # by a thing that is wholly of one color
+                attainable[row] = (self._pure @ features[row]).max()  # reached by a thing of a single color
         return TextFeatures(features, tuple(understood), attainable)
 
     def contrast_words(self) -> list[str]:
@@ -240,25 +240,25 @@ class ColorWords(TextEncoder):
 
 
 NEEDS_CAPTURE = False
-"""Whether ``load`` asks the capture for anything: a map's keyframes alone are enough to encode them again."""
+"""Whether ``load`` needs the capture; encoding keyframes again needs only the keyframes."""
 
 
 def load(options: Options, capture: Capture | None) -> ColorEncoder:
-    """The encoder; it needs nothing of the capture."""
+    """Makes the encoder; it needs nothing from the capture."""
     return ColorEncoder(options)
 
 
 def load_text(state: dict[str, Any]) -> ColorWords:
-    """The word side. Raises MapError for a map whose colors are not those that words are defined by."""
-    colors = state.get("colors", state.get("colours"))  # the older spelling stands in earlier maps
+    """Restores the text part. Raises MapError if the map's colors are not those that define the words."""
+    colors = state.get("colors", state.get("colours"))  # earlier maps have the other spelling
     if state.get("terms") != list(TERMS) or colors != list(CENTROIDS):
-        raise MapError("The map's color features are of another version of freeocc3d: make the map again.")
+        raise MapError("The map's color features are from another version of freeocc3d: reconstruct the map again.")
     return ColorWords()
 
 
 def parse_colors(phrase: str) -> dict[str, Meaning | str]:
-    """The colors that a phrase names: "a dark-blue sofa" gives "dark blue". Each with its meaning, or with the basic
-    term that it is."""
+    """The colors in a phrase: "a dark-blue sofa" gives "dark blue". The value is the color's meaning, or its basic
+    term."""
     meanings: dict[str, Meaning | str] = {}
     modifier = ""
     for token in re.findall(r"[a-z]+", phrase.lower()):
@@ -273,7 +273,7 @@ def parse_colors(phrase: str) -> dict[str, Meaning | str]:
 
 
 def base_color(token: str) -> str:
-    """The color name of which a lower-case token is a form ("reddish", "greys", "redcolored"), or an empty string."""
+    """The color name that a lower-case token is a form of ("reddish", "greys", "redcolored"), or an empty string."""
     for ending in ("", "s", "coloured", "colored"):
         if _is_color(token.removesuffix(ending)):
             return token.removesuffix(ending)
@@ -338,15 +338,15 @@ def _squared_cie94(lab: NDArray[np.float64], centroid: tuple[float, float, float
 
 
 def _table() -> NDArray[np.float32]:
-    """(32768, D) squared features of the centres of 32 x 32 x 32 bins of sRGB, red slowest."""
-    centres = (np.arange(1 << _TABLE_BITS) + 0.5) * (256 >> _TABLE_BITS) - 0.5
-    rgb = np.stack(np.meshgrid(centres, centres, centres, indexing="ij"), axis=-1)
+    """(32768, D) squared features of the centers of 32 x 32 x 32 bins of sRGB, red slowest."""
+    centers = (np.arange(1 << _TABLE_BITS) + 0.5) * (256 >> _TABLE_BITS) - 0.5
+    rgb = np.stack(np.meshgrid(centers, centers, centers, indexing="ij"), axis=-1)
     return features_squared(memberships(rgb.reshape(-1, 3))).astype(np.float32)
 
 
 def _channel_bins(white: tuple[float, float, float] | None) -> NDArray[np.int32]:
-    """(3, 256) share of each channel's values in the row of the look-up table. Linear light is divided by that of
-    ``white`` on the way: von Kries adaptation at no cost."""
+    """(3, 256) the part of each channel value in the row index of the look-up table. Linear light is divided by that of
+    ``white``: a von Kries adaptation at no cost."""
     gain = 1.0 / _linear(np.asarray(white or (255.0, 255.0, 255.0)) / 255.0)
     linear = np.minimum(_linear(np.arange(256) / 255.0) * gain[:, None], 1.0)
     srgb = np.where(linear > 0.0031308, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055, 12.92 * linear)

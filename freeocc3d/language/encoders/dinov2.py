@@ -20,16 +20,16 @@ REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
 
 
 class Options(PatchOptions, frozen=True):
-    """Which model, and how its patches become features of pixels."""
+    """The model, and how its patches become features of pixels."""
 
     model: str = ""
-    """Folder of a model package of kind "dense", or its name in the models folder (freeocc3d models list)."""
+    """Folder of a model package of kind "dense", or its name in the models folder (see freeocc3d models list)."""
     short_side: ImageSide = 448
     window: WindowSide | None = 0
 
 
 class Dinov2Encoder(Encoder):
-    """Patch features that are in the space of words already, spliced from windows and upsampled."""
+    """Patch features that are already in the space of words, joined from windows and upsampled."""
 
     name: ClassVar[str] = "dinov2"
 
@@ -40,7 +40,7 @@ class Dinov2Encoder(Encoder):
         self._image = package.session("image", options.device)
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
-        """(ceil(H / stride), ceil(W / stride), D) float16, or (rows, columns, D) of patches."""
+        """(ceil(H / stride), ceil(W / stride), D) float16; (rows, columns, D) of patches if stride is 0."""
         from ..patch_features import encode_windows, finish_patches
 
         options, rgb = self.options, frame.color
@@ -56,19 +56,19 @@ class Dinov2Encoder(Encoder):
 
 
 NEEDS_CAPTURE = False
-"""The keyframes alone are enough to encode them again."""
+"""Encoding keyframes again needs only the keyframes."""
 
 
 def check(options: Options) -> model_packages.Package:
-    """The model that is named. Raises ModelError if it is not there."""
+    """Finds the model that the options name. Raises ModelError if it does not exist."""
     return model_packages.find_model(options.model, ("dense",), "language.dinov2.model")
 
 
 def load(options: Options, capture: object = None) -> Dinov2Encoder:
-    """The encoder; it needs nothing of the capture. Raises ModelError."""
+    """Makes the encoder; it needs nothing from the capture. Raises ModelError."""
     return Dinov2Encoder(check(options), options)
 
 
 def load_text(state: dict[str, Any]) -> ModelWords:
-    """The word side; the text network is looked for when a word is encoded."""
+    """Restores the text part; it looks for the text network when it first encodes a word."""
     return ModelWords(state)

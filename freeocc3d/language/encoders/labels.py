@@ -1,4 +1,4 @@
-"""Class images that the capture brings, or that another program made; words match class names and synonyms."""
+"""Class images from the capture or from another program; words match class names and their synonyms."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from .base import Encoder, TextEncoder, TextFeatures
 REQUIRES: tuple[str, ...] = ()
 
 _VOID = 255
-"""A value that means nothing in many class images, whether or not there are 255 classes."""
+"""A value that means nothing in many class images, even if there are fewer than 255 classes."""
 _ASPECT_TOLERANCE = 0.02
 
 
 class Options(TypedOptions, frozen=True):
-    """Where the class images are, if the capture brings none."""
+    """The class images, if the capture has none."""
 
     folder: str | None = None
-    """Folder of class images, PNG with one channel. Where there is one for each frame, they are taken in order; else
-    the last number in a file's name is the frame's, counted from 0. null = the capture's own."""
+    """Folder of class images, PNG with one channel. If their number equals that of the frames, they are used in order.
+    Otherwise the last number in a file's name is the frame's index, from 0. null = use the capture's own."""
     classes: str | None = None
-    """File with the class names: JSON {"classes": [...]} or one name a line; the first (value 0) means nothing. null =
-    classes.json or classes.txt in the folder, or the capture's own."""
+    """File with the class names: JSON {"classes": [...]} or one name per line. The first (value 0) means nothing. null
+    = classes.json or classes.txt in the folder, or the capture's own."""
     stride: PositiveInt = 2
-    """Every n-th pixel of a class image is used."""
+    """Use every n-th pixel of a class image."""
 
 
 class LabelsEncoder(Encoder):
-    """The feature of class k is the k-th unit vector, that of value 0 (nothing) is zero: the mean over views is the
+    """The feature of class k is the k-th unit vector; that of value 0 (nothing) is zero. The mean over views is the
     share of the views that saw the class, and the cosine with a class is high where they agree."""
 
     name: ClassVar[str] = "labels"
@@ -58,7 +58,7 @@ class LabelsEncoder(Encoder):
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16; one zero feature for a frame without a class image.
 
-        A class image of another size is sampled at the pixels that show the same. Raises CaptureError for one of
+        A class image of another size is sampled at the corresponding pixels. Raises CaptureError for an image with
         another aspect ratio, or with a value that has no name.
         """
         labels = self.images(frame.index)
@@ -68,7 +68,7 @@ class LabelsEncoder(Encoder):
         if abs(labels.shape[1] * height / (labels.shape[0] * width) - 1) > _ASPECT_TOLERANCE:
             raise CaptureError(
                 f"The class image of frame {frame.index} has {labels.shape[1]} x {labels.shape[0]} pixels, the frame "
-                f"{width} x {height}: they cannot show the same view, so make it from the frame's own colour image."
+                f"{width} x {height}. Their views differ: make the class image from the frame's own color image."
             )
         rows, columns = (
             _sampled(size, self.stride, own) for size, own in zip((height, width), labels.shape, strict=True)
@@ -78,7 +78,7 @@ class LabelsEncoder(Encoder):
         if sampled.max(initial=0) > self.dimension:
             raise CaptureError(
                 f"The class image of frame {frame.index} has value {sampled.max()}, but only {len(self.classes)} "
-                "classes have names: complete the list of classes."
+                "classes have names: add the missing names to the list of classes."
             )
         return self._features[sampled]
 
@@ -96,7 +96,7 @@ class LabelWords(TextEncoder):
     def __init__(self, classes: list[str]):
         self.classes = classes
         shown = ", ".join(classes[1:13]) + (", …" if len(classes) > 13 else "")
-        self.knows = f"the classes that it was built with and words for them ({shown})"
+        self.knows = f"the names of its classes and their synonyms ({shown})"
 
     def encode_words(self, words: list[str]) -> TextFeatures:
         features = np.zeros((len(words), len(self.classes) - 1), np.float32)
@@ -111,7 +111,7 @@ class LabelWords(TextEncoder):
         return TextFeatures(features, tuple(understood), attainable)
 
     def matching(self, word: str) -> tuple[list[int], str]:
-        """Dimensions of the classes that a phrase means, and the part of it that was used."""
+        """The dimensions of the classes that a phrase means, and the part of the phrase that was used."""
         return synonyms.match_names(word, self.classes[1:])
 
     def contrast_words(self) -> list[str]:
@@ -119,12 +119,12 @@ class LabelWords(TextEncoder):
 
 
 def load(options: Options, capture: Capture) -> LabelsEncoder:
-    """The encoder. Raises CaptureError if there are no class images or no names for them."""
+    """Makes the encoder. Raises CaptureError if there are no class images, or no names for them."""
     if options.folder is None:
         classes = read_class_names(Path(options.classes)) if options.classes else capture.classes
         if len(classes) < 2 or all(capture.labels(index) is None for index in range(min(len(capture), 10))):
             raise CaptureError(
-                f"{capture.path} brings no class images with names: give them with language.labels.folder and "
+                f"{capture.path} has no class images with names. Give them with language.labels.folder and "
                 "language.labels.classes, or use another encoder, for example language.encoder=color."
             )
         return LabelsEncoder(tuple(classes), capture.labels, options.stride)
@@ -133,19 +133,20 @@ def load(options: Options, capture: Capture) -> LabelsEncoder:
     named = Path(options.classes) if options.classes else beside
     if named is None:
         raise CaptureError(
-            f"There is no classes.json or classes.txt in {folder}: add one, or give language.labels.classes, a file "
-            "with the classes' names."
+            f"The folder {folder} has no classes.json or classes.txt: add one, or set language.labels.classes to a "
+            "file with the class names."
         )
     return LabelsEncoder(read_class_names(named), _FolderImages(folder, len(capture)), options.stride)
 
 
 def load_text(state: dict[str, Any]) -> LabelWords:
-    """The word side."""
+    """Restores the text part."""
     return LabelWords([str(name) for name in state["classes"]])
 
 
 def _sampled(size: int, stride: int, own_size: int) -> NDArray[np.int64]:
-    """Pixels along an axis of a class image of ``own_size`` at the centres of blocks of ``stride`` of ``size``."""
+    """Pixels along an axis of a class image of ``own_size``, at the centers of blocks of ``stride`` pixels of
+    ``size``."""
     count = -(-size // stride)
     return np.minimum(((np.arange(count) + 0.5) * own_size / count).astype(np.int64), own_size - 1)
 
@@ -156,7 +157,7 @@ class _FolderImages:
     def __init__(self, folder: Path, frames: int):
         paths = [path for path in folder.glob("*.png") if re.search(r"\d", path.stem)] if folder.is_dir() else []
         if not paths:
-            raise CaptureError(f"There are no class images (*.png with the frame's number in the name) in {folder}.")
+            raise CaptureError(f"The folder {folder} has no class images: *.png with the frame's number in the name.")
         numbered = {int(re.findall(r"\d+", path.stem)[-1]): path for path in sorted(paths)}
         if len(numbered) < len(paths):
             raise CaptureError(f"Several class images in {folder} have the same number: keep one for each frame.")
@@ -175,5 +176,5 @@ class _FolderImages:
             raise CaptureError(f"Cannot read the class image {path}: {error.strerror}.") from error
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
         if image is None or image.ndim != 2:
-            raise CaptureError(f"{path} is not a class image: it must be a PNG with one channel.")
+            raise CaptureError(f"{path} is not a class image: a class image is a PNG with one channel.")
         return np.asarray(image)

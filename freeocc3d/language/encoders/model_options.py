@@ -1,4 +1,4 @@
-"""The options that encoders with model packages share."""
+"""Options that the encoders with model packages share."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ WindowSide = Annotated[int, Meta(ge=0, le=4096)]
 
 
 class WordOptions(TypedOptions, frozen=True):
-    """How words are asked, and where the networks run."""
+    """How words are encoded, and where the networks run."""
 
     model: str = ""
-    """Folder of a model package, or its name in the models folder (freeocc3d models list)."""
+    """Folder of a model package, or its name in the models folder (see freeocc3d models list)."""
     templates: tuple[str, ...] = ()
-    """Prompts whose mean stands for a word, which goes where they have {}; none = the built-in ones."""
+    """Prompts for a word; {} stands for the word, and the mean of the prompts is its meaning; none = the built-in
+    ones."""
     contrast: tuple[str, ...] = ()
-    """Words that a voxel could be instead: a word matches only where none of them fits better; none = what most rooms
-    hold."""
+    """What else a voxel could be: a word matches only where none of these words fits better; none = things in most
+    rooms."""
     threshold: Cosine = 0.15
-    """Least cosine of a match."""
+    """Smallest cosine of a match."""
     device: str = "cpu"
-    """Where the image network runs: "cpu", or "cuda:0" with onnxruntime-gpu."""
+    """Device that runs the image network: "cpu", or "cuda:0" with onnxruntime-gpu."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -35,7 +36,7 @@ class WordOptions(TypedOptions, frozen=True):
 
     @property
     def wording(self) -> Wording:
-        """How words are asked."""
+        """How words become prompts, and the words that they compete with."""
         return Wording(self.templates or TEMPLATES, self.contrast or CONTRAST, self.threshold)
 
 
@@ -43,9 +44,9 @@ class PatchOptions(WordOptions, frozen=True):
     """How the patches of an image network become features of pixels."""
 
     short_side: ImageSide = 336
-    """Frames are resized so that their shorter side has this many pixels."""
+    """Frames are resized to this many pixels on the shorter side."""
     window: WindowSide | None = None
-    """Edge in pixels of windows that are encoded one by one, half overlapping; 0 = the whole frame at once; null = the
+    """Edge in pixels of the windows to encode one by one; they overlap by half. 0 = the whole frame at once; null = the
     size of the model's training images."""
     stride: NotNegativeInt = 4
-    """Pixels of the frame from one feature to the next, upsampled from patches along the image's edges; 0 = patches."""
+    """Pixels between features, which are upsampled from patches along the image's edges; 0 = one feature per patch."""

@@ -1,8 +1,8 @@
-"""Mask classification, as of SEEM, X-Decoder or Mask2Former, as a model package: masks that words name.
+"""Mask classification, as in SEEM, X-Decoder or Mask2Former, as a model package: masks with a meaning in words.
 
-Such a network gives Q masks m_q with an embedding e_q each, in the space of words. Mask classification assigns a pixel
-to a class by sum_q p(class | e_q) sigmoid(m_q) (Cheng et al., MaskFormer, NeurIPS 2021, sec. 3.4); where the classes
-are not known yet, a pixel is given the embedding of the mask that covers it best.
+Such a network gives Q masks m_q, each with an embedding e_q in the space of words. Mask classification assigns a pixel
+to a class by sum_q p(class | e_q) sigmoid(m_q) (Cheng et al., MaskFormer, NeurIPS 2021, sec. 3.4). Here the classes are
+not yet known, so a pixel gets the embedding of the mask that covers it best.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
 
 
 class Options(WordOptions, frozen=True):
-    """Which model, and which of its masks count."""
+    """The model, and which of its masks count."""
 
     model: str = ""
-    """Folder of a model package of kind "masks", or its name in the models folder (freeocc3d models list)."""
+    """Folder of a model package of kind "masks", or its name in the models folder (see freeocc3d models list)."""
     short_side: ImageSide = 512
-    """Frames are resized so that their shorter side has this many pixels, and both sides whole patches."""
+    """Frames are resized to this many pixels on the shorter side, and both sides to whole patches."""
     mask_probability: Annotated[float, Meta(gt=0, lt=1)] = 0.5
-    """Pixels that no mask covers with at least this probability say nothing."""
+    """A pixel has a feature only if a mask covers it with at least this probability."""
 
 
 class SeemEncoder(Encoder):
@@ -45,7 +45,7 @@ class SeemEncoder(Encoder):
         self._image = package.session("image", options.device)
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
-        """(h, w, D) float16, at the masks' resolution; zero where no mask is sure."""
+        """(h, w, D) float16 at the resolution of the masks; zero where no mask is sure."""
         from ..patch_features import Tiling
 
         package, rgb = self.package, frame.color
@@ -61,7 +61,8 @@ class SeemEncoder(Encoder):
 def paint_masks(
     masks: NDArray[np.float32], embeddings: NDArray[np.float32], least_probability: float
 ) -> NDArray[np.float16]:
-    """(h, w, D) unit embeddings of the masks, (Q, h, w) logits, that cover each pixel best; zero where none does."""
+    """(h, w, D) the unit embedding of the mask that covers each pixel best, from (Q, h, w) logits; zero where none
+    does."""
     from ..patch_features import normalize_patches
 
     best = masks.argmax(axis=0)
@@ -71,19 +72,19 @@ def paint_masks(
 
 
 NEEDS_CAPTURE = False
-"""The keyframes alone are enough to encode them again."""
+"""Encoding keyframes again needs only the keyframes."""
 
 
 def check(options: Options) -> model_packages.Package:
-    """The model that is named. Raises ModelError if it is not there."""
+    """Finds the model that the options name. Raises ModelError if it does not exist."""
     return model_packages.find_model(options.model, ("masks",), "language.seem.model")
 
 
 def load(options: Options, capture: object = None) -> SeemEncoder:
-    """The encoder; it needs nothing of the capture. Raises ModelError."""
+    """Makes the encoder; it needs nothing from the capture. Raises ModelError."""
     return SeemEncoder(check(options), options)
 
 
 def load_text(state: dict[str, Any]) -> ModelWords:
-    """The word side; the text network is looked for when a word is encoded."""
+    """Restores the text part; it looks for the text network when it first encodes a word."""
     return ModelWords(state)

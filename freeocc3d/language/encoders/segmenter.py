@@ -1,9 +1,9 @@
-"""Any segmentation network (ONNX) with a list of its classes; words match names, synonyms and kin.
+"""Any segmentation network (ONNX) with a class list; words match names, synonyms and related words.
 
-The feature of a pixel is its class posteriors p, so that what is fused over views is their mean: the length |p| is 1
-where the network is sure, and less where it is not. The cosine of a fused feature with a class is p_c / |p|. Measured
-with a network of 40 classes (bedroom, living; mIoU over the classes present): p 15.4, 12.9; p / |p| 15.3, 12.9; sqrt(p)
-15.3, 12.0; the most likely class alone 15.3, 12.7; p^(1/4) 12.9, 8.2.
+The feature of a pixel is its class posteriors p, so the fused feature is their mean over views. The length |p| is 1
+where the network is sure, and less elsewhere. The cosine of a fused feature with a class is p_c / |p|. Measured with a
+network of 40 classes (bedroom, living; mIoU over the classes present): p 15.4, 12.9; p / |p| 15.3, 12.9; sqrt(p) 15.3,
+12.0; the most likely class only 15.3, 12.7; p^(1/4) 12.9, 8.2.
 """
 
 from __future__ import annotations
@@ -32,52 +32,53 @@ REQUIRES: tuple[str, ...] = ("onnxruntime",)
 NEEDS_CAPTURE = False
 
 VOID = ("unlabeled", "unlabelled", "unannotated", "unknown", "undefined", "void", "nothing", "none", "ignore")
-"""Names of classes that mean nothing, where an option does not say which do."""
+"""Names of classes that mean nothing, if the option ``void`` is null."""
 
 _INPUTS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _FREE_SIZE_STEP = 32
-"""A network of any input size is given a multiple of this, which is what its strides multiply to."""
+"""A network that accepts any input size gets a multiple of this, the usual product of its strides."""
 
 
 class Options(TypedOptions, frozen=True):
-    """A network, what its classes are called, and how it wants its images."""
+    """A network, the names of its classes, and the form of its input."""
 
     model: str = ""
-    """ONNX file. One input, an RGB image; one output, with logits or posteriors of each class or with class numbers."""
+    """ONNX file. Its input is one RGB image. Its output is the logits or posteriors of each class, or class numbers."""
     classes: str = ""
-    """File with the names of its classes in the order of its channels: JSON {"classes": [...]}, or one name a line."""
+    """File with the names of the classes in the order of the channels: JSON {"classes": [...]}, or one name per
+    line."""
     void: tuple[str, ...] | None = None
-    """Names of classes that mean nothing; null = those that are called so ("unlabeled", "void" and the like)."""
+    """Names of classes that mean nothing; null = the usual names ("unlabeled", "void" and similar)."""
     mapping: str | None = None
-    """YAML file that says what the classes become in another taxonomy: classes: [wall, ...], map: {name: class}."""
+    """YAML file that maps the classes to another taxonomy: classes: [wall, ...], map: {name: class}."""
     embeddings: str | None = None
-    """File (.npz) with text embeddings of many names, "names" and "embeddings", those of the classes among them: a name
-    whose embedding is nearer to a class's than names there commonly are to each other means the class."""
+    """File (.npz) with text embeddings of many names, including the classes: arrays "names" and "embeddings". A name
+    means a class if their embeddings are nearer than is usual between names of the file."""
     mean: tuple[Finite, Finite, Finite] = (0.485, 0.456, 0.406)
-    """Mean of red, green and blue, in 0…1, that images are normalized by; an input of bytes is not normalized."""
+    """Mean of red, green and blue, in 0…1, to normalize images with; an input of bytes is not normalized."""
     std: tuple[Positive, Positive, Positive] = (0.229, 0.224, 0.225)
-    """Standard deviation of red, green and blue, in 0…1, that images are normalized by."""
+    """Standard deviation of red, green and blue, in 0…1, to normalize images with."""
     channels: Literal["rgb", "bgr"] = "rgb"
     """Order of the input's channels: "rgb" or "bgr"."""
     size: tuple[PositiveInt, PositiveInt] | None = None
-    """Width and height of the input; null = as the network says, or about the frame's where it takes any."""
+    """Width and height of the input; null = as the network states, or near the frame's size if any size is possible."""
     output: str | None = None
-    """Name of the output with a channel for each class; null = the first that has one."""
+    """Name of the output with a channel for each class; null = the first such output."""
     stride: PositiveInt = 4
     """Pixels of the frame between features; logits are interpolated."""
     device: str = "cpu"
-    """Where the network runs: "cpu", or "cuda:0" and so on with onnxruntime-gpu."""
+    """Device that runs the network: "cpu", or a GPU such as "cuda:0" with onnxruntime-gpu."""
 
 
 class SegmenterEncoder(Encoder):
-    """Class posteriors; void classes, and what is most likely one, say nothing."""
+    """Class posteriors; void classes are ignored, and so are pixels that are most likely void."""
 
     name: ClassVar[str] = "segmenter"
 
     def __init__(
         self, network: SegmentationNetwork, classes: tuple[str, ...], grouping: NDArray[np.float32], options: Options
     ):
-        """grouping: (D, C) 1 where the network's class c counts as the d-th of ``classes``; a void column is zero."""
+        """grouping: (D, C) 1 if class c of the network counts as class d of ``classes``; a void column is zero."""
         self.network = network
         self.classes = classes
         self.grouping = grouping
@@ -88,8 +89,7 @@ class SegmenterEncoder(Encoder):
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16 posteriors, which sum to 1 less what is void.
 
-        Raises FrameError where the network gives numbers that are not finite, ConfigError where it gives a class that
-        has no name.
+        Raises FrameError if the network's numbers are not finite, ConfigError if it gives a class that has no name.
         """
         height, width = (-(-edge // self.options.stride) for edge in frame.color.shape[:2])
         posteriors = self.network.posteriors(frame, height, width).reshape(height * width, -1)
@@ -103,16 +103,16 @@ class SegmenterEncoder(Encoder):
 
 
 class SegmentationNetwork:
-    """A session with one image input and one output that is taken; what it wants and gives is asked of the file."""
+    """A session with one image input and one selected output; the file states their forms."""
 
     def __init__(self, path: Path, n_classes: int, options: Options):
-        """Raises ConfigError for a file that cannot be used, in one sentence that says why."""
+        """Raises ConfigError for a file that cannot be used; the message says why in one sentence."""
         self.path, self.n_classes, self.options = path, n_classes, options
         self.session = load_session(path, options.device)
         self.input, self.last, self.size = self._input()
         self.dtype = _INPUTS[self.input.type]
         self.output = self._output()
-        # what shapes leave open is found out before there is work to lose
+        # A trial run finds what the shapes leave open, before there is work to lose.
         self._scores(np.zeros((64, 64, 3), np.uint8))
 
     def posteriors(self, frame: Frame, height: int, width: int) -> NDArray[np.float32]:
@@ -126,17 +126,17 @@ class SegmentationNetwork:
         return scores if _are_posteriors(scores) else _softmax(scores)
 
     def _scores(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(h, w, C) what the network gives for an image."""
+        """(h, w, C) the network's output for an image."""
         image = self._image(rgb)
         try:
             given = self.session.run([self.output.name], {self.input.name: image})[0]
-        except Exception as error:  # ONNX Runtime's are of many kinds, all of them directly below Exception
+        except Exception as error:  # ONNX Runtime raises many types that share no base but Exception
             reason = " ".join(str(error).split())[:200]
-            raise ConfigError(f"{self.path} fails with an image of shape {_shape(image.shape)}: {reason}") from error
+            raise ConfigError(f"{self.path} fails on an image of shape {_shape(image.shape)}: {reason}") from error
         return self._by_class(np.asarray(given))
 
     def _image(self, rgb: NDArray[np.uint8]) -> NDArray[np.generic]:
-        """The frame as the input wants it."""
+        """The frame in the form that the input needs."""
         import cv2
 
         width, height = self.options.size or self.size or (_free_size(rgb.shape[1]), _free_size(rgb.shape[0]))
@@ -150,7 +150,7 @@ class SegmentationNetwork:
         return np.ascontiguousarray((image if self.last else image.transpose(2, 0, 1))[None].astype(self.dtype))
 
     def _by_class(self, given: NDArray[Any]) -> NDArray[np.float32]:
-        """(h, w, C) logits or posteriors of an output; one-hot where it holds class numbers."""
+        """(h, w, C) logits or posteriors of an output; one-hot if the output contains class numbers."""
         if np.issubdtype(given.dtype, np.integer):
             numbers = given.reshape(given.shape[-2:]) if given.size == np.prod(given.shape[-2:]) else given[0, ..., 0]
             if numbers.min(initial=0) < 0 or numbers.max(initial=0) >= self.n_classes:
@@ -177,23 +177,23 @@ class SegmentationNetwork:
             )
         entry = fitting[0]
         if not _may_be(entry.shape[0], 1):
-            raise ConfigError(f"{self.path} takes {entry.shape[0]} images at once; export it for one.")
+            raise ConfigError(f"{self.path} takes {entry.shape[0]} images at once: export it for one image.")
         height, width = entry.shape[1:3] if last[0] else entry.shape[2:4]
         stated = (width, height) if isinstance(width, int) and isinstance(height, int) else None
         if stated and self.options.size and self.options.size != stated:
             raise ConfigError(
-                f"'size' is {self.options.size[0]} x {self.options.size[1]}, but {self.path} takes images of {width} x "
-                f"{height} only: leave it null."
+                f"'size' is {self.options.size[0]} x {self.options.size[1]}, but {self.path} takes only images of "
+                f"{width} x {height}: set 'size' to null."
             )
         return entry, last[0], stated
 
     def _output(self) -> Any:
-        """The output that is taken."""
+        """The selected output."""
         outputs = {entry.name: entry for entry in self.session.get_outputs()}
         if self.options.output is not None and self.options.output not in outputs:
             raise ConfigError(
-                f"{self.path} has no output '{self.options.output}'{nearest(self.options.output, outputs)}; there are: "
-                f"{', '.join(outputs)}."
+                f"{self.path} has no output '{self.options.output}'{nearest(self.options.output, outputs)}. Choose "
+                f"from: {', '.join(outputs)}."
             )
         wanted = [outputs[self.options.output]] if self.options.output else list(outputs.values())
         for entry in wanted:
@@ -214,17 +214,17 @@ class SegmentationNetwork:
 
 
 class SegmenterWords(LabelWords):
-    """Class names, their synonyms and wider words, and names that text embeddings say mean one."""
+    """Class names, their synonyms and wider words, and names that mean a class by their text embeddings."""
 
     threshold = 0.6
-    """Below the 0.71 of a class that views are divided about with another."""
+    """Less than 0.71, the score of a class if the views are divided between it and another."""
 
     def __init__(self, classes: list[str], aliases: dict[str, int]):
         super().__init__(["", *classes])
         self.aliases = aliases
 
     def matching(self, word: str) -> tuple[list[int], str]:
-        """Of the parts of a phrase, most specific first, the first that either knows."""
+        """Returns the first match among the parts of a phrase, most specific first."""
         found, used = super().matching(word)
         for part in synonyms.split_phrase(word):
             if part == used:
@@ -235,19 +235,19 @@ class SegmenterWords(LabelWords):
 
 
 def check(options: Options) -> None:
-    """Raises ConfigError for a file that is not given, or not there."""
+    """Raises ConfigError for a file that is not given or does not exist."""
     for name in ("model", "classes", "mapping", "embeddings"):
         given = getattr(options, name)
         if given == "":
             raise ConfigError(
-                f"The encoder 'segmenter' needs language.segmenter.{name}: a file. It has none of its own."
+                f"The encoder 'segmenter' needs a file: set language.segmenter.{name}. freeocc3d includes none."
             )
         if given is not None and not Path(given).is_file():
-            raise ConfigError(f"There is no file {given}, which language.segmenter.{name} names.")
+            raise ConfigError(f"There is no file {given}: correct language.segmenter.{name}.")
 
 
 def load(options: Options, capture: Capture | None = None) -> SegmenterEncoder:
-    """The encoder; it needs nothing of the capture. Raises CaptureError, ConfigError for files that cannot be used."""
+    """Makes the encoder; it needs nothing from the capture. Raises CaptureError or ConfigError for unusable files."""
     check(options)
     names = read_class_names(Path(options.classes))
     network = SegmentationNetwork(Path(options.model), len(names), options)
@@ -259,7 +259,7 @@ def load(options: Options, capture: Capture | None = None) -> SegmenterEncoder:
     said = np.asarray(grouping.any(axis=1))
     classes, grouping = tuple(name for name, kept in zip(classes, said.tolist(), strict=True) if kept), grouping[said]
     if not classes:
-        raise ConfigError(f"All classes of {options.classes} are void: nothing is left to map.")
+        raise ConfigError(f"All classes of {options.classes} are void: no class is left to map.")
     encoder = SegmenterEncoder(network, classes, grouping, options)
     if options.embeddings is not None:
         encoder.aliases = _aliases(NameEmbeddings.read(Path(options.embeddings)), classes)
@@ -267,34 +267,32 @@ def load(options: Options, capture: Capture | None = None) -> SegmenterEncoder:
 
 
 def load_text(state: dict[str, Any]) -> SegmenterWords:
-    """The word side."""
+    """Restores the text part."""
     aliases = {str(name): int(row) for name, row in state.get("aliases", {}).items()}
     return SegmenterWords([str(name) for name in state["classes"]], aliases)
 
 
 def _void(names: tuple[str, ...], options: Options) -> NDArray[np.bool_]:
-    """(C,) which classes mean nothing."""
+    """(C,) whether each class means nothing."""
     lower = [name.lower() for name in names]
     if options.void is None:
         return np.isin(lower, VOID)
     void = [name.lower() for name in options.void]
     if absent := [name for name in void if name not in lower]:
-        raise ConfigError(
-            f"{options.classes} names no class '{absent[0]}'{nearest(absent[0], lower)} that could be void."
-        )
+        raise ConfigError(f"The void class '{absent[0]}'{nearest(absent[0], lower)} is not in {options.classes}.")
     return np.isin(lower, void)
 
 
 def _aliases(names: NameEmbeddings, classes: tuple[str, ...]) -> dict[str, int]:
-    """Names that mean a class by their embeddings, and that the vocabulary knows nothing of."""
+    """Names that mean a class by their embeddings, and that the synonyms do not contain."""
     known = {name: synonyms.match_names(name, list(classes))[1] for name in names.names}
     whole = {synonyms.make_key(name) for name, part in known.items() if part == synonyms.normalize_phrase(name)}
     return {key: row for key, row in names.meaning(classes).items() if key not in whole}
 
 
 def _class_axis(shape: Any, n_classes: int, last: bool) -> int | None:
-    """Which axis of a (1, C, h, w) or (1, h, w, C) output is the classes', by its length; None where neither fits.
-    last: of the input, which decides where both do. Lengths that are not known before a run (names) fit."""
+    """The class axis of a (1, C, h, w) or (1, h, w, C) output, by its length; None if neither fits. last: whether the
+    input has its channels last, which decides if both fit. Lengths that are unknown before a run (names) fit."""
     order = (3, 1) if last else (1, 3)
     exact = [axis for axis in order if len(shape) == 4 and shape[axis] == n_classes]
     open_ = [axis for axis in order if len(shape) == 4 and not isinstance(shape[axis], int)]
@@ -307,7 +305,7 @@ def _may_be(edge: Any, length: int) -> bool:
 
 
 def _are_posteriors(scores: NDArray[np.float32]) -> bool:
-    """Whether (h, w, C) scores sum to one everywhere: a network with a softmax of its own."""
+    """Whether (h, w, C) scores sum to 1 everywhere: the network has its own softmax."""
     return bool(scores.min() >= -1e-6 and np.abs(scores.sum(axis=-1) - 1).max() < 1e-2)
 
 

@@ -1,16 +1,17 @@
-"""Trident, the paper's encoder: CLIP's values mixed by DINO's correlation, gathered and refined by SAM.
+"""Trident, the paper's encoder: DINO's correlations mix CLIP's values, and SAM gathers and refines them.
 
 Source: Y. Shi et al., Harnessing Vision Foundation Models for High-Performance, Training-Free Open Vocabulary
-Segmentation, 2024. Its steps, as they are here:
+Segmentation, 2024. Its steps, as implemented here:
 
-1. Splice. In every window CLIP's last attention is replaced by the correlation of DINO's patches,
-   softmax over j of gamma (S_ij - beta mean(S)), S the cosines, without those that are negative; what it makes of
-   CLIP's values is averaged over windows.
+1. Splice. In every window the correlation of DINO's patches replaces CLIP's last attention: softmax over j of gamma
+   (S_ij - beta mean(S)), with S the cosines, without negative entries. The resulting mixes of CLIP's values are
+   averaged over windows.
 2. Gather. SAM's last attention (mean over heads) over the whole frame mixes the spliced values, without pairs of
-   patches whose SAM features are less alike than ``cosine`` times the mean; CLIP's projection makes features of them.
-3. Refine. The paper prompts SAM with what each class asked for covers. A map is built before anybody asks, so that the
-   prompts are a grid of points here, and a pixel takes the mean feature of the masks that cover it, each weighing by
-   SAM's estimate of its quality.
+   patches whose SAM features have a smaller cosine than ``cosine`` times the mean. CLIP's projection turns the result
+   into features.
+3. Refine. The paper prompts SAM with the areas of the classes in the query. A map is built before any query, so here
+   the prompts are a grid of points. A pixel gets the mean feature of the masks that cover it, weighted by SAM's
+   estimate of their quality.
 """
 
 from __future__ import annotations
@@ -35,33 +36,33 @@ if TYPE_CHECKING:
 REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
 
 _FINER = 2
-"""Features a patch of SAM's, along an axis, after refinement."""
+"""Features per SAM patch along an axis, after refinement."""
 
 
 class Options(PatchOptions, frozen=True):
-    """Which models, and the paper's constants."""
+    """The models, and the paper's constants."""
 
     model: str = ""
-    """Folder of a model package of kind "clip", or its name in the models folder (freeocc3d models list)."""
+    """Folder of a model package of kind "clip", or its name in the models folder (see freeocc3d models list)."""
     dino: str = ""
-    """The same of kind "backbone": DINO ViT-B/16 in the paper."""
+    """The same for kind "backbone": DINO ViT-B/16 in the paper."""
     sam: str = ""
-    """The same of kind "sam"."""
+    """The same for kind "sam"."""
     window: WindowSide | None = 336
     beta: Advanced[Finite] = 1.2
-    """Share of the mean correlation that a pair of DINO's patches must exceed."""
+    """A pair of DINO patches counts if its correlation exceeds this times the mean correlation."""
     gamma: Advanced[Finite] = 3.0
-    """Factor of correlations in the softmax."""
+    """Factor of the correlations in the softmax."""
     cosine: Advanced[Finite] = 1.2
-    """Share of the mean cosine that a pair of SAM's patches must exceed."""
+    """A pair of SAM patches counts if its cosine exceeds this times the mean cosine."""
     points: Advanced[Annotated[int, Meta(ge=0, le=64)]] = 16
-    """Points along the longer side of the grid that SAM is prompted with; 0 = no masks."""
+    """Number of prompt points for SAM along the longer side of the grid; 0 = no masks."""
     mask_score: Advanced[Finite] = 0.8
-    """Least quality of a mask, as SAM estimates it."""
+    """Smallest quality of a mask, as SAM estimates it."""
     stride: NotNegativeInt = 4
-    """Pixels of the frame from one feature to the next, upsampled along the image's edges; 0 = as SAM's grid is."""
+    """Pixels between features, which are upsampled along the image's edges; 0 = SAM's grid."""
     device: str = "cpu"
-    """Where the image networks run: "cpu", or "cuda:0" with onnxruntime-gpu."""
+    """Device that runs the image networks: "cpu", or "cuda:0" with onnxruntime-gpu."""
 
 
 class TridentEncoder(Encoder):
@@ -80,7 +81,7 @@ class TridentEncoder(Encoder):
         self._sam, self._masks = (sam.session(part, options.device) for part in ("image", "masks"))
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
-        """(ceil(H / stride), ceil(W / stride), D) float16, or (h, w, D) at SAM's grid, twice as fine with masks."""
+        """(ceil(H / stride), ceil(W / stride), D) float16, or (h, w, D) on SAM's grid, twice as fine with masks."""
         from ..patch_features import finish_patches, resample_patches
 
         rgb = frame.color
@@ -97,13 +98,13 @@ class TridentEncoder(Encoder):
         return finish_patches(features, rgb, self.options.stride)
 
     def spliced(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(rows, columns, width) CLIP's values, mixed by DINO's correlation in each window; the windows' mean."""
+        """(rows, columns, width) CLIP's values, mixed in each window by DINO's correlation; the mean over windows."""
         from ..patch_features import Splice, Tiling
 
         options, clip, dino = self.options, self.clip, self.dino
         window = clip.input_size if options.window is None else options.window
         tiling = Tiling.of(rgb.shape[0], rgb.shape[1], clip, options.short_side, window)
-        same = dataclasses.replace(tiling, patch=dino.patch)  # the same patches, as large as DINO wants them
+        same = dataclasses.replace(tiling, patch=dino.patch)  # the same patches at DINO's size
         seen_by_dino = same.windows(same.image(rgb, dino.mean, dino.std))
         splice: Splice | None = None
         for (images, corners), (others, _) in zip(
@@ -134,8 +135,8 @@ class TridentEncoder(Encoder):
         return normalize_patches(features[0])
 
     def _sam_view(self, rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[int, int]]:
-        """SAM's features (1, C, n, n), attention (1, n n, n n), and the (rows, columns) of them that show the frame: it
-        lies at the upper left of a square."""
+        """SAM's features (1, C, n, n), its attention (1, n n, n n), and the (rows, columns) of them that show the
+        frame, which is at the upper left of a square."""
         from ..patch_features import Tiling
 
         size, patch = self.sam.input_size, self.sam.patch
@@ -149,7 +150,7 @@ class TridentEncoder(Encoder):
         return features, attention, grid
 
     def _refined(self, features: NDArray[np.float32], sam_features: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(2 h, 2 w, D) features of (h, w, D), brought together within SAM's masks."""
+        """(2 h, 2 w, D) features from (h, w, D), averaged within SAM's masks."""
         from ..patch_features import normalize_patches, resample_patches
 
         h, w = features.shape[:2]
@@ -160,7 +161,7 @@ class TridentEncoder(Encoder):
         best = scores[0].argmax(axis=1)
         rows = np.flatnonzero(scores[0, np.arange(len(best)), best] >= self.options.mask_score)
         finer = normalize_patches(resample_patches(features, (_FINER * h, _FINER * w)))
-        fraction = masks.shape[3] // sam_features.shape[2]  # pixels of a mask in a patch of SAM's
+        fraction = masks.shape[3] // sam_features.shape[2]  # pixels of a mask per SAM patch
         cell = fraction // _FINER
         if not len(rows):
             return finer
@@ -173,8 +174,8 @@ class TridentEncoder(Encoder):
 
 
 def correlate_patches(seen: NDArray[np.float32], beta: float, gamma: float) -> NDArray[np.float32]:
-    """(N, N) attention from the cosines of (N, C) features: those below beta times their mean get nothing; a patch
-    always attends to itself."""
+    """(N, N) attention from the cosines of (N, C) features. Cosines below beta times their mean give 0; a patch always
+    attends to itself."""
     from ..clip_attention import apply_softmax
     from ..patch_features import normalize_patches
 
@@ -187,8 +188,8 @@ def correlate_patches(seen: NDArray[np.float32], beta: float, gamma: float) -> N
 
 
 def gate_attention(attention: NDArray[np.float32], seen: NDArray[np.float32], cosine: float) -> NDArray[np.float32]:
-    """(N, N) attention without the pairs of patches whose (N, C) features are less alike than ``cosine`` times the
-    mean, rows summing to 1."""
+    """(N, N) attention without pairs of patches whose (N, C) features have a smaller cosine than ``cosine`` times the
+    mean; rows sum to 1."""
     from ..patch_features import normalize_patches
 
     u = normalize_patches(seen)
@@ -202,8 +203,8 @@ def gate_attention(attention: NDArray[np.float32], seen: NDArray[np.float32], co
 def pool_masks(
     features: NDArray[np.float32], shares: NDArray[np.float32], scores: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(h, w, D): the mean over masks of their mean feature, a mask weighing by its score and by its share (M, h, w) of
-    the cell; what no mask covers keeps its own."""
+    """(h, w, D) the mean over masks of their mean features, weighted by the score of each mask and its share (M, h, w)
+    of the cell. A cell without masks keeps its own feature."""
     flat, own = shares.reshape(len(shares), -1), features.reshape(-1, features.shape[-1])
     sizes = flat.sum(axis=1, keepdims=True)
     means = (flat @ own) / np.where(sizes > 0, sizes, 1)
@@ -214,11 +215,11 @@ def pool_masks(
 
 
 NEEDS_CAPTURE = False
-"""The keyframes alone are enough to encode them again."""
+"""Encoding keyframes again needs only the keyframes."""
 
 
 def check(options: Options) -> tuple[model_packages.Package, model_packages.Package, model_packages.Package]:
-    """The models that are named: CLIP, DINO and SAM. Raises ModelError if one is not there."""
+    """Finds the models that the options name: CLIP, DINO and SAM. Raises ModelError if one does not exist."""
     return (
         model_packages.find_model(options.model, ("clip",), "language.trident.model"),
         model_packages.find_model(options.dino, ("backbone",), "language.trident.dino"),
@@ -227,10 +228,10 @@ def check(options: Options) -> tuple[model_packages.Package, model_packages.Pack
 
 
 def load(options: Options, capture: object = None) -> TridentEncoder:
-    """The encoder; it needs nothing of the capture. Raises ModelError."""
+    """Makes the encoder; it needs nothing from the capture. Raises ModelError."""
     return TridentEncoder(*check(options), options)
 
 
 def load_text(state: dict[str, Any]) -> ModelWords:
-    """The word side, CLIP's; the text network is looked for when a word is encoded."""
+    """Restores the text part, CLIP's; it looks for the text network when it first encodes a word."""
     return ModelWords(state)

@@ -1,5 +1,5 @@
-"""Checkpoints turned into model packages: networks as ONNX, ``tokenizer.json`` and a manifest.
+"""Turns checkpoints into model packages: networks as ONNX, ``tokenizer.json`` and a manifest.
 
-``freeocc3d models export`` is the way in. Everything here needs torch and transformers: only ``export_checkpoint``
-imports it.
+``freeocc3d models export`` calls it. Only ``export_checkpoint`` imports the other modules, which need torch and
+transformers.
 """

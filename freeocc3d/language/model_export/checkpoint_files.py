@@ -1,5 +1,5 @@
-"""Checkpoints on disk or on the Hugging Face hub, read into networks. Weights come from safetensors alone: nothing is
-unpickled."""
+"""Reads checkpoints from disk or from the Hugging Face hub into networks. Weights come only from safetensors; nothing
+is unpickled."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from .tokenizer_files import read_tokenizer
 
 
 def read_checkpoint(source: str, tokenizer: Path | None, text: str | None, text_head: Path | None) -> Checkpoint:
-    """What SOURCE is, made ready for export. Raises ModelError."""
+    """Reads ``source`` and prepares it for export. Raises ModelError."""
     if source.startswith("open_clip:"):
         model, mean, std = _from_open_clip(source.removeprefix("open_clip:"))
         if tokenizer is None:
-            raise ModelError("open_clip brings no tokenizer.json: name a folder that holds one with --tokenizer.")
+            raise ModelError("open_clip has no tokenizer.json: give a folder that contains one with --tokenizer.")
         return build_clip(model, read_tokenizer(tokenizer), mean, std)
     folder = _local(source)
     if (folder / "open_clip_config.json").is_file():
@@ -57,7 +57,7 @@ def _clip_of(folder: Path) -> nn.Module:
 
 
 def _local(source: str) -> Path:
-    """The folder of a checkpoint, fetched from the hub where it is no folder here."""
+    """The folder of a checkpoint; fetches it from the hub if ``source`` is not a folder."""
     if Path(source).is_dir():
         return Path(source)
     return model_hub.pull_package(source)
@@ -78,8 +78,8 @@ def _from_transformers(folder: Path) -> nn.Module:
         )
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise ModelError(
-            f"{folder} is no checkpoint of CLIP, SigLIP, DINO, DINOv2 or SAM as config.json and model.safetensors: "
-            f"{' '.join(str(error).split())}."
+            f"{folder} does not contain a checkpoint of CLIP, SigLIP, DINO, DINOv2 or SAM as config.json and "
+            f"model.safetensors: {' '.join(str(error).split())}."
         ) from error
     return loaded.float().eval()
 
@@ -91,7 +91,7 @@ def _from_open_clip_folder(folder: Path) -> tuple[nn.Module, list[float], list[f
         model = clip_from_open_clip(state, config["model_cfg"])
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         said = " ".join(str(error).split())[:200]
-        raise ModelError(f"{folder} is no OpenCLIP ViT in its usual form: {said}.") from error
+        raise ModelError(f"{folder} is not a usual OpenCLIP ViT: {said}.") from error
     own = config.get("preprocess_cfg", {})
     return model, list(own.get("mean", CLIP_MEAN)), list(own.get("std", CLIP_STD))
 
@@ -120,7 +120,7 @@ def _safetensors(path: Path) -> dict[str, Tensor]:
 
 
 def _normalization(folder: Path, kind: str) -> tuple[list[float], list[float]]:
-    """Mean and standard deviation that a checkpoint's preprocessor_config.json states, or that its kind usually has."""
+    """Mean and standard deviation from a checkpoint's preprocessor_config.json, or the usual ones for its kind."""
     path = folder / "preprocessor_config.json"
     stated = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     usual = {"clip": (CLIP_MEAN, CLIP_STD), "siglip": ([0.5] * 3, [0.5] * 3)}.get(kind, (DINO_MEAN, DINO_STD))
@@ -128,7 +128,7 @@ def _normalization(folder: Path, kind: str) -> tuple[list[float], list[float]]:
 
 
 def stated_licence(source: str) -> str:
-    """The licence that a model card states, if there is one."""
+    """The license that a model card states, if it exists."""
     card = Path(source) / "README.md"
     found = re.search(r"^license:\s*(\S+)", card.read_text(encoding="utf-8"), re.M) if card.is_file() else None
     return found[1] if found else "not stated: see the source"

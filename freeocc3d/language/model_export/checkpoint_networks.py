@@ -1,4 +1,4 @@
-"""A checkpoint's networks as the parts of a model package, with their inputs and outputs and the manifest's facts."""
+"""Splits a checkpoint into the parts of a model package: networks with inputs and outputs, and the manifest's facts."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from . import transformer_graphs as graphs
 from .tokenizer_files import clip_tokenizer, end_token, siglip_tokenizer
 
 CLIP_MEAN, CLIP_STD = [0.48145466, 0.4578275, 0.40821073], [0.26862954, 0.26130258, 0.27577711]
-"""Of the images that CLIP was trained with."""
+"""Mean and standard deviation of CLIP's training images."""
 
 DINO_MEAN, DINO_STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
 """ImageNet's."""
 
 _TALK2DINO_TEMPERATURE = 0.07
-"""That Talk2DINO is trained with."""
+"""Softmax temperature in the training of Talk2DINO."""
 
 
 @dataclass(frozen=True)
 class CheckpointNetwork:
-    """A module to export: example inputs by name, which of their axes may have any length, and its outputs' names."""
+    """A module to export: example inputs by name, their axes with any length, and the names of its outputs."""
 
     module: nn.Module
     inputs: dict[str, Tensor]
@@ -34,7 +34,7 @@ class CheckpointNetwork:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What is exported: networks by part, the tokenizer as JSON, and the manifest's facts."""
+    """What to export: networks by part, the tokenizer as JSON, and the manifest's facts."""
 
     kind: str
     networks: dict[str, CheckpointNetwork]
@@ -43,7 +43,7 @@ class Checkpoint:
 
 
 def build_clip(model: nn.Module, tokenizer: str, mean: list[float], std: list[float]) -> Checkpoint:
-    """Of transformers' CLIPModel, as its tokenizer.json is cut and padded by ``clip_tokenizer``."""
+    """From transformers' CLIPModel; ``clip_tokenizer`` made its tokenizer.json."""
     text, vision = model.config.text_config, model.config.vision_config
     network = graphs.ClipText(model, end_token(text.eos_token_id, tokenizer))
     tokens = torch.zeros((2, 7), dtype=torch.int64)
@@ -56,7 +56,7 @@ def build_clip(model: nn.Module, tokenizer: str, mean: list[float], std: list[fl
 
 
 def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[float]) -> Checkpoint:
-    """Of transformers' SiglipModel."""
+    """From transformers' SiglipModel."""
     text, vision = model.config.text_config, model.config.vision_config
     tokens = torch.zeros((2, text.max_position_embeddings), dtype=torch.int64)
     words = _text_network(graphs.SiglipText(model), tokens, (0,))
@@ -69,7 +69,7 @@ def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[
 
 
 def build_backbone(model: nn.Module, mean: list[float], std: list[float]) -> Checkpoint:
-    """Of transformers' ViTModel (DINO) or Dinov2Model, with registers or without."""
+    """From transformers' ViTModel (DINO) or Dinov2Model, with registers or without."""
     network = CheckpointNetwork(
         graphs.DinoPatches(model), {"image": _image(model.config)}, {"image": (0, 2, 3)}, ("features",)
     )
@@ -78,7 +78,7 @@ def build_backbone(model: nn.Module, mean: list[float], std: list[float]) -> Che
 
 
 def build_text_aligned(model: nn.Module, text_model: nn.Module, tokenizer: str, head: dict[str, Tensor]) -> Checkpoint:
-    """A DINOv2 whose patches a CLIP's words are brought to by ``head``, as Talk2DINO's are."""
+    """From a DINOv2; ``head`` brings a CLIP's words into its patch space, as Talk2DINO's head does."""
     seen = build_backbone(model, DINO_MEAN, DINO_STD)
     text = text_model.config.text_config
     network = graphs.ClipText(text_model, end_token(text.eos_token_id, tokenizer), graphs.Talk2DinoHead(head))
@@ -92,7 +92,7 @@ def build_text_aligned(model: nn.Module, text_model: nn.Module, tokenizer: str, 
 
 
 def build_sam(model: nn.Module, mean: list[float], std: list[float]) -> Checkpoint:
-    """Of transformers' SamModel with "eager" attention, whose weights are given out."""
+    """From transformers' SamModel with "eager" attention, which returns its attention weights."""
     vision = model.config.vision_config
     side, grid = vision.image_size, vision.image_size // vision.patch_size
     features = torch.zeros((1, vision.output_channels, grid, grid))

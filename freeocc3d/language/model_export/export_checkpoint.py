@@ -1,4 +1,4 @@
-"""A checkpoint in, a model package out: what ``freeocc3d models export`` does."""
+"""Exports a checkpoint as a model package, for ``freeocc3d models export``."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ def export_checkpoint(
     text_head: Path | None = None,
     licence: str | None = None,
 ) -> model_packages.Package:
-    """Write the checkpoint as a model package, and read it back.
+    """Writes the checkpoint as a model package, and reads it back.
 
     source: a folder with config.json and model.safetensors (CLIP, SigLIP, DINO, DINOv2, SAM of transformers), a folder
     with open_clip_config.json and open_clip_model.safetensors, ``open_clip:ARCHITECTURE/WEIGHTS``, or OWNER/NAME on the
     Hugging Face hub.  output: the folder to write; a plain name means a folder in the models folder.
     tokenizer: folder with tokenizer.json, or vocab.json and merges.txt, if the checkpoint has neither.
-    text: checkpoint of the CLIP whose words ``text_head``, the safetensors file of Talk2DINO's projection, brings into
-    the space of a DINOv2.  licence: of the weights; None = what the model card says.
+    text: checkpoint of the CLIP whose words are projected into the space of a DINOv2.  text_head: the safetensors file
+    of that projection, Talk2DINO's.  licence: license of the weights; None = the one on the model card.
 
-    Raises ModelError: no such checkpoint, or the folder exists. Raises DependencyError: a package is not installed.
+    Raises ModelError if the checkpoint does not exist or the folder exists, DependencyError if a package is missing.
     """
     if missing := [name for name in _NEEDED if find_spec(name) is None]:
         raise DependencyError(
-            f"The export of a model needs {', '.join(missing)}: install them with pip install 'freeocc3d[export]'."
+            f"Exporting a model needs {', '.join(missing)}: install with pip install 'freeocc3d[export]'."
         )
     from .checkpoint_files import read_checkpoint, stated_licence
     from .package_writer import write_package

@@ -1,4 +1,4 @@
-"""Weights of OpenCLIP's (and OpenAI's) CLIP, given to transformers' CLIP."""
+"""Transfers the weights of OpenCLIP's (and OpenAI's) CLIP to transformers' CLIP."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _BLOCK_LAYERS = {
 
 
 def clip_from_open_clip(state: dict[str, Tensor], config: dict[str, Any]) -> nn.Module:
-    """transformers' CLIPModel with the weights of an OpenCLIP (or OpenAI) ViT.
+    """Makes transformers' CLIPModel with the weights of an OpenCLIP (or OpenAI) ViT.
 
     state: OpenCLIP's weights by name.  config: its ``model_cfg``.
-    Raises KeyError or RuntimeError if the weights are not those of such a network.
+    Raises KeyError or RuntimeError if the weights do not belong to such a network.
     """
     from transformers import CLIPModel
 
@@ -64,7 +64,7 @@ def clip_from_open_clip(state: dict[str, Tensor], config: dict[str, Any]) -> nn.
 
 
 def _configuration(config: dict[str, Any]) -> Any:
-    """transformers' CLIPConfig of an OpenCLIP ``model_cfg``."""
+    """transformers' CLIPConfig for an OpenCLIP ``model_cfg``."""
     from transformers import CLIPConfig
 
     vision, text, dimension = config["vision_cfg"], config["text_cfg"], config["embed_dim"]

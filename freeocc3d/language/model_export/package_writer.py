@@ -1,4 +1,4 @@
-"""A checkpoint's networks written as a model package."""
+"""Writes a checkpoint's networks as a model package."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def write_package(
     licence: str,
     precision: model_packages.Precision = "fp32",
 ) -> None:
-    """Write a package; it is whole or it is not there. Raises ModelError."""
+    """Writes a package, completely or not at all. Raises ModelError."""
     if folder.exists():
-        raise ModelError(f"{folder} exists: choose another folder for the package.")
+        raise ModelError(f"{folder} already exists: choose another folder for the package.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
         made = Path(temporary) / "package"
@@ -58,12 +58,12 @@ def write_package(
         (made / model_packages.MANIFESTS[0]).write_text(yaml.safe_dump(manifest, sort_keys=False), encoding="utf-8")
         package = model_packages.read_package(made)
         for part in checkpoint.networks:
-            package.session(part)  # what is written can be run
+            package.session(part)  # fails if the written network cannot run
         os.replace(made, folder)
 
 
 def write_onnx(network: CheckpointNetwork, path: Path) -> None:
-    """Export one network."""
+    """Exports one network."""
     any_length = {
         name: dict.fromkeys(network.dynamic.get(name, ()), torch.export.Dim.DYNAMIC) for name in network.inputs
     }
@@ -77,7 +77,7 @@ def write_onnx(network: CheckpointNetwork, path: Path) -> None:
 
 @contextlib.contextmanager
 def _silent_exporter() -> Iterator[None]:
-    """torch's exporter warns, and logs the number of operators that it skips."""
+    """Silences torch's exporter, which warns and logs the number of skipped operators."""
     log = logging.getLogger()
     level = log.level
     log.setLevel(logging.ERROR)
@@ -90,8 +90,8 @@ def _silent_exporter() -> Iterator[None]:
 
 
 def change_precision(path: Path, precision: model_packages.Precision) -> None:
-    """Bring a written network to another precision: fp16 halves weights and sums; int8 quantises the weights of matrix
-    products, one scale a column, and its inputs as they come. Inputs and outputs stay float32."""
+    """Changes the precision of a written network. fp16 halves weights and sums. int8 quantizes the weights of matrix
+    products, with one scale per column, and their inputs at run time. Inputs and outputs stay float32."""
     if precision == "fp16":
         import onnx
         from onnxruntime.transformers.float16 import convert_float_to_float16

@@ -1,4 +1,4 @@
-"""tokenizer.json of a model package: CLIP's and SigLIP's, with how texts are cut and padded written into it."""
+"""Makes tokenizer.json of a model package, CLIP's or SigLIP's, including how texts are cut and padded."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ _SIGLIP_PUNCTUATION = r"[!\"#$%&'()*+,\-./:;<=>?@\[\\\]^_`{|}~]"
 
 
 def end_token(stated: int, tokenizer: str) -> int:
-    """The end token's number; CLIP's first configurations state 2, and mean the largest number of the vocabulary."""
+    """The number of the end token. CLIP's first configurations state 2, but mean the largest number of the
+    vocabulary."""
     if stated != 2:
         return int(stated)
     from tokenizers import Tokenizer
@@ -20,20 +21,20 @@ def end_token(stated: int, tokenizer: str) -> int:
 
 
 def clip_tokenizer(tokenizer: str, length: int) -> str:
-    """tokenizer.json that cuts texts as CLIP does, the end token last, and pads them to the longest."""
+    """tokenizer.json that cuts texts like CLIP, with the end token last, and pads them to the longest."""
     from tokenizers import Tokenizer
 
     made = Tokenizer.from_str(tokenizer)
     end = made.token_to_id("<|endoftext|>")
     if end is None:
-        raise ModelError("The tokenizer has no <|endoftext|>: it is not CLIP's.")
+        raise ModelError("The tokenizer has no <|endoftext|>: it is not a CLIP tokenizer.")
     made.enable_truncation(length)
     made.enable_padding(pad_id=end, pad_token="<|endoftext|>")
     return str(made.to_str())
 
 
 def siglip_tokenizer(tokenizer: str, length: int, pad_id: int) -> str:
-    """tokenizer.json that lowers texts, takes punctuation out, and cuts and pads them to ``length``, as SigLIP's."""
+    """tokenizer.json that, like SigLIP, lowers texts, removes punctuation, and cuts and pads texts to ``length``."""
     from tokenizers import Regex, Tokenizer, normalizers
 
     made = Tokenizer.from_str(tokenizer)
@@ -48,7 +49,7 @@ def siglip_tokenizer(tokenizer: str, length: int, pad_id: int) -> str:
 
 
 def clip_tokenizer_from(vocabulary: dict[str, int], merges: list[tuple[str, str]]) -> str:
-    """tokenizer.json of CLIP's vocab.json and merges.txt: byte-level BPE of lower-case words that end with </w>."""
+    """tokenizer.json from CLIP's vocab.json and merges.txt: byte-level BPE of lower-case words that end with </w>."""
     from tokenizers import Regex, Tokenizer, normalizers, pre_tokenizers, processors
     from tokenizers.models import BPE
 
@@ -71,7 +72,7 @@ def clip_tokenizer_from(vocabulary: dict[str, int], merges: list[tuple[str, str]
 
 
 def read_tokenizer(folder: Path) -> str:
-    """tokenizer.json in a folder, or what vocab.json and merges.txt make. Raises ModelError."""
+    """tokenizer.json of a folder, or the one made from vocab.json and merges.txt. Raises ModelError."""
     try:
         if (folder / "tokenizer.json").is_file():
             return (folder / "tokenizer.json").read_text(encoding="utf-8")
@@ -80,4 +81,4 @@ def read_tokenizer(folder: Path) -> str:
         pairs = [line.split() for line in lines if line and not line.startswith("#version")]
         return clip_tokenizer_from(vocabulary, [(left, right) for left, right in pairs])
     except (OSError, ValueError, KeyError) as error:
-        raise ModelError(f"{folder} holds neither tokenizer.json nor vocab.json with merges.txt: {error}.") from error
+        raise ModelError(f"{folder} has neither tokenizer.json nor vocab.json with merges.txt: {error}.") from error

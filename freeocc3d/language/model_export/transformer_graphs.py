@@ -1,7 +1,7 @@
-"""The networks of a model package as PyTorch modules around the layers of transformers' models, ready to be exported.
+"""The networks of a model package as PyTorch modules around the layers of transformers' models, ready for export.
 
-Position embeddings are interpolated inside the graphs, bicubically as transformers does, so that images of any size (in
-patches) go in. Attention is written out, so that the last block can be cut before it.
+Position embeddings are interpolated inside the graphs, bicubically as in transformers, so that images can have any size
+(in patches). Attention is written out, so that the last block can be cut before it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def clip_block(layer: nn.Module, x: Tensor, mask: Tensor | None = None) -> Tenso
 
 
 def positions(table: Tensor, grid: int, height: int, width: int, antialias: bool = False) -> Tensor:
-    """(1, height width, C) of (grid², C) position embeddings, interpolated."""
+    """(1, height width, C) interpolated from (grid², C) position embeddings."""
     square = table.reshape(1, grid, grid, -1).permute(0, 3, 1, 2)
     fitted = F.interpolate(square, size=(height, width), mode="bicubic", align_corners=False, antialias=antialias)
     return fitted.flatten(2).transpose(1, 2)
@@ -63,7 +63,7 @@ class ImageTrunk(nn.Module):
 
 
 class ClipHead(nn.Module):
-    """From mixed values to CLIP's space, with and without the block's residual and feed-forward part."""
+    """Maps mixed values to CLIP's space, with and without the block's residual and feed-forward part."""
 
     def __init__(self, model: nn.Module):
         super().__init__()
@@ -79,8 +79,8 @@ class ClipHead(nn.Module):
 
 
 class SiglipHead(nn.Module):
-    """From mixed values to SigLIP's space. Its pooling attends to the patches with a learned query; a patch's own
-    feature is what that gives when it attends to this patch alone."""
+    """Maps mixed values to SigLIP's space. SigLIP's pooling attends to the patches with a learned query. The feature of
+    a patch is the result of pooling that patch alone."""
 
     def __init__(self, model: nn.Module):
         super().__init__()
@@ -138,7 +138,7 @@ class ClipText(nn.Module):
 
 
 class SiglipText(nn.Module):
-    """SigLIP's text tower: the embedding at the last of always as many tokens."""
+    """SigLIP's text tower: the embedding at the last token; the number of tokens is fixed."""
 
     def __init__(self, model: nn.Module):
         super().__init__()
@@ -159,7 +159,7 @@ class SiglipText(nn.Module):
 
 
 class DinoPatches(nn.Module):
-    """DINO's or DINOv2's patch features (B, h, w, C), after the last norm."""
+    """Patch features (B, h, w, C) of DINO or DINOv2, after the last norm."""
 
     def __init__(self, model: nn.Module):
         super().__init__()
@@ -170,7 +170,7 @@ class DinoPatches(nn.Module):
         table = own.position_embeddings.detach()[0]
         self.grid = int((len(table) - 1) ** 0.5)
         registers = getattr(own, "register_tokens", None)
-        self.antialias = registers is not None  # as those networks were trained
+        self.antialias = registers is not None  # as in the training of those networks
         first = [own.cls_token.detach() + table[:1], *([] if registers is None else [registers.detach()])]
         self.register_buffer("first", torch.cat(first, dim=1))
         self.register_buffer("table", table[1:])
@@ -186,7 +186,7 @@ class DinoPatches(nn.Module):
 
 
 class Talk2DinoHead(nn.Module):
-    """CLIP's text embedding to DINOv2's patch space (Barsellotti et al., Talking to DINO, ICCV 2025)."""
+    """Maps CLIP's text embedding to DINOv2's patch space (Barsellotti et al., Talking to DINO, ICCV 2025)."""
 
     def __init__(self, weights: dict[str, Tensor]):
         super().__init__()
@@ -214,7 +214,7 @@ class SamImage(nn.Module):
             x = x + own.pos_embed
         for layer in own.layers[:-1]:
             x = layer(x)
-        last = own.layers[-1]  # its attention is over the whole image
+        last = own.layers[-1]  # it attends to the whole image
         mixed, weights = last.attn(last.layer_norm1(x))
         x = x + mixed
         x = x + last.mlp(last.layer_norm2(x))
@@ -223,7 +223,7 @@ class SamImage(nn.Module):
 
 
 class SamMasks(nn.Module):
-    """SAM's mask decoder, prompted with points, each for itself."""
+    """SAM's mask decoder with point prompts, one mask set for each point."""
 
     def __init__(self, model: nn.Module):
         super().__init__()
