@@ -56,7 +56,7 @@ def test_a_map_is_made_asked_and_outlives_its_model(
         again.query("a word that was never asked")
     with pytest.raises(SystemExit, match="1"):
         main(["query", str(tmp_path / "map"), "another word"])
-    assert "copy its folder there" in capsys.readouterr().err
+    assert "Copy its folder there" in capsys.readouterr().err
     with pytest.raises(SystemExit) as end:
         main(["info", str(tmp_path / "map"), "--json"])
     assert end.value.code == 0

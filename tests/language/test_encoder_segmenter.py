@@ -154,7 +154,7 @@ def test_posteriors_of_classes_that_are_mapped_to_one_are_added(tmp_path: Path) 
         ("map: {void: null}", "must hold 'classes'"),
         ("classes: plant", "a list of names"),
         ("- plant", "becomes"),
-        ("classes: [plant]\nmap: [void]", "must read 'name: class'"),
+        ("classes: [plant]\nmap: [void]", "must hold lines of the form 'name: class'"),
         ("classes: [", "not valid YAML"),
     ],
 )
@@ -206,8 +206,8 @@ def test_networks_that_fit_neither_classes_nor_sizes_are_reported(tmp_path: Path
     refused(tmp_path, write_identity(tmp_path / "two.onnx", [2, 3, 8, 8]), "takes 2 images at once")
     refused(tmp_path, net, r"takes only images of 96 x 64", size=(64, 64))
     refused(tmp_path, net, "no output 'scores'", output="scores")
-    refused(tmp_path, tmp_path / "", "needs language.segmenter.model", model="")
-    refused(tmp_path, net, "needs language.segmenter.classes", classes="")
+    refused(tmp_path, tmp_path / "", "set language.segmenter.model", model="")
+    refused(tmp_path, net, "set language.segmenter.classes", classes="")
     refused(tmp_path, net, "cpu", device="tpu")
     refused(tmp_path, net, "There is no file .*language.segmenter.classes", classes=str(tmp_path / "absent.txt"))
 

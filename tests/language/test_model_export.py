@@ -208,7 +208,7 @@ def test_weights_that_are_pickled_are_not_read(tmp_path: Path) -> None:
     tiny_models.dinov2().save_pretrained(tmp_path)
     torch.save({}, tmp_path / "pytorch_model.bin")
     (tmp_path / "model.safetensors").unlink()
-    with pytest.raises(ModelError, match="is no checkpoint"):
+    with pytest.raises(ModelError, match="does not contain a checkpoint"):
         read_checkpoint(str(tmp_path), None, None, None)
 
 

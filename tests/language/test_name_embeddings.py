@@ -84,9 +84,9 @@ def test_files_that_cannot_be_used_are_reported(tmp_path: Path) -> None:
     np.testing.assert_allclose(NameEmbeddings.read(tmp_path / "good.npz").embeddings, embeddings, atol=1e-6)
     told("no usable array 'names'", embeddings=embeddings)
     told("no usable array 'embeddings'", names=names, embeddings=embeddings[0])
-    told("one finite embedding", names=names[1:], embeddings=embeddings)
-    told("one finite embedding", names=names, embeddings=0 * embeddings)
-    told("one finite embedding", names=names, embeddings=np.where(np.eye(200, 64) > 0, np.nan, embeddings))
+    told("one finite, nonzero embedding", names=names[1:], embeddings=embeddings)
+    told("one finite, nonzero embedding", names=names, embeddings=0 * embeddings)
+    told("one finite, nonzero embedding", names=names, embeddings=np.where(np.eye(200, 64) > 0, np.nan, embeddings))
     told("at least 100", names=names[:50], embeddings=embeddings[:50])
     told("damaged", names=np.array([{"a": 1}] * 200, dtype=object), embeddings=embeddings)
     with pytest.raises(ConfigError, match=r"There is no file .*give an \.npz file"):

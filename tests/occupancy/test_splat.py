@@ -236,7 +236,7 @@ def test_a_gpu_that_is_not_there_is_reported() -> None:
     torch = pytest.importorskip("torch")
     with pytest.raises(ConfigError, match="cpu or cuda"):
         splat.check(splat.Options(device="gpu"))
-    with pytest.raises(ConfigError, match="on the processor only"):
+    with pytest.raises(ConfigError, match="only on the CPU"):
         splat.Options(device="cuda:0", projection="integrated")
     if not torch.cuda.is_available():
         with pytest.raises(DependencyError, match="needs a GPU"):

@@ -26,6 +26,6 @@ def test_options_come_from_bases_in_other_files() -> None:
     found = {option.name: option for option in syntax_trees.options_of("freeocc3d.language.encoders.dinov2")}
     assert list(found)[:5] == ["model", "templates", "contrast", "threshold", "device"]
     assert found["short_side"].default == 448
-    assert found["short_side"].doc == "Frames are resized so that their shorter side has this many pixels."
+    assert found["short_side"].doc == "Frames are resized to this many pixels on the shorter side."
     assert found["window"].type == "a whole number from 0 to 4096 or null"
     assert syntax_trees.options_of("freeocc3d.settings.registry") == ()
