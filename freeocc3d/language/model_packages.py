@@ -251,7 +251,7 @@ def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:
         value = manifest.get(key, default)
         value = float(value) if kind is float and isinstance(value, int) else value
         if not isinstance(value, kind) or isinstance(value, bool):
-            raise refuse(f"'{key}' is missing or not a {kind.__name__}")
+            raise refuse(f"'{key}' is missing or not of type {kind.__name__}")
         return value
 
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:

@@ -150,7 +150,7 @@ def test_posteriors_of_classes_that_are_mapped_to_one_are_added(tmp_path: Path) 
     ("text", "told"),
     [
         ("classes: [plant]\nmap: {void: null, lettuce: plant, bluebell: plant}", "what 'tomato' becomes"),
-        ("classes: [plant]\nmap: {void: stone}", "'stone', which is none"),
+        ("classes: [plant]\nmap: {void: stone}", "'stone', which is not one"),
         ("map: {void: null}", "must hold 'classes'"),
         ("classes: plant", "a list of names"),
         ("- plant", "becomes"),

@@ -206,7 +206,7 @@ def test_pickled_weights_are_refused(server: Hub) -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("someone/else", "has no repository someone/else"),
+        ("someone/else", "has no readable repository someone/else"),
         ("clip-b16-opena", r"is not a repository OWNER/NAME .* \(did you mean 'clip-b16-openai'\?\)"),
         ("a/b/c", "is not a repository OWNER/NAME"),
         ("a/..", "is not a repository OWNER/NAME"),

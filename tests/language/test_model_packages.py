@@ -62,8 +62,8 @@ def test_what_is_not_onnx_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("inputs", "outputs", "message"),
     [
-        ({"pixels": [1, 3, 8, 8]}, {"features": [1, 2, 2, 8]}, r"takes pixels and gives features; the image network"),
-        ({"image": [1, 3, 8, 8]}, {"logits": [1, 2]}, r"takes image and gives logits; the image network of a 'dense'"),
+        ({"pixels": [1, 3, 8, 8]}, {"features": [1, 2, 2, 8]}, r"takes pixels and gives features, but the image network"),
+        ({"image": [1, 3, 8, 8]}, {"logits": [1, 2]}, r"takes image and gives logits, but the image network of a 'dense'"),
         (
             {"image": [1, 3, 8, 8], "size": [2]},
             {"features": [1, 2, 2, 8]},
@@ -89,8 +89,8 @@ def test_other_inputs_and_outputs_are_reported(tmp_path: Path, inputs: Any, outp
     [
         ({"format": 2}, "it must contain format: 1"),
         ({"kind": "diffusion"}, "kind 'diffusion' is not one of clip"),
-        ({"dimension": "8"}, "'dimension' is missing or not a int"),
-        ({"dimension": True}, "'dimension' is missing or not a int"),
+        ({"dimension": "8"}, "'dimension' is missing or not of type int"),
+        ({"dimension": True}, "'dimension' is missing or not of type int"),
         ({"dimension": 0}, "must be greater than 0"),
         ({"dimension": 1 << 40}, "must be greater than 0, and usual"),
         ({"patch": 300}, "and 'input_size' must not be less than 'patch'"),
@@ -153,7 +153,7 @@ def test_packages_are_found_by_folder_and_by_name(tmp_path: Path, home: Path) ->
     assert model_packages.find_model(str(home / "tiny"), ("dense",), "x").name == "tiny"
     with pytest.raises(ModelError, match=r"There is no model 'tinny' \(did you mean 'tiny'\?\)"):
         model_packages.find_model("tinny", ("dense",), "x")
-    with pytest.raises(ModelError, match=r"language\.clip\.model needs a model of kind clip; .* is of kind dense"):
+    with pytest.raises(ModelError, match=r"language\.clip\.model needs a model of kind clip, but .* is of kind dense"):
         model_packages.find_model("tiny", ("clip",), "language.clip.model")
     (tmp_path / "beside").mkdir()
     with pytest.raises(ModelError, match=r"There is no model '\.\./beside'"):
