@@ -165,7 +165,7 @@ class LanguageOptions(TypedOptions, frozen=True):
 
 
 class VocabularyOptions(TypedOptions, frozen=True):
-    """Names of what is in the scene, from a vision-language model. A word that is asked for competes with them."""
+    """Names of what is in the scene, from a vision-language model. The word in a query competes with them."""
 
     endpoint: str | None = None
     """Address of an OpenAI-compatible server, such as http://localhost:11434/v1 (Ollama). Keyframes are sent to it.

@@ -183,7 +183,9 @@ def test_pooling_is_the_weighted_mean_of_masks_means() -> None:
 def test_lacking_and_mistaken_models_are_reported(folders: dict[str, str]) -> None:
     with pytest.raises(ModelError, match=r"language\.trident\.sam is empty"):
         trident.load(trident.Options(**{**folders, "sam": ""}))
-    with pytest.raises(ModelError, match=r"language\.trident\.dino needs a model of kind backbone, but .* is of kind sam"):
+    with pytest.raises(
+        ModelError, match=r"language\.trident\.dino needs a model of kind backbone, but .* is of kind sam"
+    ):
         trident.load(trident.Options(**{**folders, "dino": folders["sam"]}))
     with pytest.raises(ConfigError, match="'points' must be from 0 to 64"):
         trident.Options(points=100)

@@ -62,8 +62,16 @@ def test_what_is_not_onnx_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("inputs", "outputs", "message"),
     [
-        ({"pixels": [1, 3, 8, 8]}, {"features": [1, 2, 2, 8]}, r"takes pixels and gives features, but the image network"),
-        ({"image": [1, 3, 8, 8]}, {"logits": [1, 2]}, r"takes image and gives logits, but the image network of a 'dense'"),
+        (
+            {"pixels": [1, 3, 8, 8]},
+            {"features": [1, 2, 2, 8]},
+            r"takes pixels and gives features, but the image network",
+        ),
+        (
+            {"image": [1, 3, 8, 8]},
+            {"logits": [1, 2]},
+            r"takes image and gives logits, but the image network of a 'dense'",
+        ),
         (
             {"image": [1, 3, 8, 8], "size": [2]},
             {"features": [1, 2, 2, 8]},

@@ -173,7 +173,7 @@ class Options(TypedOptions, frozen=True):
     """How pixels get color names."""
 
     stride: PositiveInt = 4
-    """Edge in pixels of the blocks whose memberships are averaged into one feature."""
+    """Edge in pixels of the blocks over which memberships are averaged into one feature."""
     white: tuple[Channel, Channel, Channel] | None = None
     """RGB (16 to 255) of a white thing in this capture, for scans in colored or dim light; null = colors are not
     corrected."""
