@@ -1,5 +1,5 @@
-"""Imports flow one way, within rooms too, and what has to start fast imports nothing heavy. Read from the syntax trees:
-nothing runs."""
+"""Imports flow one way, also within rooms, and what must start fast imports nothing heavy. Reads the syntax trees
+only."""
 
 import ast
 from collections.abc import Iterator
@@ -99,8 +99,8 @@ def _walk(node: ast.AST, package: list[str], lazy: bool, typing_only: bool) -> I
 
 
 def own(imported: Import) -> str | None:
-    """The module within the package that an import names, None for other packages. The root package itself, of which
-    only the version is taken, is "__init__"."""
+    """The module within the package that an import names; None for other packages. The root package itself is
+    "__init__"; only its version is imported."""
     if imported.module == "freeocc3d":
         return "__init__"
     return imported.module.removeprefix("freeocc3d.") if imported.module.startswith("freeocc3d.") else None

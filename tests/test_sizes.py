@@ -1,4 +1,4 @@
-"""Files and functions are short: read from the syntax trees."""
+"""Files and functions are short, according to their syntax trees."""
 
 import ast
 from pathlib import Path

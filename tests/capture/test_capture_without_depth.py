@@ -1,4 +1,4 @@
-"""``capture.depth=false``: every reader gives color alone, and no depth file is looked at."""
+"""``capture.depth=false``: every reader gives color alone, and opens no depth file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lists of classes, and what the classes of one taxonomy become in another."""
+"""Lists of classes, and maps from one taxonomy's classes to another's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A lens: undistorted pixels where OpenCV's own point formula puts them, and nothing done where nothing distorts."""
+"""A lens: undistorted pixels match OpenCV's own point formula, and a lens without distortion changes nothing."""
 
 import cv2
 import numpy as np

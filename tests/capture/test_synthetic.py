@@ -1,4 +1,4 @@
-"""The built-in room: the same frame whenever it is asked for, exact where it says so, disturbed as a sensor would."""
+"""The built-in room: the same frame at every request, exact or with the noise of a sensor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trajectory files of other systems: each form against poses that are known, and the frames that they belong to."""
+"""Trajectory files of other systems: each format against known poses, and the frames that the poses belong to."""
 
 import json
 from pathlib import Path

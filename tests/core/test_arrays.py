@@ -1,4 +1,4 @@
-"""Arrays in files: nothing is unpickled, and sizes are checked first."""
+"""Arrays in files: reading unpickles nothing, and checks sizes first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The noise of depth: what an image states, else what a sensor's usually is, pixel by pixel as for whole images."""
+"""The noise of depth: an image's own, or the sensor's usual noise; the same by pixel and by image."""
 
 import numpy as np
 import pytest

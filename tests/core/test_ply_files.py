@@ -1,4 +1,4 @@
-"""PLY files: what is written reads back, and no file is believed before its size bears its header out."""
+"""PLY files: what is written reads back, and the size of a file is checked against its header."""
 
 from pathlib import Path
 

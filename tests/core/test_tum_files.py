@@ -1,4 +1,4 @@
-"""TUM's form of trajectories: what is written comes back, and what is damaged is told."""
+"""Trajectories in TUM's format: what is written reads back, and damage is reported."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What other views confirm, on exact and on wrong depths."""
+"""Depth that other views confirm, on exact and on wrong depths."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Depth of a scan without depth: the built-in room at its true poses."""
+"""Multi-view stereo on the built-in room at its true poses."""
 
 import shutil
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Matching scores against a plain reference, written pixel by pixel."""
+"""Matching scores against a plain per-pixel reference."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""The planes of a room whose walls are bare, found from its edges; rays that meet them, against a plain reference."""
+"""The planes of a room with bare walls, found from its edges; ray intersections against a plain reference."""
 
 from dataclasses import dataclass, fields
 
@@ -71,8 +71,8 @@ def _through_door(start: np.ndarray, ends: np.ndarray) -> np.ndarray:
 
 
 def _room(behind: int = 0) -> _Room:
-    """A box of which the edges, the floor and a window's frame were measured; with ``behind``, it has a door, and
-    about as many points of the wall and the floor behind it."""
+    """A box whose edges, floor and window frame were measured; with ``behind``, it has a door, and about as many points
+    of the wall and the floor behind it."""
     rng = np.random.default_rng(0)
     zero = np.zeros(3)
     parts = [side[_to_rim(side, zero, _SIZE) < 0.06] for side in _sides(zero, _SIZE)]

@@ -1,4 +1,4 @@
-"""Points of a scan: what is confirmed, and how it is merged in cells."""
+"""Points of a scan: which are confirmed, and how they are merged in cells."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The depth source by multi-view stereo: whose poses and points it takes, and what it does to frames."""
+"""The depth source by multi-view stereo: the poses and points that it uses, and the frames that it returns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth of a view from a surface, and from planes where the surface only spans a gap."""
+"""Depth of a view from a surface, or from planes where the surface only spans a gap."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Depth of one view by its neighbors, against analytic depth."""
+"""Depth of one view from its neighbors, against analytic depth."""
 
 import numpy as np
 import pytest

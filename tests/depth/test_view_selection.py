@@ -1,4 +1,4 @@
-"""Partners by what frames share and by angle."""
+"""Partner views, chosen by shared points and by angle."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The surface that explains rays: the march and the cut against plain references, and bodies that are known."""
+"""The surface that explains rays: ray marching and graph cut against plain references, and known bodies."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Every command that the documentation shows is one that the program takes: names, arguments, options, settings."""
+"""The program accepts every command in the documentation: names, arguments, options, settings."""
 
 from __future__ import annotations
 

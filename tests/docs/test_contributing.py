@@ -1,4 +1,4 @@
-"""The examples of CONTRIBUTING.md are complete: they are installed as a package of somebody else, and used."""
+"""The examples of CONTRIBUTING.md are complete: they work as an installed package of another author."""
 
 from __future__ import annotations
 

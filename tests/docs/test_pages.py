@@ -1,4 +1,4 @@
-"""Pages are short, name files that exist, and their Python names what the package has."""
+"""Pages are short, name existing files, and use the package's names in their Python code."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_every_key_of_json_is_explained(module: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_python_names_what_there_is(page: Path) -> None:
-    """Imports from the package, and attributes of what is imported."""
+    """Imports from the package, and attributes of imported names."""
     for block in re.findall(r"```python[^\n]*\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
         imported = {}
         for node in ast.walk(ast.parse(block)):
@@ -75,6 +75,6 @@ def test_python_names_what_there_is(page: Path) -> None:
 
 
 def taken(module: str, name: str) -> object:
-    """What ``from module import name`` gives."""
+    """The object that ``from module import name`` gives."""
     loaded = importlib.import_module(module)
     return getattr(loaded, name) if hasattr(loaded, name) else importlib.import_module(f"{module}.{name}")

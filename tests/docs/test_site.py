@@ -1,4 +1,4 @@
-"""The site builds without a warning, links included, and asks nothing of the network."""
+"""The site builds without a warning, with working links, and needs no network."""
 
 from __future__ import annotations
 

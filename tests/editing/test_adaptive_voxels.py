@@ -1,4 +1,4 @@
-"""Voxels that are small only where they show more: the built-in room with its two cups."""
+"""Smaller voxels only where they show more: the built-in room with its two cups."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Finer voxels in a box: the paper's cups, which are one lump at 8 cm and two cups at 5 mm."""
+"""Finer voxels in a box: the paper's cups, one lump at 8 cm and two cups at 5 mm."""
 
 import json
 from pathlib import Path

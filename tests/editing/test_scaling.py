@@ -1,4 +1,4 @@
-"""The scale of maps: the built-in room, which is in meters, made half as large and said to be in no unit."""
+"""The scale of maps: a copy of the built-in room at half its size, without a unit."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Scores of cases that are counted by hand."""
+"""Scores of hand-counted cases."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What maps, Gaussians and finished grids claim about the voxels of a truth's lattice."""
+"""The predictions of maps, Gaussians and finished grids for the voxels of a truth's lattice."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""The builder of ground truths: an analytic scene matched exactly, a plain reference, and the shipped truths."""
+"""The builder of ground truths: an exact analytic scene, a plain reference, and the shipped truths."""
 
 from pathlib import Path
 

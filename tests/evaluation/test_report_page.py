@@ -1,4 +1,4 @@
-"""The report page: one file, true to the figures, honest about what is not there."""
+"""The report page: one file that shows the figures and states what is missing."""
 
 import base64
 import re
@@ -69,8 +69,8 @@ class Page(HTMLParser):
 
 
 def room(name: str = "room", classes: bool = True, way: bool = False) -> ScoredScene:
-    """A floor of walls' class, a sofa on it of which a part is missed and a part is called a lamp, an invented block;
-    what the truth does not know is predicted occupied everywhere."""
+    """A floor with the class of walls, a sofa on it, partly missed and partly called a lamp, and an invented block;
+    everything unknown to the truth is predicted occupied."""
     true = np.zeros((20, 12, 10), np.uint8)
     true[:, :, 0] = 1
     true[2:8, 2:8, 1:4] = 2

@@ -1,4 +1,4 @@
-"""The restricted unpickler: arrays and plain values come back, everything else is refused before it happens."""
+"""The restricted unpickler: it returns arrays and plain values, and refuses everything else before it runs."""
 
 import os
 import pickle

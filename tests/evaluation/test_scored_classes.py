@@ -1,4 +1,4 @@
-"""Class files: which classes are scored, and how other names map to them."""
+"""Class files: the scored classes, and the map from other names to them."""
 
 from pathlib import Path
 

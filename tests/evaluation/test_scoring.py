@@ -1,4 +1,4 @@
-"""Whole evaluations: pooled scenes, class lists, real captures, and what does not fit."""
+"""Whole evaluations: pooled scenes, class lists, real captures, and inputs that do not match."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Errors of trajectories: cases counted by hand, and evo on the same files."""
+"""Errors of trajectories: hand-counted cases, and evo on the same files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Exact distances against SciPy's and against solids whose distances are known."""
+"""Exact distances against SciPy's, and against solids with known distances."""
 
 import numpy as np
 import pytest

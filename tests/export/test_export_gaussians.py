@@ -1,4 +1,4 @@
-"""The export of Gaussians: upright, and read by a program that others wrote."""
+"""The export of Gaussians: upright, and read by another author's program."""
 
 import contextlib
 import json

@@ -1,4 +1,4 @@
-"""What all exporters have in common: what they refuse, and that nothing is left of what they could not write."""
+"""All exporters: what they refuse, and that a failed export leaves nothing behind."""
 
 import errno
 from types import SimpleNamespace

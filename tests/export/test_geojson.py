@@ -1,4 +1,4 @@
-"""GeoJSON of what words find."""
+"""GeoJSON of the regions that words find."""
 
 import json
 

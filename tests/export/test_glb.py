@@ -1,4 +1,4 @@
-"""glTF files, loaded by trimesh and judged by Khronos' validator."""
+"""glTF files, loaded by trimesh and checked by Khronos' validator."""
 
 import contextlib
 import json

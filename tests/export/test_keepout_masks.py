@@ -1,4 +1,4 @@
-"""Costs of words, read by map_server's own rules and compared with distances that are known."""
+"""Costs of words, read by map_server's own rules and compared with known distances."""
 
 import json
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""A planner's own software on an exported map: OMPL plans, FCL tells collisions from the OctoMap file."""
+"""A planner's own software on an exported map: OMPL plans, FCL finds collisions in the OctoMap file."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def apartment():
 
 
 def collision_free(path, tree_size):
-    """Whether a sphere at a point touches nothing occupied, told by FCL from the file."""
+    """Whether a sphere at a point touches nothing occupied, according to FCL and the file."""
     nodes = path.read_bytes().split(b"data\n", 1)[1]
     tree = fcl.CollisionObject(fcl.OcTree(tree_size, np.frombuffer(nodes, np.int8)))
     sphere = fcl.Sphere(RADIUS)

@@ -1,4 +1,4 @@
-"""PLY: closed surfaces, and the colorings that are computed."""
+"""PLY: closed surfaces, and computed colors."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Denoising: the kernel against plain NumPy, noise that averages out, and points that are no surface."""
+"""Denoising: the kernel against plain NumPy, noise that averages out, and points off any surface."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Fitting: what it improves, what it may not touch, and that nothing makes it run away."""
+"""Fitting: what it improves, what it must not change, and that it stays stable."""
 
 from dataclasses import replace
 

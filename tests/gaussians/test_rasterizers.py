@@ -13,7 +13,7 @@ NAMES = "means", "scales", "quats", "opacities", "colors"
 
 
 def scene(n: int, seed: int = 0, dtype: torch.dtype = torch.float32):
-    """Gaussians before, beside and behind a turned camera, of every size and opacity."""
+    """Gaussians in front of, next to and behind a turned camera, of every size and opacity."""
     rng = np.random.default_rng(seed)
     arrays = (
         rng.uniform((-1.5, -1.5, -0.5), (1.5, 1.5, 3.5), (n, 3)),

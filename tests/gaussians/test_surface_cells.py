@@ -1,4 +1,4 @@
-"""Sums by cells: the compiled ones against plain NumPy, and what they may not depend on."""
+"""Sums by cells: compiled against plain NumPy, and independent of the order of the input."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Splats are sorted and listed as NumPy would."""
+"""Splats are sorted and listed as in NumPy."""
 
 import numpy as np
 

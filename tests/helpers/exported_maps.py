@@ -1,4 +1,4 @@
-"""Maps in memory for the tests of exporters, and what reads the files back."""
+"""Maps in memory for the tests of exporters, and readers of the exported files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small networks for tests: a 1 x 1 convolution of the image, in the forms in which segmentation networks come."""
+"""Small networks for tests: a 1 x 1 convolution of the image, in every form of segmentation networks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tests of whole runs share: a short scan of the built-in room, and what a map's folder holds."""
+"""Shared by tests of whole runs: a short scan of the built-in room, and the content of a map's folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Analytic scenes for tests: Gaussians, depth images and occupancy whose right answers are known."""
+"""Analytic scenes for tests: Gaussians, depth images and occupancy with known answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared by the tests: tiny captures written to a folder, and the way to the large ones."""
+"""Tiny captures, written to a folder, and the folder of the large ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 SIZE = 32, 24
-"""Width and height of the images that are written, unless told otherwise."""
+"""Width and height of the images that are written by default."""
 
 DEPTH_M = 2.0
 """Depth of frame 0's pixels; frame i is a centimeter farther."""
@@ -27,10 +27,10 @@ def data_folder() -> Path:
 
 
 def models_folder() -> Path:
-    """The folder of small real networks beside the captures, or skip the test."""
+    """The folder of small real networks next to the captures, or skip the test."""
     folder = data_folder().parent / "models"
     if not folder.is_dir():
-        pytest.skip(f"no networks in {folder}: they stand beside the captures, see FREEOCC3D_DATA")
+        pytest.skip(f"no networks in {folder}: they belong next to the captures, see FREEOCC3D_DATA")
     return folder
 
 

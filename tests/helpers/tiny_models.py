@@ -1,4 +1,4 @@
-"""Tiny networks with random weights, and a vocabulary for them, that the tests of model packages share."""
+"""Tiny networks with random weights, and their vocabulary, for the tests of model packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tiny videos for the tests, whose frames tell their own number."""
+"""Tiny videos for the tests; each frame shows its own number."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real HTTP server that plays a vision-language model: what it answers is up to the test."""
+"""A real HTTP server that plays a vision-language model; each test sets the answers."""
 
 from __future__ import annotations
 

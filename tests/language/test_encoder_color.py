@@ -1,4 +1,4 @@
-"""Color names: what words mean, what surfaces under imperfect light are called, and the encoder's contract."""
+"""Color names: the meaning of words, the names of surfaces under imperfect light, and the encoder's contract."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Segmentation networks as encoders: every form in which they come, what is refused, and which words reach a class."""
+"""Segmentation networks as encoders: every form of network, what is refused, and the words that match a class."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Coded features: how much a cosine loses, what stays exact, and that scores need no decoding."""
+"""Coded features: the loss in cosine, what stays exact, and scores without decoding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which keyframes are encoded when not all are: sharp ones that show the most."""
+"""The choice of keyframes to encode when not all are encoded: sharp ones that show the most."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checkpoints become model packages: OpenCLIP's form against a plain network, transformers' by the command."""
+"""Checkpoints become model packages: OpenCLIP's format against a plain network, transformers' by the command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pulling models from a hub: a server that speaks the Hugging Face hub's protocol, and misbehaves when told to."""
+"""Pulling models from a hub: a server with the Hugging Face hub's protocol, which fails on request."""
 
 from __future__ import annotations
 

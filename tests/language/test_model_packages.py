@@ -1,4 +1,4 @@
-"""Model packages: what is read, and what is refused, in words."""
+"""Model packages: what is read, and the messages about what is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which names mean a class, by how near their embeddings are beside others."""
+"""The names that mean a class, by the distances between their embeddings and those of other names."""
 
 from __future__ import annotations
 

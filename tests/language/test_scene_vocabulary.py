@@ -1,4 +1,4 @@
-"""A scene's vocabulary: names out of answers of all kinds, counted over keyframes, kept for a run that goes on."""
+"""A scene's vocabulary: names from all kinds of answers, counted over keyframes, kept for a resumed run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The word side of a model package: its tokenizer against CLIP's, its network, and what is kept on disk."""
+"""The text side of a model package: its tokenizer against CLIP's, its network, and its cache on disk."""
 
 from __future__ import annotations
 

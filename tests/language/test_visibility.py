@@ -1,4 +1,4 @@
-"""What is and is not seen of Gaussians, and how well: the compiled kernel against NumPy."""
+"""Which Gaussians a view sees, and how well: the compiled kernel against NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Questions to a vision-language model over HTTP: a real server that answers in every way that servers do."""
+"""Questions to a vision-language model over HTTP: a real server with every kind of answer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def asking(url: str, pauses: list[float] | None = None, **given: Any) -> VisionS
 
 
 def failing(answer: Answer, told: str, final: bool, asked: int = 1, **given: Any) -> str:
-    """The sentence that is told of a server, and how often it was asked."""
+    """The error message about a server, and the number of requests."""
     with serving(answer) as server, pytest.raises(ServerError, match=told) as caught:
         asking(server.url, **given).ask("What?", JPEG)
     assert caught.value.final == final

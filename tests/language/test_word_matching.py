@@ -1,4 +1,4 @@
-"""Scores beside other words, and hysteresis."""
+"""Scores relative to other words, and hysteresis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gravity frame of rooms whose floor, walls and cameras are known, seen from any frame."""
+"""The gravity frame of rooms with a known floor, walls and cameras, in any frame."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Keyframes that come, go and move: the same map as from scratch, with only their blocks made again."""
+"""Keyframes are added, removed and moved: the same map as from scratch, with only their blocks rebuilt."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Maps of several voxel sizes brought to one, by blocks, against the same done voxel by voxel."""
+"""Maps of several voxel sizes resampled to one, by blocks, against the same voxel by voxel."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The projection against its plain reference and against cases whose answers are known."""
+"""The projection against its plain reference and known answers."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What a user is warned of after a run."""
+"""The warnings after a run."""
 
 from __future__ import annotations
 

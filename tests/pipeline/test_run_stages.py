@@ -1,4 +1,4 @@
-"""Stages of a run: interruption, resuming, a full disk, and names by a vision model."""
+"""Stages of a run: interruption, resuming, a full disk, and names by a vision-language model."""
 
 from __future__ import annotations
 

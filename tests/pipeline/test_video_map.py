@@ -1,4 +1,4 @@
-"""From a video to a map: the built-in room as a video file, with a trajectory and points that are in no unit."""
+"""From a video to a map: the built-in room as a video file, with a trajectory and points without a unit."""
 
 from pathlib import Path
 

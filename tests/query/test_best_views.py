@@ -1,4 +1,4 @@
-"""Which keyframes show a region: a thing in front of a wall, seen and hidden."""
+"""The keyframes that show a region: a thing in front of a wall, seen and hidden."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Asking by class: a partition of the map, by names that it has."""
+"""Queries by class: a partition of the map by its class names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Asking by picture: which part of it is looked at, and what looks like it."""
+"""Queries by picture: the part that is used, and the regions that look like it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boxes of regions, against turned things whose boxes are known."""
+"""Oriented bounding boxes of regions, against turned things with known boxes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Things that touch are told apart, and single things are not: on analytic shapes."""
+"""Touching things are separated, and single things are not: on analytic shapes."""
 
 from __future__ import annotations
 

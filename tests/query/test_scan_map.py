@@ -1,4 +1,4 @@
-"""A map that answers: words, classes and pictures, and where what it finds is."""
+"""A map that answers words, classes and pictures, and the places of the answers."""
 
 import numpy as np
 import pytest

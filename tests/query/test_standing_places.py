@@ -1,4 +1,4 @@
-"""Standing places in rooms of 10 cm voxels whose floor is the layer k = 0."""
+"""Standing places in rooms of 10 cm voxels with the floor in layer k = 0."""
 
 from __future__ import annotations
 

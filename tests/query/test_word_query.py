@@ -1,4 +1,4 @@
-"""Queries on tiny synthetic maps whose voxels' features are put in by hand."""
+"""Queries on tiny synthetic maps with features set by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Types with ranges: what fits, and what a message says of what does not."""
+"""Types with ranges: which values are valid, and the messages about the others."""
 
 import ast
 from typing import Annotated, Any, Literal

@@ -1,4 +1,4 @@
-"""The options of the stages: every default fits its type, and no number is without an end."""
+"""The options of the stages: every default has its type, and every number has a range."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Keyframes on disk: what comes back, scaled as well, and what is damaged."""
+"""Keyframes on disk: what is saved reads back, also scaled, and damage is reported."""
 
 import json
 from pathlib import Path

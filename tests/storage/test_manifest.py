@@ -1,4 +1,4 @@
-"""The manifest: what is written is read, and what is damaged is named with its file and field."""
+"""The manifest: what is written reads back, and damage is reported with file and field."""
 
 from pathlib import Path
 from typing import Any

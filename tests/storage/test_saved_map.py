@@ -1,4 +1,4 @@
-"""Saved maps, opened: what is saved comes back, and what is damaged is named."""
+"""Saved maps: what is saved reads back, and damage is reported."""
 
 import shutil
 

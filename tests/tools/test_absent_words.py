@@ -1,4 +1,4 @@
-"""The benchmark's words: which names are absent, and what its rows say."""
+"""The benchmark's absent words: which names count as absent, and its rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark: a few frames of a real scan through every part, its tables, and what it says of what is lacking."""
+"""The benchmark: a few frames of a real scan through every part, its tables, and its words for what is missing."""
 
 import json
 from pathlib import Path

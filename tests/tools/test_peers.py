@@ -1,4 +1,4 @@
-"""The benchmark's peers on a wall whose voxels are known."""
+"""The benchmark's peers on a wall with known voxels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the benchmark says of plans for robots, and of exporters, on cases that are known."""
+"""The benchmark's figures of plans for robots, and of exporters, on known cases."""
 
 import numpy as np
 import pytest

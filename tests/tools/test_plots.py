@@ -1,4 +1,4 @@
-"""The benchmark's pictures: what is in them, and that the same figures draw the same file."""
+"""The benchmark's pictures: their content, and the same file from the same figures."""
 
 from __future__ import annotations
 

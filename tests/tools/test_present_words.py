@@ -1,4 +1,4 @@
-"""The benchmark's present words: what counts as found, and what its rows say."""
+"""The benchmark's present words: what counts as found, and its rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The altered captures of the benchmark are what their names say, and what is measured on them is told."""
+"""The altered captures of the benchmark match their names, and its measurements are reported."""
 
 import numpy as np
 import pytest

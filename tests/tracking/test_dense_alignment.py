@@ -1,4 +1,4 @@
-"""Dense alignment: planes and poses of analytic scenes, normal equations against NumPy, what is not determined."""
+"""Dense alignment: planes and poses of analytic scenes, normal equations against NumPy, undetermined directions."""
 
 from dataclasses import replace
 

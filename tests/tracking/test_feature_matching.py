@@ -41,7 +41,8 @@ def test_matches_are_mutual_and_unrivalled() -> None:
 
 
 def images_on_a_line(count: int) -> list[np.ndarray]:
-    """Descriptors of images each of which shares most of what it shows with the next; the last is at the first."""
+    """Descriptors of images in a row: each shares most of its content with the next, and the last image is the first
+    one again."""
     rng = np.random.default_rng(2)
     world = unit(rng.normal(size=(40 * count + 160, 32)))
     images = [world[40 * n : 40 * n + 160] for n in range(count)]

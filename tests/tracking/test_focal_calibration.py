@@ -1,4 +1,4 @@
-"""Whether color and depth fit each other, asked of scans: one that is rendered right, one made wrong, real ones."""
+"""Whether the color and depth of a scan match: a correct rendered scan, an altered one, and real ones."""
 
 import numpy as np
 import pytest

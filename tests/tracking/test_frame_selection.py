@@ -1,4 +1,4 @@
-"""Frames of a long scan: sharp ones, as far apart as image motion says."""
+"""Frames of a long scan: sharp ones, spaced by image motion."""
 
 import cv2
 import numpy as np

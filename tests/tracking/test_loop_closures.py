@@ -1,4 +1,5 @@
-"""Places, closures, the joint refinement, submaps: on rendered and real captures, and with closures that are wrong."""
+"""Place recognition, loop closures, joint refinement, submaps: on rendered and real captures, and with wrong
+closures."""
 
 import numpy as np
 import pytest

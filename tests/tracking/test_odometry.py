@@ -1,4 +1,4 @@
-"""Open3D's odometry as a tracker: a real scan, loss that is told, overlap edges, resuming."""
+"""Open3D's odometry as a tracker: a real scan, reported loss, overlap edges, resuming."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The tracker of RGB-D scans: followed, lost, found again, submaps, altered captures, resuming."""
+"""The tracker of RGB-D scans: tracking, loss, relocalization, submaps, altered captures, resuming."""
 
 from dataclasses import replace
 

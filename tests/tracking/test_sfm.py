@@ -1,4 +1,4 @@
-"""What structure from motion finds: its scale, and its file."""
+"""The result of structure from motion: its scale, and its file."""
 
 from dataclasses import fields, replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Poses by structure from motion: of the rendered room, of scans that cannot be reconstructed, and from a model."""
+"""Poses by structure from motion: from the rendered room, from scans that cannot be reconstructed, and from a model."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from freeocc3d.tracking.trackers.colmap import ColmapTracker, Options
 
 
 class Listener(Progress):
-    """Remembers what it is told, and presses Ctrl-C in a stage."""
+    """Remembers the progress that it gets, and raises Ctrl-C in a stage."""
 
     def __init__(self, stop_in: str = "") -> None:
         self.stop_in = stop_in

@@ -1,4 +1,4 @@
-"""Trajectories against the truth: which poses belong together, and the alignment that is found."""
+"""Trajectories against the truth: the matching of poses, and their alignment."""
 
 from pathlib import Path
 

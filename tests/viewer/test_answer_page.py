@@ -1,4 +1,4 @@
-"""An answer as one page: what it says is what was found, and it needs nothing beside it."""
+"""An answer as one page: it shows the regions that were found, and needs no other file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures: written, of the promised size, showing what they should."""
+"""Pictures: written, of the right size, with the right content."""
 
 from types import SimpleNamespace
 

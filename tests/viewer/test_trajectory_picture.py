@@ -1,4 +1,4 @@
-"""The picture of the camera's way: it is drawn where it was, with what is apart beside it."""
+"""The picture of the camera path: drawn at the right place, with separate submaps next to it."""
 
 from pathlib import Path
 
