@@ -1,10 +1,10 @@
-# Every target does all the set-up that it needs; nothing else has to be run first.
+# Every target sets up all that it needs; run nothing else first.
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-# Tests that need seconds of each room: whole folders where none is slow.
+# The fast tests of each room; a whole folder if all its tests are fast.
 QUICK  := tests/test_imports.py tests/core tests/settings tests/capture tests/occupancy tests/export \
 	$(addprefix tests/tracking/test_, tracking.py frame_selection.py dense_alignment.py) \
 	$(addprefix tests/gaussians/test_, anchors.py denoising.py splat_ply.py) \
@@ -15,7 +15,7 @@ QUICK  := tests/test_imports.py tests/core tests/settings tests/capture tests/oc
 
 .PHONY: help demo quick test lint docs wheel-test benchmark setup system clean
 
-demo: setup  ## build the built-in room, map it, ask it three words, write pictures to demo/
+demo: setup  ## map the built-in room, ask three words, write pictures to demo/
 	$(BIN)/freeocc3d demo -o demo --overwrite
 
 help:  ## list the targets
@@ -34,7 +34,7 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-docs: setup  ## the documentation as a site in site/
+docs: setup  ## build the documentation as a site in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 wheel-test: setup  ## build the wheel, install it into an empty environment, and run its demo
@@ -52,7 +52,7 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
 	@touch $@
 
-# Libraries that the wheels of open3d (libusb, libgomp) and pyvista (EGL, GL) load but do not carry.
+# Libraries that the wheels of open3d (libusb, libgomp) and pyvista (EGL, GL) load but do not contain.
 system:
 	@sh tools/system_libraries.sh
 

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs the shared libraries that the wheels load but do not carry, or prints the command that does.
+# Installs the shared libraries that the wheels load but do not contain, or prints the command for it.
 missing=""
 need() {  # need SONAME DEBIAN-PACKAGE
     /sbin/ldconfig -p 2>/dev/null | grep -q "$1" || missing="$missing $2"

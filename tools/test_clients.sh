@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs the programs of Debian's that tests open exports with, where this user may; else those tests are skipped.
+# Installs the Debian programs that open exports in tests, if this user may; otherwise those tests are skipped.
 missing=""
 command -v compare_octrees >/dev/null 2>&1 || missing="$missing octomap-tools"
 /usr/bin/python3 -c 'import pyopenvdb' >/dev/null 2>&1 || /usr/bin/python3 -c 'import openvdb' >/dev/null 2>&1 ||
