@@ -1,1 +1,1 @@
-"""LAYER 1: dense depth for scans without any: multi-view stereo, the scan's surface, its planes, depth networks."""
+"""LAYER 1: dense depth for scans without depth: multi-view stereo, surface, building planes, depth networks."""

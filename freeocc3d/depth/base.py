@@ -1,4 +1,4 @@
-"""The contract of a depth source: how far the things are that a scan's frames show, where no sensor measured it."""
+"""The contract of a depth source, which gives depth maps to frames without sensor depth."""
 
 from __future__ import annotations
 
@@ -12,27 +12,26 @@ from ..tracking.base import Tracker
 
 
 class DepthSource(ABC):
-    """Gives frames the depth that they lack."""
+    """Adds depth to frames that lack it."""
 
     offline: ClassVar[bool] = False
-    """Whether ``prepare`` works through the whole scan before the first frame is completed."""
+    """Whether ``prepare`` processes the whole scan before ``complete`` gets the first frame."""
 
     def prepare(self, tracker: Tracker, folder: Path, frames: range, progress: Progress) -> None:  # noqa: B027, most have nothing to do
-        """What is done for the whole scan before its first frame is completed; called if ``offline``, after
-        ``tracker.prepare``.
+        """Process the whole scan before the first frame is completed; called if ``offline``, after ``tracker.prepare``.
 
-        tracker: the one whose poses are used, and which prepares the frames.  folder: takes whatever lets an
-        interrupted run go on; gone when the map is there.  frames: those of the capture that are used.
-        Raises TrackingError for a scan whose depth cannot be found.
+        tracker: gives the poses and prepares the frames.  folder: keeps what an interrupted run needs to continue; it
+        is deleted when the map is finished.  frames: the selected frames of the capture.
+        Raises TrackingError if no depth can be estimated for the scan.
         """
 
     @abstractmethod
     def complete(self, frame: Frame) -> Frame:
-        """The frame with its depth; ``frame`` is what ``tracker.prepare_frame`` gave."""
+        """The frame with its depth. frame: a frame from ``tracker.prepare_frame``."""
 
 
 class MeasuredDepth(DepthSource):
-    """What the frames hold already, from the capture's sensor or from their tracker."""
+    """Keeps the depth that the frames have, from the capture's sensor or from the tracker."""
 
     def complete(self, frame: Frame) -> Frame:
         return frame

@@ -1,4 +1,4 @@
-"""The planes of a building: floors, ceilings, walls and what stands along them, as rays meet them."""
+"""The planes of a building (floors, ceilings, walls and surfaces parallel to them), and rays that meet them."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-_NEAR, _FAR, _FAR_OUTERMOST = 0.97, 1.05, 1.1  # times the surface's depth
+_NEAR, _FAR, _FAR_OUTERMOST = 0.97, 1.05, 1.1  # limits of a plane's depth, times the surface's depth
 
 
 @dataclass(frozen=True)
 class Plane:
-    """The points X of the world with ``normal`` · X = ``offset`` in those squares of the plane where a surface is
-    supposed.
+    """The world points X with ``normal`` · X = ``offset``, within the squares of the plane that support a surface.
 
-    normal: (3,) float64, of length 1.  offset, square: meters.  axes: (2, 3) orthonormal, along the plane.
-    support: (U, V) bool of squares of that edge, the lower corner of the first of which has the coordinates ``corner``
-    along the axes.  outermost: whether no other in its direction lies farther out; then it goes on wherever it is not
-    seen through.
+    normal: (3,) float64, unit.  offset: meters.  axes: (2, 3) orthonormal, in the plane.
+    square: edge of a square, meters.  support: (U, V) bool, whether each square supports a surface.
+    corner: (2,) lower corner of the first square, along the axes, meters.  outermost: whether no plane of its direction
+    lies farther out; such a plane extends to all squares that no ray crosses.
     """
 
     normal: NDArray[np.float64]
@@ -40,7 +39,7 @@ _ROWS: dict[str, tuple[str, tuple[int, ...]]] = {
 
 
 class Layout:
-    """Planes, as rays meet them."""
+    """The planes of a building."""
 
     EXPECTED: ClassVar[dict[str, tuple[str, int]]] = {
         **{name: (kind, 1 + len(shape)) for name, (kind, shape) in _ROWS.items()},
@@ -56,7 +55,7 @@ class Layout:
         self._packed = (*(arrays[name] for name in names), starts, far)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """The planes as arrays whose names and kinds are those of ``Layout.EXPECTED``."""
+        """The planes as arrays with the names and kinds of ``Layout.EXPECTED``."""
         planes = self.planes
         return {
             "normals": np.array([plane.normal for plane in planes], np.float64).reshape(-1, 3),
@@ -71,14 +70,14 @@ class Layout:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> Layout:
-        """The inverse of ``to_arrays``. Raises ValueError if they do not fit each other."""
+        """The inverse of ``to_arrays``. Raises ValueError for inconsistent arrays."""
         count, rows = len(arrays["offsets"]), [arrays[name] for name in _ROWS]
         fit = all(row.shape == (count, *shape) for row, (_, shape) in zip(rows, _ROWS.values(), strict=True))
         if not fit or not all(np.isfinite(row).all() for row in rows) or not (arrays["squares"] > 0).all():
-            raise ValueError("arrays that are not those of planes")
-        sizes = arrays["shapes"].astype(np.float64).prod(axis=1)  # whole numbers would overflow
+            raise ValueError("arrays that do not describe planes")
+        sizes = arrays["shapes"].astype(np.float64).prod(axis=1)  # integers would overflow
         if (arrays["shapes"] <= 0).any() or sizes.sum() != len(arrays["support"]):
-            raise ValueError("planes of other sizes than their squares")
+            raise ValueError("planes whose sizes do not match their squares")
         normals, offsets, axes, corners, squares, shapes, outermost = rows
         parts = np.split(arrays["support"], np.cumsum(sizes.astype(np.int64))[:-1]) if count else []
         return cls(
@@ -93,9 +92,11 @@ class Layout:
     def near(
         self, origin: NDArray[np.float64], directions: NDArray[np.float64], times: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Where the plane of a wall may take the surface's place: (N,), how many times (N, 3) directions reach the
-        first plane that is supposed there, about as far away as the surface is, which they reach after (N,) ``times``;
-        0 = there is none. What lies before the surface is known to be free."""
+        """Find planes near a surface, to replace it.
+
+        directions: (N, 3) of rays from ``origin``.  times: (N,) ray parameters where the rays meet the surface.
+        Returns (N,) ray parameters of the first supported plane at about the depth of the surface; 0 = none. A plane
+        may not lie clearly before the surface, because that space is free."""
         return _nearest(origin, directions, times, *self._packed)
 
 

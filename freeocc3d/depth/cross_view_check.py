@@ -1,4 +1,4 @@
-"""Which depths of a view the depths of other views confirm."""
+"""Checks the depths of a view against the depths of other views."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from .photo_consistency import compute_rays
 
 @dataclass(frozen=True)
 class DepthImage:
-    """Inverse depths of a posed view: ``inverse`` and its standard deviation ``sigma``, (H, W) float32, 1 / meters;
-    ``inverse`` 0 = none."""
+    """Inverse depths of a posed view. inverse: (H, W) float32, 1 / meters, 0 = none.  sigma: its standard deviation,
+    (H, W) float32, 1 / meters."""
 
     inverse: NDArray[np.float32]
     sigma: NDArray[np.float32]
@@ -28,8 +28,9 @@ class DepthImage:
 
 @dataclass(frozen=True)
 class ConfirmedDepth:
-    """Per pixel, (H, W): how many views agree and how many look through the point; the mean ``inverse`` depth of all
-    that agree, weighted by their variances; its standard deviation ``sigma``, of which their spread is part."""
+    """Per pixel, (H, W). agreeing: number of views that agree.  through: number of views that look through the point.
+    inverse: mean inverse depth of the agreeing views, weighted by inverse variance, 1 / meters.  sigma: its standard
+    deviation, which includes the spread of the views."""
 
     agreeing: Tensor
     through: Tensor
@@ -40,8 +41,8 @@ class ConfirmedDepth:
 def confirm_depth(
     view: DepthImage, others: Sequence[DepthImage], tolerance: float, device: str = "cpu"
 ) -> ConfirmedDepth:
-    """``view`` compared with ``others``: a view agrees where its depth, seen from the first one, differs by at most the
-    ``tolerance`` (relative) or two standard deviations, whichever is more."""
+    """Compare ``view`` with ``others``. Another view agrees if its depth, transformed to ``view``, differs by no more
+    than the ``tolerance`` (relative) or two standard deviations, whichever is larger."""
     inverse, sigma = (torch.from_numpy(a).to(device) for a in (view.inverse, view.sigma))
     there = inverse > 0
     points = compute_rays(view.camera, device) / inverse.clamp_min(1e-6)
@@ -66,18 +67,18 @@ def confirm_depth(
         weight, total, square = weight + own, total + own * here, square + own * here.square()
     mean = total / weight
     scatter = (square / weight - mean.square()).clamp_min(0.0)
-    # Neighbors share images, and with them their errors: the mean is not surer than a single one.
+    # Neighboring views share images and their errors: the mean is no more certain than a single view.
     return ConfirmedDepth(agreeing, through, mean, torch.sqrt((agreeing + 1) / weight + scatter))
 
 
 def _moved(T: NDArray[np.float64], points: Tensor) -> Tensor:
-    """(3, H, W) points by a rigid transform."""
+    """Transform (3, H, W) points by a rigid transform."""
     M = torch.from_numpy(T[:3]).float().to(points.device)
     return torch.einsum("ij,jhw->ihw", M[:, :3], points) + M[:, 3].reshape(3, 1, 1)
 
 
 def _sampled(image: DepthImage, points: Tensor, device: str) -> tuple[Tensor, Tensor]:
-    """The image's inverse depth and sigma at the nearest pixel that (3, H, W) points are seen at; 0 outside."""
+    """Inverse depth and sigma of ``image`` at the nearest pixels of (3, H, W) points; inverse depth is 0 outside."""
     camera = image.camera
     z = points[2].clamp_min(1e-6)
     u = torch.round(points[0] / z * camera.fx + camera.cx)

@@ -1,7 +1,7 @@
-"""A monocular depth network as a second opinion: an ONNX file that guesses (inverse) depth from one image.
+"""Runs a monocular depth network, an ONNX file that predicts (inverse) depth from one image, and fuses it with stereo.
 
-What such networks give is right up to a scale and a shift of inverse depth (R. Ranftl et al., Towards Robust Monocular
-Depth Estimation, PAMI 2022), which each frame's stereo depth tells.
+Such a prediction is correct up to a scale and a shift of inverse depth (R. Ranftl et al., Towards Robust Monocular
+Depth Estimation, PAMI 2022). The stereo depth of each frame determines both.
 """
 
 from __future__ import annotations
@@ -16,48 +16,50 @@ from numpy.typing import NDArray
 from ..core.errors import ModelError
 from ..core.onnx_session import load_session
 
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, on which encoders are trained
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, the training data of the encoders
 _FREE_SIZE = 518
 _PATCH = 14
 _LEAST_PIXELS = 200
 _OUTLIERS = 2.5  # robust standard deviations
-_LEAST_RELATIVE = 0.02  # of inverse depth: no guess is taken for better
+_LEAST_RELATIVE = 0.02  # smallest relative standard deviation of a predicted inverse depth
 _METRIC = {"depth": True, "inverse": False}
 
 
 class DepthNetwork:
-    """Calls the network; its metadata ``output`` says "inverse" (the default) or "depth"."""
+    """Calls the network. Its metadata ``output`` is "inverse" (the default) or "depth"."""
 
     def __init__(self, session: Any, path: Path):
         inputs, self._session = session.get_inputs(), session
         if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].shape[1] != 3:
-            raise ModelError(f"{path} is no depth network: it must take one image, (1, 3, H, W).")
+            raise ModelError(f"{path} is not a depth network: it must take one image, (1, 3, H, W).")
         self._path, self._input = path, inputs[0]
         said = session.get_modelmeta().custom_metadata_map.get("output", "inverse")
         if said not in _METRIC:
-            raise ModelError(f"{path}: its metadata 'output' must be inverse or depth, not {said}.")
+            raise ModelError(f"{path}: the metadata 'output' must be inverse or depth, not {said}.")
         self._is_depth = _METRIC[said]
 
     def __call__(self, color: NDArray[np.uint8], width: int, height: int) -> NDArray[np.float32]:
-        """(height, width) inverse depth in no unit, from (H, W, 3) uint8 RGB. Raises ModelError."""
+        """(height, width) inverse depth without a unit, from (H, W, 3) uint8 RGB. Raises ModelError."""
         rows, columns = self._size(color)
         image = cv2.resize(color, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         image = (image - np.array(_MEAN, np.float32)) / np.array(_DEVIATION, np.float32)
         try:
             output = self._session.run(None, {self._input.name: image.transpose(2, 0, 1)[None]})[0]
-        except Exception as error:  # onnxruntime's exceptions have no common base of their own
+        except Exception as error:  # onnxruntime's exceptions share no base class
             raise ModelError(f"{self._path} fails on an image of {columns} x {rows} pixels: {error}") from error
         found = np.asarray(output, np.float32)
         found = (
             found.reshape(found.shape[-2:]) if found.ndim >= 2 and found.size == np.prod(found.shape[-2:]) else found
         )
         if found.ndim != 2 or not np.isfinite(found).all():
-            raise ModelError(f"{self._path} is no depth network: its output of shape {output.shape} is no depth image.")
+            raise ModelError(
+                f"{self._path} is not a depth network: its output of shape {output.shape} is not a depth map."
+            )
         inverse = 1.0 / np.maximum(found, 1e-3) if self._is_depth else found
         return np.asarray(cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
     def _size(self, color: NDArray[np.uint8]) -> tuple[int, int]:
-        """Rows and columns of the input: as the network fixes them, else in whole patches of vision transformers."""
+        """Rows and columns of the input: fixed by the network, else multiples of a vision transformer's patch."""
         rows, columns = self._input.shape[2:]
         if isinstance(rows, int) and isinstance(columns, int):
             return rows, columns
@@ -67,15 +69,16 @@ class DepthNetwork:
 
 
 def load_depth_network(path: Path, device: str = "cpu") -> DepthNetwork:
-    """The network in an ONNX file. Raises ModelError, ConfigError."""
+    """Load the network in an ONNX file. Raises ModelError, ConfigError."""
     return DepthNetwork(load_session(path, device), path)
 
 
 def fuse_guess(
     inverse: NDArray[np.float32], sigma: NDArray[np.float32], guess: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Stereo's inverse depth and sigma with a network's guess, weighted by their variances; the guess alone where
-    stereo has none. All (H, W). A frame in which too little is known to place the guess stays as it is."""
+    """Fuse stereo's inverse depth and sigma with a network's prediction, weighted by inverse variance. The prediction
+    alone fills pixels without stereo. All are (H, W). A frame with too little stereo depth to fit the prediction stays
+    unchanged."""
     known = inverse > 0
     if np.count_nonzero(known) < _LEAST_PIXELS:
         return inverse, sigma

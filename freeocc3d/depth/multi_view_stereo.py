@@ -1,4 +1,4 @@
-"""Dense depth of a scan's posed frames by multi-view stereo, for captures that have none."""
+"""Dense depth of a scan's posed frames by multi-view stereo, for captures without depth."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ from .watertight_surface import WatertightSurface, build_surface
 __all__ = ["Options", "StereoDepth", "StereoView"]
 
 _AT_ONCE = 16  # frames
-_FILES_KEPT = 64  # in memory: images and depths of the frames around the one in work
+_FILES_KEPT = 64  # kept in memory: images and depths around the current frame
 _STORED: dict[str, dict[str, tuple[str, int]]] = {
     "view": {"grey": ("u", 2), "T_world_cam": ("f", 2), "size": ("i", 1), "camera": ("f", 1)},
     "guess": {"inverse": ("f", 2)},
     **{stage: {"inverse": ("f", 2), "sigma": ("f", 2)} for stage in ("measured", "depth")},
 }
 _SURFACE = {"vertices": ("f", 2), "sigma_m": ("f", 1), "triangles": ("i", 2), "cell_m": ("f", 1)}
-_EACH_WAY = 8  # pixels: depths that are looked at for how deep the scan is
+_EACH_WAY = 8  # pixel step of the depths that give the typical depth of the scan
 _LEAST_POINTS = 100
 _Result = TypeVar("_Result")
-_SAME_SURFACE = 0.02  # relative: beyond it, depths of adjacent pixels belong to different things
+_SAME_SURFACE = 0.02  # largest relative depth difference of adjacent pixels of one surface
 
 
 class StereoDepth:
-    """Depth of a scan's frames: what each measures becomes points that others confirm, these the surface of the scan,
-    and this the depth of each. One file a frame and stage in ``folder``, and one of the surface: what is there is not
-    computed again."""
+    """Depth maps of a scan's frames. Each frame measures depth, other frames confirm its points, all confirmed points
+    give the surface of the scan, and the surface gives the depth of each frame. ``folder`` holds one file per frame and
+    stage, and the surface; existing files are not computed again."""
 
     def __init__(self, folder: Path, options: Options):
         self.folder, self.options = folder, options
@@ -69,10 +69,11 @@ class StereoDepth:
         progress: Progress,
         prepared: Callable[[Frame], Frame] = lambda frame: frame,
     ) -> None:
-        """Depth of those of ``frames`` that have a pose and partners.
+        """Compute the depth of those ``frames`` that have a pose and partner views.
 
-        prepared: the frame as a pinhole camera sees it, should the capture's frames be distorted.
-        Raises TrackingError if hardly any frame has others to be compared with; ModelError, about the network.
+        prepared: undistorts a frame to a pinhole camera.
+        Raises TrackingError if too few frames have partner views, or hardly any point is confirmed; ModelError for the
+        network.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         T = np.full_like(scan.T_world_cam, np.nan)
@@ -86,16 +87,16 @@ class StereoDepth:
         able = [frame for frame, partners in enumerate(chosen.partners) if len(partners)]
         if len(able) < 2:
             raise TrackingError(
-                f"No depth can be had from the images of {capture.path}: no two of its frames see the same things from "
-                "different places. Move the camera sideways, do not only turn it."
+                f"The images of {capture.path} give no depth: no two frames see the same objects from different "
+                "places. Move the camera sideways; do not only turn it."
             )
         self._compute("measured", able, functools.partial(self._measure, chosen=chosen, apart=apart), progress)
         if not self._surface_path.exists():
             points = self._points(able, chosen, progress)
             if len(points.points) < _LEAST_POINTS:
                 raise TrackingError(
-                    f"No depth can be had from the images of {capture.path}: hardly anything in them was found to be "
-                    "equally far away by several. They may be blurred, or show bare surfaces, or their poses be wrong."
+                    f"The images of {capture.path} give no depth: hardly any point has the same depth in several "
+                    "images. The images may be blurred or show bare surfaces, or the poses may be wrong."
                 )
             surface = build_surface(points, T[able, :3, 3])
             self._save(surface, detect_layout(points, T[able, :3, 3], surface.normals()))
@@ -104,8 +105,8 @@ class StereoDepth:
         )
 
     def depth(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """(H, W) depth in meters of a frame, 0 = none, and its standard deviation, at the size of ``prepared`` frames;
-        None for a frame that has none. Raises MapError for a file that is damaged."""
+        """(H, W) depth of a frame, meters, 0 = none, and its standard deviation, meters, at the size of ``prepared``
+        frames; None for a frame without depth. Raises MapError for a damaged file."""
         if not self._path("depth", index).exists():
             return None
         height, width = self._load("view", index)["size"].tolist()
@@ -114,7 +115,7 @@ class StereoDepth:
     def _compute(
         self, stage: str, frames: Sequence[int], step: Callable[[int], DepthImage], progress: Progress
     ) -> None:
-        """``step`` of the frames that have no file of the stage yet."""
+        """Run ``step`` for the frames without a file of the stage."""
         missing = [frame for frame in frames if not self._path(stage, frame).exists()]
         progress.stage(f"stereo: {stage}", len(missing))
         for done, frame, depth in self._each(missing, step):
@@ -122,13 +123,13 @@ class StereoDepth:
             progress.advance(done)
 
     def _each(self, frames: Sequence[int], step: Callable[[int], _Result]) -> Iterator[tuple[int, int, _Result]]:
-        """How many are done, a frame, and ``step`` of it. On a CPU each core has a frame of its own: their images are
-        too small to be shared out."""
+        """Yield the number of finished frames, a frame, and the result of ``step`` for it. On a CPU, each core works on
+        its own frame, because the images are too small to divide."""
         workers = count_threads() if self.options.device == "cpu" else 1
         threads = torch.get_num_threads()
         pool = ThreadPoolExecutor(workers, "stereo", initializer=torch.set_num_threads, initargs=(1,))
         try:
-            for start in range(0, len(frames), _AT_ONCE):  # so that results do not pile up
+            for start in range(0, len(frames), _AT_ONCE):  # limits the waiting results
                 some = frames[start : start + _AT_ONCE]
                 for done, (frame, found) in enumerate(zip(some, pool.map(step, some), strict=True), start=start + 1):
                     yield done, frame, found
@@ -144,7 +145,7 @@ class StereoDepth:
         progress: Progress,
         prepared: Callable[[Frame], Frame],
     ) -> list[int]:
-        """Keep what is needed of each image; returns the frames that are broken."""
+        """Store what the stages need of each image. Returns the broken frames."""
         path = self.options.network
         network = (
             None if path is None else depth_network.load_depth_network(Path(path).expanduser(), self.options.device)
@@ -212,9 +213,13 @@ class StereoDepth:
         vertices, triangles = stored["vertices"], stored["triangles"]
         shapes = tuple(stored[name].shape for name in ("vertices", "sigma_m", "triangles", "cell_m"))
         if shapes != ((len(vertices), 3), (len(vertices),), (len(triangles), 3), (1,)):
-            raise MapError(f"{self._surface_path} is damaged: its arrays do not fit each other.")
+            raise MapError(
+                f"{self._surface_path} is damaged: its arrays have inconsistent sizes. Delete it and resume."
+            )
         if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
-            raise MapError(f"{self._surface_path} is damaged: it has triangles of points that it does not have.")
+            raise MapError(
+                f"{self._surface_path} is damaged: its triangles have missing corners. Delete it and resume."
+            )
         return WatertightSurface(vertices, stored["sigma_m"], triangles, float(stored["cell_m"][0]))
 
     def _layout(self) -> Layout:
@@ -222,10 +227,10 @@ class StereoDepth:
         try:
             return Layout.from_arrays(read_arrays(path, Layout.EXPECTED))
         except ValueError as error:
-            raise MapError(f"{path} is damaged: it has {error}.") from error
+            raise MapError(f"{path} is damaged: it holds {error}.") from error
 
     def _save(self, surface: WatertightSurface, planes: Layout) -> None:
-        """The surface last: where it is, both are."""
+        """Save both files, the surface last: if it exists, both exist."""
         write_arrays(self.folder / "layout.npz", planes.to_arrays())
         arrays = {name: getattr(surface, name) for name in ("vertices", "sigma_m", "triangles")}
         write_arrays(self._surface_path, {**arrays, "cell_m": np.array([surface.cell_m])})
@@ -260,14 +265,14 @@ class StereoDepth:
 
 
 def _shrunk(view: StereoView, size: int) -> StereoView:
-    """The view with a longer side of ``size`` pixels, or of fewer if it has fewer; both sides even."""
+    """The view reduced to at most ``size`` pixels on the longer side; both sides are even."""
     camera = view.intrinsics
     by = min(1.0, size / max(camera.width, camera.height))
     return view.shrunk(2 * round(camera.width * by / 2), 2 * round(camera.height * by / 2))
 
 
 def _enlarged(depth: DepthImage, width: int, height: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Inverse depths and their sigma at another size: between pixels of one surface they are interpolated."""
+    """Inverse depth and sigma at another size. Depth is interpolated only between pixels of one surface."""
     nearest = cv2.resize(depth.inverse, (width, height), interpolation=cv2.INTER_NEAREST)
     between = cv2.resize(depth.inverse, (width, height), interpolation=cv2.INTER_LINEAR)
     smooth = (nearest > 0) & (np.abs(between - nearest) < _SAME_SURFACE * nearest)
@@ -278,6 +283,6 @@ def _enlarged(depth: DepthImage, width: int, height: int) -> tuple[NDArray[np.fl
 def _meters(
     inverse: NDArray[np.float32], sigma: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth and its standard deviation from those of inverse depth."""
+    """Convert inverse depth and its standard deviation to depth and its standard deviation, meters."""
     depth_m = np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     return depth_m, np.asarray(sigma * depth_m**2, np.float32)

@@ -1,7 +1,8 @@
-"""Photo-consistency: how well other views agree with a reference view about hypothetical depths of its pixels.
+"""Photo-consistency: how well other views agree with hypothetical depths of a reference view's pixels.
 
-Depths are handled as inverse depths: along them a pixel moves nearly evenly through the other images, and over a plane
-they are linear in the pixel. Source: R. T. Collins, A Space-Sweep Approach to True Multi-Image Matching, CVPR 1996.
+All depths are inverse depths: with equal steps of inverse depth, a pixel moves nearly evenly through the other images,
+and on a plane inverse depth is linear in the pixel. Source: R. T. Collins, A Space-Sweep Approach to True Multi-Image
+Matching, CVPR 1996.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from ..core.transforms import invert
 from ..core.types import Intrinsics
 
 NOISE = 3.0 / 255.0
-"""Standard deviation of what differs between two images of the same surface; fainter texture scores little."""
+"""Standard deviation of the difference of two images of one surface. Weaker texture gets a low score."""
 
-_AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 24}  # pixels x hypotheses; on a CPU such that they stay in its cache
+_AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 24}  # pixels x hypotheses; on a CPU they fit in its cache
 
 
 @dataclass(frozen=True)
 class StereoView:
-    """An image whose camera is known.
+    """An image with a known camera.
 
     color: (H, W, 3) uint8 RGB, or (H, W) float32 gray in 0…1 for ``intrinsics`` of that size.
     T_world_cam: (4, 4) float64.
@@ -38,7 +39,7 @@ class StereoView:
     T_world_cam: NDArray[np.float64]
 
     def shrunk(self, width: int, height: int) -> StereoView:
-        """The same view in gray, of another size."""
+        """The same view in gray, at another size."""
         image = self.color
         if image.ndim == 3:
             image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255.0))
@@ -48,17 +49,17 @@ class StereoView:
 
 
 def compute_rays(camera: Intrinsics, device: str | torch.device = "cpu") -> Tensor:
-    """(3, H, W) points at depth 1 that the pixels see."""
+    """(3, H, W) points at depth 1 on the rays of the pixels."""
     v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     return torch.stack((x, y, torch.ones_like(x))).float().to(device)
 
 
 class Matcher:
-    """A reference view and the V views that it is compared with, all gray and of one size.
+    """Compares a reference view with V other views, all gray and of one size.
 
-    Patches of (2 radius + 1)² pixels are compared by zero-mean normalized cross-correlation, each pixel at the depth
-    that it has itself: where the hypotheses vary over a patch, it is slanted or curved as they are.
+    It compares patches of (2 radius + 1)² pixels by zero-mean normalized cross-correlation. Each pixel of a patch has
+    its own depth hypothesis, so a patch can be slanted or curved.
     """
 
     def __init__(self, view: StereoView, others: Sequence[StereoView], radius: int, device: str = "cpu"):
@@ -70,10 +71,10 @@ class Matcher:
         self._sources = [(self._image(other), *self._projection(view, other)) for other in others]
         baselines = [np.linalg.norm((invert(o.T_world_cam) @ view.T_world_cam)[:3, 3]) for o in others]
         self.pixel = 1.0 / (self.camera.fx * float(np.median(baselines)))
-        """Inverse depth that moves a point by about one pixel in the other views."""
+        """Step of inverse depth that moves a point by about one pixel in the other views."""
 
     def scores(self, inverse_depth: Tensor) -> Tensor:
-        """Correlations in -1…1 of the reference with each view; 0 where that does not see the point.
+        """Correlations, -1…1, of the reference with each view; 0 where the view does not see the point.
 
         inverse_depth: (D, H, W) or (D, 1, 1) hypotheses.  Returns (V, D, H, W).
         """
@@ -86,7 +87,7 @@ class Matcher:
         return out
 
     def agreement(self, inverse_depth: Tensor) -> Tensor:
-        """(D, H, W) mean of the better half of the views' scores, so that what hides a point from some does not count.
+        """(D, H, W) mean of the better half of the views' scores, so that occlusion in some views does not count.
 
         Source: S. B. Kang, R. Szeliski, J. Chai, Handling Occlusions in Dense Multi-view Stereo, CVPR 2001.
         """
@@ -110,11 +111,11 @@ class Matcher:
         return scores * inside
 
     def _image(self, view: StereoView) -> Tensor:
-        return torch.from_numpy(view.color).to(self.device) - 0.5  # sums of squares keep more digits
+        return torch.from_numpy(view.color).to(self.device) - 0.5  # makes sums of squares more accurate
 
     def _projection(self, view: StereoView, other: StereoView) -> tuple[Tensor, Tensor]:
-        """(3, H, W) and (3, 1, 1, 1): their sum, the latter times the inverse depth, is the homogeneous place in the
-        other image, whose borders are -1 and 1."""
+        """(3, H, W) a and (3, 1, 1, 1) b: a + inverse depth * b is the homogeneous position in the other image, with
+        borders at -1 and 1."""
         camera = other.intrinsics
         to_grid = np.array(
             [[2.0 / camera.width, 0.0, 1.0 / camera.width - 1.0], [0.0, 2.0 / camera.height, 1.0 / camera.height - 1.0],
@@ -126,16 +127,16 @@ class Matcher:
 
 
 def average_best_half(scores: Tensor) -> Tensor:
-    """(V, …) to (…): the mean of the better half of the views."""
+    """Mean of the better half of the views: (V, …) to (…)."""
     count = (len(scores) + 1) // 2
     return scores.mean(dim=0) if count == len(scores) else scores.topk(count, dim=0)[0].mean(dim=0)
 
 
 def average_box(images: Tensor, radius: int) -> Tensor:
-    """(D, H, W): means over the part of (2 radius + 1)² pixels around each that lies in the image."""
+    """(D, H, W) means over the (2 radius + 1)² pixels around each pixel, as far as they lie in the image."""
     if images.device.type != "cpu":
         return average_box_reference(images, radius)
-    size = (2 * radius + 1,) * 2  # OpenCV's sums run along rows and columns: four times as fast as pooling
+    size = (2 * radius + 1,) * 2  # OpenCV sums along rows and columns: four times as fast as pooling
     inside = np.ones(images.shape[1:], np.float32)
     share = 1.0 / cv2.boxFilter(inside, -1, size, borderType=cv2.BORDER_CONSTANT)
     means = np.empty(images.shape, np.float32)

@@ -1,8 +1,8 @@
-"""Finds the planes of a building from what little is measured of them.
+"""Finds the planes of a building from few measured points.
 
-A bare wall has no texture that could be matched, but the edges around it and on it can: the surface of the scan spans
-what lies between them by large triangles, and the wall's plane is where it should be put. Most walls are at right
-angles; so three directions are found first in which most points lie in layers, and then the layers.
+A bare wall has no texture to match, but the edges on and around it have. Between them, the surface of the scan has only
+large triangles; the plane of the wall gives the right position. Most walls are at right angles. So three directions are
+found first, along which most points lie in layers, and then the layers.
 Sources of the ideas: J. Coughlan, A. Yuille, Manhattan World, ICCV 1999; Y. Furukawa et al., Manhattan-world Stereo,
 CVPR 2009.
 """
@@ -20,17 +20,17 @@ from .scan_points import ScanPoints
 
 _MOST_PLANES = 60
 _LEAST_POINTS = 60
-# Lengths in cells of the points; sizes of pieces in squares of a plane.
-_WITHIN = 1.0  # off a plane, of what lies on it
-_LAYER = 0.6  # layers that points are counted in
-_BESIDE = 4.0  # up to here a surface that runs through the plane is looked for
+# Lengths are in cells of the points, sizes of pieces in squares of a plane.
+_WITHIN = 1.0  # largest distance of a point on the plane
+_LAYER = 0.6  # thickness of the layers for counting points
+_BESIDE = 4.0  # largest distance to look for a surface that crosses the plane
 _SQUARE = 2.0
-_SEEN_THROUGH = 3.0  # beyond the plane, or 3 sigma
+_SEEN_THROUGH = 3.0  # smallest distance behind the plane of a point seen through it, or 3 sigma
 _PIECE, _HELD = 60, 30
 _GAPS = (4, 8, 16, 32)
-_GAP_OF_PIECE = 0.3  # gaps up to this share of a piece's length are closed
-_REACH = 34  # squares that a plane may go on beyond its points
-_MOST_SQUARES = 1 << 24  # a plane of more is some stray points far apart
+_GAP_OF_PIECE = 0.3  # largest closed gap, as a share of a piece's length
+_REACH = 34  # squares by which a plane may extend beyond its points
+_MOST_SQUARES = 1 << 24  # a larger plane consists of stray points
 
 _TURNS_DEG = (
     -0.5,
@@ -38,18 +38,18 @@ _TURNS_DEG = (
     0.0,
     0.25,
     0.5,
-)  # of the second and third direction about the first, for walls that are not quite at right angles
-_LEAST_ALIKE = 0.9  # cosine between the normals of a plane before and after it is fitted
-_TILT = 0.003  # radians: standard deviation of a plane's normal before its points are asked
+)  # of the second and third direction about the first, for walls not quite at right angles
+_LEAST_ALIKE = 0.9  # smallest cosine between a plane's normals before and after the fit
+_TILT = 0.003  # radians: prior standard deviation of a plane's normal
 _DEPENDENT = 50.0  # points per independent measurement
-_BEHIND = 0.01  # share of the points that may lie behind the outermost wall
-_OUTERMOST = 60  # squares that it must hold
+_BEHIND = 0.01  # largest share of the points behind an outermost wall
+_OUTERMOST = 60  # smallest number of squares with points on an outermost plane
 
 
 @dataclass(frozen=True)
 class _Bounded:
-    """A plane where its points support it; the squares in which it is not seen through; how many hold points; which
-    points it takes."""
+    """A plane within its support. free: (U, V) squares that no ray crosses.  held: number of squares with points.
+    taken: (P,) the points on the plane."""
 
     plane: Plane
     free: NDArray[np.bool_]
@@ -58,10 +58,10 @@ class _Bounded:
 
 
 def detect_layout(points: ScanPoints, centers: NDArray[np.float64], normals: NDArray[np.float64]) -> Layout:
-    """The planes of a scan.
+    """Find the planes of a scan.
 
-    centers: (C, 3) of the cameras that ``points.ray_camera`` counts.  normals: (N, 3) of surfaces, of length 1 and any
-    sign, one of which at least is that of a wall or floor.
+    centers: (C, 3) camera centers, indexed by ``points.ray_camera``.  normals: (N, 3) unit surface normals of any sign,
+    at least one of a wall or floor.
     """
     if len(points.points) < _LEAST_POINTS or not len(normals):
         return Layout(())
@@ -70,8 +70,8 @@ def detect_layout(points: ScanPoints, centers: NDArray[np.float64], normals: NDA
 
 
 def find_directions(points: ScanPoints, normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3): rows at right angles to each other, along which points lie in layers. The first is that of the layer with
-    most points, and as exact as these say; it is the floor's more often than not."""
+    """(3, 3) orthogonal directions, as rows, along which points lie in layers. The first one belongs to the layer with
+    most points, usually the floor, and is fitted to its points."""
     X, cell = points.points - points.points.mean(axis=0), points.cell_m
     some = X[np.random.default_rng(0).permutation(len(X))[:40_000]]
     axes = _coarse(some, _commonest(normals), cell)
@@ -120,20 +120,20 @@ def _layer(heights: NDArray[np.float64], thickness: float) -> NDArray[np.int64]:
 
 
 def _layered(X: NDArray[np.float64], axes: NDArray[np.float64], thickness: float) -> float:
-    """How unevenly points lie along the axes."""
+    """How unevenly points are distributed along the axes."""
     return float(sum((np.bincount(_layer(X @ row, thickness)).astype(float) ** 2).sum() for row in axes))
 
 
 def _peaks(X: NDArray[np.float64], axis: NDArray[np.float64], thickness: float) -> float:
-    """The same, of what stands out from its surroundings alone: a floor seen edge-on says nothing about its azimuth."""
+    """The same for one axis, counting only peaks above their surroundings: a floor seen edge-on gives no azimuth."""
     count = np.bincount(_layer(X @ axis, thickness)).astype(float)
     count += np.append(count[1:], 0.0)
-    around = np.convolve(count, np.full(15, 1 / 15.0))[7 : 7 + len(count)]  # as many, however few layers
+    around = np.convolve(count, np.full(15, 1 / 15.0))[7 : 7 + len(count)]  # same length, even with few layers
     return float((np.maximum(count - around, 0.0) ** 2).sum())
 
 
 def _fitted(X: NDArray[np.float64], normal: NDArray[np.float64], offset: float, cell: float) -> NDArray[np.float64]:
-    """The normal of the plane through the points near one."""
+    """Fit a plane to the points near a given plane. Returns its normal."""
     for within in (1.5, 1.5, 1.5, 1.0, 1.0, 1.0):
         held = X[np.abs(X @ normal - offset) < within * cell]
         if len(held) < _LEAST_POINTS:
@@ -141,14 +141,14 @@ def _fitted(X: NDArray[np.float64], normal: NDArray[np.float64], offset: float, 
         mean = held.mean(axis=0)
         found = np.linalg.eigh((held - mean).T @ (held - mean))[1][:, 0]
         if abs(found @ normal) < _LEAST_ALIKE:
-            break  # they lie in a line
+            break  # the points lie on a line
         normal = found * np.sign(found @ normal)
         offset = float(normal @ mean)
     return normal
 
 
 def _layers(points: ScanPoints, centers: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
-    """Planes, those that hold most points first; what one holds the next ones do without.
+    """Planes in order of their number of points. Each point counts for one plane only.
 
     Source: P. Hough, Method and Means for Recognizing Complex Patterns, 1962.
     """
@@ -178,7 +178,7 @@ def _layers(points: ScanPoints, centers: NDArray[np.float64], axes: NDArray[np.f
         )
         bounded = None if plane is None else _bounded(points, centers, *plane)
         alike = group == group[row] if bounded is not None else np.arange(len(group)) == row
-        count[alike, max(at - 1, 0) : at + 2] = -np.inf  # never the same again
+        count[alike, max(at - 1, 0) : at + 2] = -np.inf  # do not find it again
         if bounded is None:
             continue
         found.append(bounded.plane)
@@ -193,8 +193,8 @@ def _tilted(
     X: NDArray[np.float64], sigma_m: NDArray[np.float64], left: NDArray[np.bool_], start: NDArray[np.float64],
     offset: float, cell: float,
 ) -> tuple[NDArray[np.float64], float] | None:  # fmt: skip
-    """The plane through the points near one, whose normal is known to a few milliradians beforehand: what hangs on a
-    corner's edge alone cannot turn it."""
+    """Fit a plane to the points near a given plane. The normal has a prior of a few milliradians, so points along a
+    single edge cannot turn it. Returns (normal, offset), or None with too few points."""
     normal, across = start, np.linalg.svd(start[None])[2][1:]
     for _ in range(4):
         held = left & (np.abs(X @ normal - offset) < _WITHIN * cell)
@@ -215,7 +215,7 @@ def _tilted(
 def _bounded(
     points: ScanPoints, centers: NDArray[np.float64], normal: NDArray[np.float64], offset: float
 ) -> _Bounded | None:
-    """The plane where its points support it; None if these are few or scattered."""
+    """The plane within the support of its points; None if they are few or scattered."""
     X, cell = points.points, points.cell_m
     square = _SQUARE * cell
     height = X @ normal - offset
@@ -241,7 +241,7 @@ def _bounded(
     beside = ~on & (np.abs(height) < _BESIDE * cell)
     count, above, below = counted(X[on]), counted(X[beside & (height > 0)]), counted(X[beside & (height < 0)])
     around = np.ones((3, 3), np.uint8)
-    # Another surface runs through it where there are as many points on both sides as on it.
+    # Another surface crosses the plane where as many points lie on both sides as on the plane.
     both_sides = (cv2.dilate(above, around) > 0) & (cv2.dilate(below, around) > 0)
     crossed = both_sides & (cv2.blur(above + below, (3, 3)) / (_BESIDE - 1.0) > 0.5 * cv2.blur(count, (3, 3)))
     held = _pieces((count >= 1) & ~crossed)
@@ -270,13 +270,13 @@ def _bounded(
 
 
 def _pieces(held: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Without those that are small."""
+    """Remove small pieces."""
     _, labels, sizes, _ = cv2.connectedComponentsWithStats(cv2.dilate(held.astype(np.uint8), np.ones((5, 5), np.uint8)))
     return held & np.isin(labels, np.flatnonzero(sizes[:, cv2.CC_STAT_AREA] >= _PIECE))
 
 
 def _closed(held: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """With the gaps closed that are small beside the pieces around them."""
+    """Close the gaps that are small relative to the pieces around them."""
     grid = held.astype(np.uint8)
     for gap in _GAPS:
         _, labels, sizes, _ = cv2.connectedComponentsWithStats(cv2.dilate(grid, _disc(2)))
@@ -294,8 +294,8 @@ def _disc(radius: int) -> NDArray[np.uint8]:
 
 
 def _outermost(points: ScanPoints, centers: NDArray[np.float64], axes: NDArray[np.float64]) -> list[Plane]:
-    """The floor, the ceiling and the walls that have hardly anything behind them: of the layers of which that is true,
-    those that hold most. They go on wherever they are not seen through."""
+    """The floor, the ceiling and the outer walls: in each direction, the layer with most points among those with hardly
+    anything behind them. Each extends to all squares that no ray crosses."""
     X, cell = points.points, points.cell_m
     everything, planes = np.ones(len(X), bool), []
     for outwards in np.concatenate((axes, -axes)):

@@ -1,4 +1,4 @@
-"""The points of a scan that several of its views measured, and the rays along which they did."""
+"""Points of a scan that several views confirm, and the rays from cameras to these points."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 from .cross_view_check import DepthImage, confirm_depth
 from .photo_consistency import compute_rays
 
-_SAME_DEPTH = 0.01  # relative: up to it views agree, whatever their standard deviations
-_LOOKING_THROUGH = 0.5  # views that contradict, over those that agree
-_CELL = 0.01  # of the scan's depth
+_SAME_DEPTH = 0.01  # relative difference within which views always agree
+_LOOKING_THROUGH = 0.5  # largest ratio of contradicting to agreeing views
+_CELL = 0.01  # edge of a cell, as a share of the scan's depth
 _LEAST_VIEWS = 2
-_BITS = 20  # of a cell's number along one axis
-_HALF = 1 << _BITS - 1  # its number in the middle
-_MOST = 500_000  # points: the cut through their tetrahedra takes some 2 GB
-_UNCONFIRMED = 4  # times as many are kept until it is known which ones other cameras measured, too
+_BITS = 20  # of a cell index along one axis
+_HALF = 1 << _BITS - 1  # the middle cell index
+_MOST = 500_000  # points: the graph cut of their tetrahedra takes about 2 GB
+_UNCONFIRMED = 4  # times as many cells are kept before unconfirmed ones are dropped
 
 
 @dataclass(frozen=True)
 class ScanPoints:
-    """points: (P, 3) float64 world.  sigma_m: (P,) meters.  ray_point, ray_camera: (R,) int32, the rays along which
-    points were measured.  cell_m: edge of the cells that hold one point each."""
+    """points: (P, 3) float64 world, meters.  sigma_m: (P,) meters.  ray_point, ray_camera: (R,) int32, point and camera
+    of each measuring ray.  cell_m: edge of the cells, meters; each cell holds one point."""
 
     points: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
@@ -36,8 +36,8 @@ class ScanPoints:
 def confirm_points(
     view: DepthImage, others: Sequence[DepthImage], agreeing: int, device: str = "cpu"
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N, 3) world points of a view that ``agreeing`` of the ``others`` see at the same depth, and few at a greater
-    one; their (N,) standard deviations in meters."""
+    """(N, 3) world points of a view, and their (N,) standard deviations, meters. At least ``agreeing`` of the
+    ``others`` see each point at the same depth, and few see through it."""
     found = confirm_depth(view, others, _SAME_DEPTH, device)
     keep = (found.agreeing >= agreeing) & (found.through <= _LOOKING_THROUGH * found.agreeing)
     there = keep.cpu().numpy() & (view.inverse > 0)
@@ -50,9 +50,9 @@ def confirm_points(
 def merge_points(
     measured: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], depth_m: float, most: int = _MOST
 ) -> ScanPoints:
-    """One point per cell of a hundredth of the scan's typical ``depth_m``: the mean of those in it, weighted by their
-    variances. Points that one camera alone measured are left out; cells are larger where there would be more than
-    ``most``.
+    """Merge points to one per cell: their mean, weighted by inverse variance. The edge of a cell is a hundredth of the
+    scan's typical ``depth_m``, and doubles until at most ``most`` points remain. Points from only one camera are left
+    out.
 
     measured: (N, 3) points and (N,) sigma, meters, of each camera.
     """
@@ -79,8 +79,8 @@ def merge_points(
 
 @dataclass(frozen=True)
 class _Cells:
-    """keys: (K,) int64, ascending, three numbers of a cell packed.  sums: (K, 5) of weights, weighted x, y, z, sigma.
-    ray_key, ray_camera: (R,) a cell holds what a camera measured, each pair once."""
+    """keys: (K,) int64, ascending, packed cell indices.  sums: (K, 5) sums of weights and of weighted x, y, z, sigma.
+    ray_key, ray_camera: (R,) unique pairs of a cell and a camera that measured a point in it."""
 
     edge: float
     keys: NDArray[np.int64]
@@ -103,7 +103,7 @@ class _Cells:
         return cls(edge, keys, sums, keys, np.full(len(keys), camera, np.int32))
 
     def coarser(self) -> _Cells:
-        """In cells of twice the edge."""
+        """The same content in cells with twice the edge."""
         keys, sums = _summed(_halved(self.keys), self.sums)
         ray_key, ray_camera = _halved(self.ray_key), self.ray_camera
         order = np.lexsort((ray_camera, ray_key))
@@ -114,7 +114,7 @@ class _Cells:
 
 
 def _joined(parts: Sequence[_Cells]) -> _Cells:
-    """Cells of one edge, each of its own cameras."""
+    """Join cells of equal edge; no two parts share a camera."""
     keys, sums = _summed(np.concatenate([p.keys for p in parts]), np.concatenate([p.sums for p in parts]))
     return _Cells(
         parts[0].edge,
@@ -131,7 +131,7 @@ def _summed(keys: NDArray[np.int64], sums: NDArray[np.float64]) -> tuple[NDArray
 
 
 def _halved(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Packed numbers of the cells of twice the edge; those are counted from the same middle."""
+    """Packed indices of the cells with twice the edge, relative to the same middle."""
     one = (1 << _BITS) - 1
     x, y, z = (((keys >> shift & one) + _HALF) >> 1 for shift in (2 * _BITS, _BITS, 0))
     return np.asarray((x << 2 * _BITS) | (y << _BITS) | z)

@@ -1,4 +1,4 @@
-"""Semi-global aggregation: what each pixel's labels cost once its neighbors have their say along eight directions.
+"""Semi-global aggregation: adds to each pixel's label costs those of paths from eight directions.
 
 Source: H. Hirschmüller, Stereo Processing by Semiglobal Matching and Mutual Information, PAMI 2008, eq. 13.
 """
@@ -11,11 +11,11 @@ from torch import Tensor
 
 
 def aggregate_costs(costs: Tensor, step: float, jump_down: Tensor, jump_right: Tensor) -> Tensor:
-    """Sum of the least costs of paths that end in a pixel, over eight directions.
+    """Sum over eight directions of the smallest costs of paths that end in a pixel.
 
-    costs: (H, W, L) of giving a pixel one of L ordered labels.  step: price of going on with the label beside.
-    jump_down, jump_right: (H, W) price of any other change between a pixel and the one above, or to the left (a low one
-    where an edge of the image speaks for it).  Returns (H, W, L).
+    costs: (H, W, L) costs of L ordered labels.  step: price of a change to an adjacent label.  jump_down, jump_right:
+    (H, W) price of any larger change between a pixel and the one above it, or to its left; low at image edges.
+    Returns (H, W, L).
     """
     total = _swept(costs, step, jump_down, diagonal=True)
     turned = _swept(costs.transpose(0, 1).contiguous(), step, jump_right.t().contiguous(), diagonal=False)
@@ -23,15 +23,15 @@ def aggregate_costs(costs: Tensor, step: float, jump_down: Tensor, jump_right: T
 
 
 def price_jumps(gray: Tensor, least: float, most: float, contrast: float) -> tuple[Tensor, Tensor]:
-    """(H, W) prices between vertical and between horizontal neighbors: ``most`` where they look alike, down to
-    ``least`` where they differ by much more than ``contrast``."""
+    """(H, W) prices between vertical and between horizontal neighbors: ``most`` for equal intensities, down to
+    ``least`` for differences far above ``contrast``."""
     down = F.pad((gray[1:] - gray[:-1]).abs(), (0, 0, 1, 0))
     right = F.pad((gray[:, 1:] - gray[:, :-1]).abs(), (1, 0))
     return tuple(least + (most - least) * torch.exp(-change / contrast) for change in (down, right))
 
 
 def _swept(costs: Tensor, step: float, jump: Tensor, diagonal: bool) -> Tensor:
-    """Paths that go down and up the rows, straight and, if so asked, along both diagonals."""
+    """Aggregate along paths down and up the rows: straight and, with ``diagonal``, along both diagonals."""
     height, width, labels = costs.shape
     directions = 3 if diagonal else 1
     total = torch.zeros_like(costs)

@@ -1,4 +1,4 @@
-"""Sparse points of a scan whose poses are known: features matched between frames, and where their rays meet."""
+"""Triangulates sparse points of a scan with known poses, from features matched between frames."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from ..tracking.base import PosedPoints
 from ..tracking.rgbd import orb_features
 
 _STEPS = (1, 2, 3, 5, 8, 12)  # frames ahead
-_NEAR = 6  # frames of another time whose cameras look the same way from close by
-_LOOK = 0.8  # cosine between optical axes
+_NEAR = 6  # frames from other times with a nearby camera and a similar direction
+_LOOK = 0.8  # smallest cosine between optical axes
 _LEAST_ANGLE = np.radians(2.0)
-_AGREES = 2.0 / 500.0  # of a ray's length: how far two rays of one point may pass each other
+_AGREES = 2.0 / 500.0  # of a ray's length: largest gap between the rays of one point
 
 
 def triangulate(
@@ -29,7 +29,7 @@ def triangulate(
     progress: Progress,
     prepared: Callable[[Frame], Frame] = lambda frame: frame,
 ) -> PosedPoints:
-    """Points that two of ``frames`` see each. T_world_cam: (N, 4, 4), NaN where unknown."""
+    """Triangulate points that pairs of ``frames`` see. T_world_cam: (N, 4, 4), NaN where unknown."""
     posed = [frame for frame in frames if np.isfinite(T_world_cam[frame]).all()]
     progress.stage("triangulation", len(posed))
     found: dict[int, tuple[orb_features.OrbFeatures, NDArray[np.float64]]] = {}
@@ -58,14 +58,14 @@ def triangulate(
 
 
 def _pairs(T_world_cam: NDArray[np.float64], frames: list[int]) -> list[tuple[int, int]]:
-    """Frames that may see the same: those that follow each other, and those that look the same way from close by."""
+    """Pairs of frames that may overlap: successive ones, and nearby ones with a similar direction."""
     T = T_world_cam[frames]
     pairs = {(row, row + step) for step in _STEPS for row in range(len(frames) - step)}
     for row in range(len(frames)):
         distance = np.linalg.norm(T[:, :3, 3] - T[row, :3, 3], axis=1)
         other = (T[:, :3, 2] @ T[row, :3, 2] > _LOOK) & (np.abs(np.arange(len(frames)) - row) > _STEPS[-1])
         near = np.flatnonzero(other)
-        near = near[np.argsort(distance[near])[:: max(1, len(near) // _NEAR)]][:_NEAR]  # some close, some farther
+        near = near[np.argsort(distance[near])[:: max(1, len(near) // _NEAR)]][:_NEAR]  # some near, some farther away
         pairs |= {(min(row, k), max(row, k)) for k in near.tolist()}
     return [(frames[a], frames[b]) for a, b in sorted(pairs)]
 
@@ -76,7 +76,7 @@ def _meeting(
     center_b: NDArray[np.float64],
     rays_b: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Midpoints between (M, 3) unit rays of two cameras, of those pairs that meet in front of both."""
+    """Midpoints between (M, 3) unit rays of two cameras, for the pairs that meet in front of both cameras."""
     way = center_b - center_a
     cosine = np.einsum("mc,mc->m", rays_a, rays_b)
     sine2 = np.maximum(1.0 - cosine**2, 1e-12)

@@ -1,4 +1,4 @@
-"""Multi-view stereo as a depth source: depth of color images whose poses are known."""
+"""Multi-view stereo as a depth source, for color images with known poses."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from .base import DepthSource
 from .multi_view_stereo import Options, StereoDepth
 from .sparse_points import triangulate
 
-_SUREST_M = 5e-4  # a standard deviation of 0 would weigh infinitely
+_SUREST_M = 5e-4  # a standard deviation of 0 would have infinite weight
 
 
 class StereoSource(DepthSource):
-    """Depth of a capture that has none, by multi-view stereo from the poses that a tracker has ahead."""
+    """Estimates depth by multi-view stereo, from poses that the tracker knows in advance."""
 
     offline = True
 
@@ -41,13 +41,13 @@ class StereoSource(DepthSource):
         return replace(frame, depth_m=found[0], depth_sigma_m=np.maximum(found[1], np.float32(_SUREST_M)))
 
     def _posed_points(self, tracker: Tracker, frames: range, progress: Progress) -> PosedPoints:
-        """The tracker's, or points that are triangulated from its poses."""
+        """The tracker's points, or points triangulated from its poses."""
         if (found := tracker.posed_points()) is not None:
             return found
         T_world_cam = tracker.poses_ahead()
         if T_world_cam is None:
             raise TrackingError(
-                f"{self._capture.path} has no depth, and this tracker estimates poses frame by frame, from which depth "
-                "cannot be measured: take tracking.backend=colmap, known or file."
+                f"{self._capture.path} has no depth, and this tracker estimates poses frame by frame, but stereo needs "
+                "all poses first: set tracking.backend=colmap, known or file."
             )
         return triangulate(self._capture, T_world_cam, frames, progress)

@@ -1,4 +1,4 @@
-"""Depth of a view from the surface of the whole scan."""
+"""Renders the depth map of a view from the surface of the whole scan."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .cross_view_check import DepthImage
 from .photo_consistency import compute_rays
 from .watertight_surface import SIDE_BY_SIDE, WatertightSurface
 
-_SPANNED, _FACING = 40.0, 0.4  # cells: no gap is spanned by longer edges, nor by what is seen at a cosine below that
+_SPANNED, _FACING = 40.0, 0.4  # longest edge, in cells, and smallest cosine of a triangle that may fill a gap
 _ALIKE = 0.2  # relative
 _SUREST, _LAYOUT_SIGMA, _SPANNED_SIGMA = 0.005, 0.01, 0.04  # standard deviations over depth
 
@@ -19,13 +19,13 @@ _SUREST, _LAYOUT_SIGMA, _SPANNED_SIGMA = 0.005, 0.01, 0.04  # standard deviation
 def render_surface_depth(
     surface: WatertightSurface, layout: Layout, camera: Intrinsics, T_world_cam: NDArray[np.float64]
 ) -> DepthImage:
-    """The surface as a camera sees it, where it was measured; where it only spans a gap, the layout's plane near it, or
-    else what spans the gap, if that is small."""
+    """Render the surface as a camera sees it. Measured parts keep their depth. Where the surface only spans a gap, a
+    plane of the layout near it is used or, without one, the surface if the gap is small."""
     origin = T_world_cam[:3, 3]
     directions = np.moveaxis(compute_rays(camera).numpy().astype(np.float64), 0, -1) @ T_world_cam[:3, :3].T
     met = surface.met(origin, directions)
     times = met.times.astype(np.float64)
-    times[times < surface.cell_m] = 0.0  # a surface through the camera itself
+    times[times < surface.cell_m] = 0.0  # the surface passes through the camera
     measured = (times > 0) & (met.edge_m < SIDE_BY_SIDE * surface.cell_m)
     spanned = (times > 0) & (met.edge_m < _SPANNED * surface.cell_m) & (met.cosine > _FACING)
     depth = np.where(measured | spanned, times, 0.0)
@@ -39,8 +39,8 @@ def render_surface_depth(
 
 
 def prefer_own_depth(own: DepthImage, surface: DepthImage) -> DepthImage:
-    """What a view measured itself where the ``surface`` does not contradict it, as this merges what is closer together
-    than its cells and puts it where the poses of all views say, not this one's; elsewhere the surface."""
+    """Use a view's own depth where the ``surface`` does not contradict it, and the surface elsewhere. The surface
+    merges details smaller than its cells, and averages the poses of all views instead of following this view's pose."""
     use = (own.inverse > 0) & (np.abs(own.inverse - surface.inverse) < _ALIKE * surface.inverse)
     inverse = np.where(use, own.inverse, surface.inverse)
     sigma = np.where(use, np.maximum(own.sigma, surface.sigma), surface.sigma)

@@ -1,4 +1,4 @@
-"""Space cut into tetrahedra whose corners are points and cameras, and what the rays between these say of them."""
+"""Divides space into tetrahedra between points and cameras, and collects the votes of rays about them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 BEHIND = 3.0
-"""Standard deviations behind a point, where there is matter."""
+"""Standard deviations behind a point at which space is full."""
 
-_CERTAIN = 7.0  # standard deviations before a point, where there is none
+_CERTAIN = 7.0  # standard deviations before a point at which space is certainly free
 
 
 @dataclass(frozen=True)
 class Tetrahedra:
-    """vertices: (V, 3) float64.  corners: (T, 4) int32 vertices.  beside: (T, 4) int32, the cell that shares all other
-    corners: a tetrahedron, or what is outside of all, the cell T."""
+    """vertices: (V, 3) float64.  corners: (T, 4) int32, vertices of each tetrahedron.  beside: (T, 4) int32, the
+    neighbor
+    opposite each corner: a tetrahedron, or T for the cell outside all tetrahedra."""
 
     vertices: NDArray[np.float64]
     corners: NDArray[np.int32]
@@ -27,10 +28,10 @@ class Tetrahedra:
 
 @dataclass(frozen=True)
 class CellVotes:
-    """What rays say of cells.
+    """The votes of rays about cells.
 
-    free, full: (T + 1,) rays that say that a cell is.  facets: (T, 4) price of a surface between a free tetrahedron and
-    the cell ``beside`` it.
+    free, full: (T + 1,) number of rays that vote for a cell to be free, or full.  facets: (T, 4) price of a surface
+    between a free tetrahedron and the cell ``beside`` it.
     """
 
     free: NDArray[np.float64]
@@ -39,7 +40,7 @@ class CellVotes:
 
 
 def tetrahedralize(vertices: NDArray[np.float64]) -> Tetrahedra:
-    """The Delaunay tetrahedra of (V, 3) vertices, of which there must be five that do not lie in a plane."""
+    """The Delaunay tetrahedra of (V, 3) vertices: at least five, not all in one plane."""
     found = Delaunay(vertices - vertices.mean(axis=0))
     beside = np.where(found.neighbors < 0, len(found.simplices), found.neighbors)
     return Tetrahedra(vertices, found.simplices.astype(np.int32), beside.astype(np.int32))
@@ -51,8 +52,8 @@ def collect_votes(
     ray_camera: NDArray[np.int32],
     sigma_m: NDArray[np.float64],
 ) -> CellVotes:
-    """Each ray votes with one for the cell of its camera to be free, for the one ``BEHIND`` its point to be full, and
-    against a surface on its way, less so the nearer to its point: 1 - exp(-d² / 2 sigma²) at the distance d.
+    """Each ray votes 1 for the cell of its camera to be free, and 1 for the cell ``BEHIND`` its point to be full. It
+    also votes against a surface along the ray, by 1 - exp(-d² / 2 sigma²) at the distance d from the point.
 
     ray_point, ray_camera: (R,) vertices.  sigma_m: (V,) meters.
     """
@@ -71,7 +72,7 @@ def collect_votes(
 
 @njit(cache=True, nogil=True)
 def compute_facet_planes(vertices, corners):  # type: ignore[no-untyped-def]
-    """(T, 4, 4) of each facet (opposite a corner) its unit normal, which points outwards, and its offset along it."""
+    """(T, 4, 4) unit outward normal of each facet (opposite a corner), and its offset along the normal."""
     out = np.empty((*corners.shape, 4))
     for cell in range(len(corners)):
         for facet in range(4):
@@ -106,8 +107,9 @@ def _march(vertices, corners, beside, facets, first, around, ray_point, ray_came
 
 @njit(cache=True, nogil=True)
 def _walk(corners, beside, facets, cell, out, start, way, length, camera, sigma, prices):  # type: ignore[no-untyped-def]
-    """From a corner of a cell out by the facet opposite and on, until a cell holds the ``camera`` (-1: it is behind) or
-    the ``length`` is gone; returns that cell. Prices go to the facets that are crossed, seen from the camera's side."""
+    """Walk along a ray from a corner of a cell, out by the opposite facet and on, until a cell holds the ``camera``
+    (-1: walk away from the camera) or the ``length`` is reached. Returns that cell. Adds prices to the crossed facets,
+    on the camera's side."""
     outside = len(corners)
     distance = _distance(facets, cell, out, start, way) if cell < outside else 0.0
     for _ in range(outside):  # no ray meets a tetrahedron twice
@@ -131,8 +133,9 @@ def _walk(corners, beside, facets, cell, out, start, way, length, camera, sigma,
 
 @njit(cache=True, nogil=True)
 def _way_out(facets, cell, entered, start, way):  # type: ignore[no-untyped-def]
-    """By which facet a way leaves a tetrahedron, and how far away: the nearest of those that it does not enter by. That
-    there is one even where rounding has the way miss the tetrahedron is why sides of edges are not compared instead."""
+    """The facet by which a ray leaves a tetrahedron, and its distance: the nearest facet besides the entered one. Such
+    a facet exists even if, by rounding, the ray misses the tetrahedron; a comparison of edge sides would not find
+    it."""
     out, nearest = (entered + 1) & 3, np.inf
     for facet in range(4):
         if facet != entered and _leaving(facets, cell, facet, way) > 0.0:
@@ -144,8 +147,8 @@ def _way_out(facets, cell, entered, start, way):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _first_cell(corners, facets, first, around, point, way):  # type: ignore[no-untyped-def]
-    """The cell around a vertex into which a way goes, and which of its corners the vertex is. Of a way along a facet
-    rounding may say that it leaves the tetrahedra on both sides: where it does so least, it goes."""
+    """The cell at a vertex that a ray enters, and the corner of the cell that the vertex is. If a ray runs along a
+    facet, rounding may place it outside the tetrahedra on both sides; the one that it leaves least is taken."""
     best, which, least = len(corners), 0, 1e-9
     for row in range(first[point], first[point + 1]):
         cell = around[row]
@@ -162,17 +165,17 @@ def _first_cell(corners, facets, first, around, point, way):  # type: ignore[no-
 
 @njit(cache=True, nogil=True)
 def _leaving(facets, cell, facet, way):  # type: ignore[no-untyped-def]
-    """The sine by which a way leaves a tetrahedron through a facet's plane; negative if it enters."""
+    """Sine of the angle at which a ray leaves a tetrahedron through a facet's plane; negative if it enters."""
     return facets[cell, facet, 0] * way[0] + facets[cell, facet, 1] * way[1] + facets[cell, facet, 2] * way[2]
 
 
 @njit(cache=True, nogil=True)
 def _distance(facets, cell, facet, start, way):  # type: ignore[no-untyped-def]
-    """How far away a way that leaves by a facet meets it; 0 for one within its plane, as in a flat tetrahedron."""
+    """Distance along a ray to the facet that it leaves by; 0 if the ray lies in its plane, as in a flat tetrahedron."""
     leaving = _leaving(facets, cell, facet, way)
     if leaving == 0.0:
         return 0.0
-    height = facets[cell, facet, 3]  # slices are avoided: counting references to them takes longer than this
+    height = facets[cell, facet, 3]  # a loop, because slices cost more for reference counts
     for k in range(3):
         height -= facets[cell, facet, k] * start[k]
     return height / leaving

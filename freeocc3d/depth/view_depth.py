@@ -1,4 +1,4 @@
-"""Dense depth of one view from the views around it: swept and refined."""
+"""Dense depth of one view from the views around it, by plane sweep and refinement."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from .photo_consistency import Matcher, StereoView
 from .semi_global import aggregate_costs, price_jumps
 
 _FEWEST, _MOST_HYPOTHESES = 32, 160
-_CONTRAST = 4.0 / 255.0  # a change of gray beyond this may be the edge of something
+_CONTRAST = 4.0 / 255.0  # a larger change of gray may be an object's edge
 _STEP, _JUMPS = 0.05, (0.3, 1.2)  # in units of 1 - correlation
 _RADIUS, _FINE_RADIUS = 2, 3
-_LEAST_SWEPT = 160  # pixels of the longer side: texture is lost in smaller images
-_REFINED = (1.0, 0.5)  # pixels between hypotheses about the depth so far
+_LEAST_SWEPT = 160  # pixels of the longer side: smaller images lose texture
+_REFINED = (1.0, 0.5)  # pixels between hypotheses around the current depth
 _LEAST_SCORE = 0.5
-_SUREST, _UNSURE = 0.25, 1.0  # pixels: what no match is better than, and what is no match any more
-_STEADY = 1.5  # pixels by which refinement may still move
+_SUREST, _UNSURE = 0.25, 1.0  # pixels: smallest sigma of a match, and largest
+_STEADY = 1.5  # largest last step of the refinement, pixels
 
 
 def sweep_planes(view: StereoView, others: Sequence[StereoView], near: float, far: float, device: str) -> Tensor:
@@ -47,13 +47,13 @@ def measure_depth(
     far: float,
     device: str = "cpu",
 ) -> DepthImage:
-    """What the photographs say: inverse depths where patches match well and in one place only, 0 elsewhere.
+    """Measure inverse depths where patches match well and unambiguously; 0 elsewhere.
 
-    Matches are found among ``others``, in images of a quarter of the size (of half, where those would be small) and of
-    twice as much, and refined among views ``apart``, whose baselines are longer.
+    Matches are found among ``others``, first in images of a quarter of the size (of half for small images), then of
+    twice that size. They are refined among the views ``apart``, which have longer baselines.
 
-    sigma: for n independent pixels, a correlation c at the peak and its curvature 2 k, the least-squares estimate has
-    the variance (1 - c) / (n k); no match is taken for better than a quarter of a pixel.
+    sigma: for n independent pixels, correlation c at the peak and curvature 2 k, the least-squares estimate has the
+    variance (1 - c) / (n k). The smallest sigma is a quarter of a pixel.
     """
     camera = view.intrinsics
     longer = max(camera.width, camera.height)
@@ -71,7 +71,7 @@ def measure_depth(
 
 
 def filter_median(image: Tensor) -> Tensor:
-    """(H, W) median of 5 x 5 pixels."""
+    """(H, W) median over 5 x 5 pixels."""
     if image.device.type == "cpu":
         return torch.from_numpy(cv2.medianBlur(image.numpy(), 5))
     return filter_median_reference(image)
@@ -89,7 +89,7 @@ def _scaled(view: StereoView, by: float) -> StereoView:
 
 
 def _all_refined(matcher: Matcher, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Inverse depths refined from those of a smaller image; those before the last step; scores; sigmas."""
+    """Refine inverse depths of a smaller image. Returns them, those before the last step, scores, and sigmas."""
     inverse = F.interpolate(filter_median(inverse)[None, None], matcher.gray.shape, mode="bilinear")[0, 0]
     before = score = sigma = inverse
     for pixels in _REFINED:
@@ -103,7 +103,7 @@ def _refined(matcher: Matcher, inverse: Tensor, step: float) -> tuple[Tensor, Te
     offsets = torch.arange(-2, 3, device=inverse.device) * step
     scores = matcher.scores((inverse + offsets[:, None, None]).clamp_min(1e-4))
     count = (len(scores) + 1) // 2
-    best_views = scores.amax(dim=1).topk(count, dim=0)[1]  # the same for all hypotheses, or the curve has steps
+    best_views = scores.amax(dim=1).topk(count, dim=0)[1]  # the same views for all hypotheses, or the curve has steps
     curve = scores.gather(0, best_views[:, None].expand(-1, len(offsets), -1, -1)).mean(dim=0)
     best = curve.argmax(dim=0, keepdim=True).clamp(1, len(offsets) - 2)
     before, peak, after = (curve.gather(0, best + k)[0] for k in (-1, 0, 1))
@@ -114,7 +114,7 @@ def _refined(matcher: Matcher, inverse: Tensor, step: float) -> tuple[Tensor, Te
 
 
 def _vertex(before: Tensor, peak: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
-    """Where the parabola through three values at -1, 0, 1 has its maximum (0 if it has none), and 2 peak - before -
+    """Position of the maximum of the parabola through three values at -1, 0, 1 (0 if none), and 2 peak - before -
     after."""
     curvature = 2.0 * peak - before - after
     return torch.where(curvature > 1e-5, 0.5 * (after - before) / curvature.clamp_min(1e-5), 0.0), curvature

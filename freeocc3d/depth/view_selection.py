@@ -1,4 +1,4 @@
-"""Which views of a scan measure a view's depth best: those that see the same points from a few degrees beside."""
+"""Chooses the views that measure a view's depth best: those that see the same points from some degrees apart."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-_LEAST_WEIGHT = 3.0  # as many points, seen under the best angle
-_MARGIN = 0.7, 1.6  # around the nearest and farthest points, for what lies between has no texture
-_OUTLIERS = 2.0  # per cent of the points at either end
+_LEAST_WEIGHT = 3.0  # in points seen at the best angle
+_MARGIN = 0.7, 1.6  # extends the depth range of the points, for surfaces without texture
+_OUTLIERS = 2.0  # percent of the points at either end
 _LEAST_POINTS = 20
 
 
 class ViewAngles(NamedTuple):
-    """Degrees between the rays of a point: the best, and the standard deviations below and above it."""
+    """Angle between the rays of a point, degrees: the best one, and standard deviations below and above it."""
 
     best: float
     below: float
@@ -23,16 +23,16 @@ class ViewAngles(NamedTuple):
 
 
 ALIKE = ViewAngles(8.0, 3.0, 8.0)
-"""Images are much alike still: for matches that have to be found."""
+"""The images still look alike: for finding matches."""
 
 APART = ViewAngles(14.0, 6.0, 10.0)
-"""Depth is surer: for matches that are known to a pixel or two."""
+"""Depth is more accurate: for refining matches that are known to a pixel or two."""
 
 
 @dataclass(frozen=True)
 class SelectedViews:
-    """partners: per frame, indices of the views to compare it with, the best first; empty where it has none.
-    near, far: (N,) meters between which its pixels' depths lie."""
+    """partners: per frame, indices of the views to compare it with, the best first; may be empty.
+    near, far: (N,) depth range of each frame, meters."""
 
     partners: list[NDArray[np.int64]]
     near: NDArray[np.float64]
@@ -47,10 +47,11 @@ def select_partners(
     count: int,
     angles: ViewAngles = ALIKE,
 ) -> SelectedViews:
-    """Up to ``count`` partners of each frame.
+    """Choose up to ``count`` partners of each frame.
 
-    T_world_cam: (N, 4, 4), NaN where unknown.  points: (P, 3) world.  seen_frame, seen_point: (O,) a point is seen in a
-    frame. A point that two frames share counts by the angle between its rays and by how alike its distances are.
+    T_world_cam: (N, 4, 4), NaN where unknown.  points: (P, 3) world.  seen_frame, seen_point: (O,) frame
+    ``seen_frame[o]`` sees point ``seen_point[o]``. The weight of a point that two frames share depends on the angle
+    between its rays and on the ratio of its distances.
     Source: J. Schönberger et al., Pixelwise View Selection for Unstructured Multi-View Stereo, ECCV 2016.
     """
     frames = len(T_world_cam)

@@ -1,8 +1,9 @@
-"""The closed surface that explains a scan's rays best: between what cameras look through and what is behind points.
+"""Builds the closed surface that explains a scan's rays best, between the free space of rays and the matter behind
+points.
 
 Sources: P. Labatut, J.-P. Pons, R. Keriven, Robust and Efficient Surface Reconstruction from Range Data, CGF 2009 (the
 energy, its cut, the quality of facets); M. Jancosek, T. Pajdla, Multi-View Reconstruction Preserving Weakly-Supported
-Surfaces, CVPR 2011 (that such a cut shows surfaces on which hardly anything was measured, too).
+Surfaces, CVPR 2011 (such a cut also finds surfaces with few measurements).
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from .scan_points import ScanPoints
 from .tetrahedra import CellVotes, Tetrahedra, collect_votes, tetrahedralize
 
 SIDE_BY_SIDE = 6.0
-"""Cells: triangles with longer edges span what nothing was measured of."""
+"""Cells: triangles with longer edges span gaps in the measurements."""
 
-_SOFT = 3.0  # standard deviations of a point within which its rays may still cross the surface
-_QUALITY = 1.0  # rays that a facet of the worst shape outweighs, for each of its sides
-_STEPS = 50.0  # of the whole numbers in which flows are computed, per ray
+_SOFT = 3.0  # standard deviations around a point within which rays may cross the surface
+_QUALITY = 1.0  # weight of the worst facet shape, in rays per side
+_STEPS = 50.0  # integer flow units per ray
 _LARGEST = (1 << 30) - 1  # the solver adds two capacities in 32 bits
 
 
 @dataclass(frozen=True)
 class RayHits:
-    """Per ray: how many times its direction reaches the surface (0 = never); of the triangle that is met there, the
-    longest edge and the median of the corners' standard deviations, meters, and the cosine between normal and ray."""
+    """Per ray. times: ray parameter at the surface, 0 = no hit. Of the triangle that is hit: edge_m, its longest edge,
+    meters; sigma_m, the median standard deviation of its corners, meters; cosine, between its normal and the ray."""
 
     times: NDArray[np.float32]
     edge_m: NDArray[np.float32]
@@ -42,8 +43,8 @@ class RayHits:
 
 @dataclass(frozen=True)
 class WatertightSurface:
-    """vertices: (V, 3) float32 world.  sigma_m: (V,) float32 standard deviations.  triangles: (F, 3) int32.
-    cell_m: between vertices that were measured side by side."""
+    """vertices: (V, 3) float32 world, meters.  sigma_m: (V,) float32 standard deviations, meters.  triangles: (F, 3)
+    int32.  cell_m: distance of adjacent measured vertices, meters."""
 
     vertices: NDArray[np.float32]
     sigma_m: NDArray[np.float32]
@@ -51,7 +52,7 @@ class WatertightSurface:
     cell_m: float
 
     def met(self, origin: NDArray[np.float64], directions: NDArray[np.float64]) -> RayHits:
-        """What (H, W, 3) directions from ``origin`` meet first."""
+        """The first hits of rays from ``origin`` along (H, W, 3) directions."""
         from open3d import core
 
         rays = np.concatenate((np.broadcast_to(origin, directions.shape), directions), axis=-1).astype(np.float32)
@@ -68,7 +69,7 @@ class WatertightSurface:
         return RayHits(*(np.where(hit, a, 0.0) for a in (times, edge_m[triangle], sigma_m[triangle], cosine)))
 
     def normals(self) -> NDArray[np.float64]:
-        """(N, 3) of the triangles whose corners were measured side by side."""
+        """(N, 3) normals of the triangles between adjacent measured vertices."""
         near = self._of_triangles[0] < SIDE_BY_SIDE * self.cell_m
         a, b, c = np.moveaxis(self.vertices[self.triangles[near]].astype(np.float64), 1, 0)
         normals = np.cross(b - a, c - a)
@@ -92,8 +93,8 @@ class WatertightSurface:
 
 
 def build_surface(points: ScanPoints, centers: NDArray[np.float64]) -> WatertightSurface:
-    """The surface of points that cameras at (C, 3) ``centers`` measured; its triangles turn counterclockwise seen from
-    the free side. There must be five points and centers that do not lie in a plane."""
+    """Build the surface of points measured from cameras at (C, 3) ``centers``. Triangles are counter-clockwise as seen
+    from the free side. Needs at least five points and centers that do not lie in one plane."""
     count = len(points.points)
     space = tetrahedralize(np.concatenate((points.points, centers)))
     soft = np.maximum(_SOFT * points.sigma_m, 0.5 * points.cell_m)
@@ -106,8 +107,8 @@ def build_surface(points: ScanPoints, centers: NDArray[np.float64]) -> Watertigh
 
 
 def cut_cells(space: Tetrahedra, seen: CellVotes) -> NDArray[np.bool_]:
-    """(T + 1,) whether a cell is free, such that the facets between free and full ones, and the cells called what rays
-    say that they are not, cost least."""
+    """(T + 1,) whether each cell is free, by the minimum cut: it has the smallest cost of facets between free and full
+    cells and of cells that contradict their rays."""
     outside = len(space.corners)
     round_ = measure_roundness(space.vertices - space.vertices.mean(axis=0), space.corners)
     cell, facet = np.nonzero(space.beside < outside)
@@ -116,7 +117,7 @@ def cut_cells(space: Tetrahedra, seen: CellVotes) -> NDArray[np.bool_]:
     shape = 1.0 - round_
     shape[cell, facet] = np.maximum(shape[cell, facet], shape[after, back])
     rim, rim_facet = np.nonzero(space.beside == outside)
-    surplus = seen.free - seen.full  # what both say costs the same whatever is cut
+    surplus = seen.free - seen.full  # votes for both cost the same in every cut
     source, sink = np.maximum(surplus, 0.0), np.maximum(-surplus, 0.0)
     cells = np.arange(outside + 1)
     rows = np.concatenate(
@@ -136,10 +137,10 @@ def cut_cells(space: Tetrahedra, seen: CellVotes) -> NDArray[np.bool_]:
 
 
 def extract_boundary(space: Tetrahedra, free: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """(F, 3) vertices of the facets between free and full cells, counterclockwise seen from the free side."""
+    """(F, 3) vertices of the facets between free and full cells, counter-clockwise as seen from the free side."""
     outside = len(space.corners)
     differ = free[:-1, None] != free[space.beside]
-    cell, facet = np.nonzero(differ & (free[:-1, None] | (space.beside == outside)))  # each once
+    cell, facet = np.nonzero(differ & (free[:-1, None] | (space.beside == outside)))  # each facet once
     triangles = np.stack([space.corners[cell, (facet + k) & 3] for k in (1, 2, 3)], axis=1)
     a, b, c = (space.vertices[triangles[:, k]] for k in range(3))
     side = np.einsum("fc,fc->f", np.cross(b - a, c - a), space.vertices[space.corners[cell, facet]] - a)
@@ -148,8 +149,8 @@ def extract_boundary(space: Tetrahedra, free: NDArray[np.bool_]) -> NDArray[np.i
 
 @njit(cache=True, nogil=True)
 def measure_roundness(vertices, corners):  # type: ignore[no-untyped-def]
-    """(T, 4) cosine between each facet (opposite a corner) and the sphere through the corners, -1…1: low where the
-    tetrahedron is a needle or a sliver before that facet."""
+    """(T, 4) cosine between each facet (opposite a corner) and the sphere through the corners, -1…1. Low if the
+    tetrahedron is a needle or a sliver at that facet."""
     out = np.empty(corners.shape)
     for cell in range(len(corners)):
         a = vertices[corners[cell, 0]]

@@ -1,7 +1,7 @@
-"""The contract of a tracker: frames in, one by one; camera poses out.
+"""The contract of a tracker: it takes frames one by one and gives camera poses.
 
-A tracker is one file of this folder with ``load(options, capture) -> Tracker``. The frames that it names as keyframes
-carry the map: layers 2–4 use only these, so a tracker chooses them such that together they show the whole scene.
+A tracker is one file of ``trackers/`` with ``load(options, capture) -> Tracker``. It also chooses the keyframes. Layers
+2–4 use only keyframes, so together they must show the whole scene.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ class KeyframeOptions(TypedOptions, frozen=True):
     """Which frames become keyframes."""
 
     keyframe_overlap: Positive = 0.85
-    """A frame that shares less than this of its keyframe's view becomes a keyframe."""
+    """A frame becomes a keyframe if it shares less than this part of its keyframe's view."""
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """What became of one frame.
+    """The tracking result of one frame.
 
     status: "keyframe", "tracked", "relocalised" or "lost".
-    T_world_cam: (4, 4) the current estimate, None if lost; a later optimization may still move it.
+    T_world_cam: (4, 4) current estimate, None if lost; a later optimization may change it.
     confidence: 0…1.
     """
 
@@ -49,8 +49,8 @@ class Tracked:
 class PosedPoints:
     """Poses of a capture's N frames, and sparse points that these frames see.
 
-    T_world_cam: (N, 4, 4) float64, NaN where a frame has none.  points: (P, 3) float32 world.
-    seen_frame, seen_point: (O,) int32, point ``seen_point[o]`` is seen in frame ``seen_frame[o]``.
+    T_world_cam: (N, 4, 4) float64, NaN where a frame has no pose.  points: (P, 3) float32 world.
+    seen_frame, seen_point: (O,) int32; frame ``seen_frame[o]`` sees point ``seen_point[o]``.
     """
 
     T_world_cam: NDArray[np.float64]
@@ -60,69 +60,69 @@ class PosedPoints:
 
 
 class Tracker(ABC):
-    """Follows the camera through a capture. Frames must come in ascending order; some may be left out."""
+    """Follows the camera through a capture. Frames come in ascending order; some may be left out."""
 
     world: ClassVar[str] = "OpenCV camera axes of the first keyframe, meters"
-    """The frame that poses and maps are in, for the map's manifest."""
+    """The coordinate frame of poses and maps, for the map's manifest."""
     needs_depth: ClassVar[bool] = False
-    """Whether it cannot work on a capture without depth."""
+    """Whether the tracker needs a capture with depth."""
     estimates_camera: ClassVar[bool] = False
-    """Whether it finds out what the camera is where the capture does not know."""
+    """Whether the tracker estimates unknown intrinsics."""
     metric: bool = True
-    """Whether its poses are in meters; where not, their unit is unknown, and so is the scale of what is mapped."""
+    """Whether poses are in meters; if not, their unit and the scale of the map are unknown."""
     offline: bool = False
-    """Whether ``prepare`` works through the whole scan before the first frame is tracked."""
+    """Whether ``prepare`` processes the whole scan before ``track`` gets the first frame."""
     warnings: tuple[Notice, ...] = ()
-    """What ``prepare`` found that the user should know."""
+    """Warnings of ``prepare`` for the user."""
     brings_depth: bool = False
-    """Whether ``prepare_frame`` adds depth, so that a capture without any needs no other depth source."""
+    """Whether ``prepare_frame`` adds depth, so that a capture without depth needs no other depth source."""
 
     def __init__(self) -> None:
         self.records = Records()
         self.edges: list[Edge] = []
 
     def prepare(self, folder: Path, frames: range, progress: Progress) -> None:  # noqa: B027, most have nothing to do
-        """What is done for the whole scan before its first frame is tracked; called if ``offline``.
+        """Process the whole scan before the first frame is tracked; called if ``offline``.
 
-        folder: takes whatever lets an interrupted run go on; gone when the map stands.  frames: those of the capture
-        that are used. Raises TrackingError for a scan that cannot be tracked.
+        folder: keeps what an interrupted run needs to continue; it is deleted when the map is finished.  frames: the
+        selected frames of the capture. Raises TrackingError for a scan that cannot be tracked.
         """
 
     def poses_ahead(self) -> NDArray[np.float64] | None:
-        """(N, 4, 4) T_world_cam of the capture's frames, NaN where one has none, if they stand before the first frame
-        is tracked (after ``prepare``); None where poses are estimated frame by frame."""
+        """(N, 4, 4) T_world_cam of the capture's frames, NaN without a pose, if they are known after ``prepare``,
+        before the first frame is tracked. None if poses are estimated frame by frame."""
         return None
 
     def posed_points(self) -> PosedPoints | None:
-        """``poses_ahead`` with the sparse points that they were found with; None where there are no such points."""
+        """``poses_ahead`` with the sparse points of the same reconstruction; None if there are no points."""
         return None
 
     def prepare_frame(self, frame: Frame) -> Frame:
-        """The frame as the tracker's camera is known to see it: undistorted, with depth that the tracker was given.
-        ``track`` takes this one, and keyframes keep it."""
+        """The frame as the tracker uses it: undistorted, with the depth that the tracker brings. ``track`` takes this
+        frame, and keyframes keep it."""
         return frame
 
     @abstractmethod
     def track(self, frame: Frame) -> Tracked:
-        """Take the next frame."""
+        """Track the next frame."""
 
     @abstractmethod
     def optimize(self) -> None:
-        """Make all poses so far consistent with all measurements so far. The world frame is the first keyframe's
-        (trackers that are given poses keep theirs)."""
+        """Make all poses so far consistent with all measurements so far. The world frame is the first keyframe's;
+        trackers with given poses keep their own world frame."""
 
     @abstractmethod
     def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
-        """Take up a saved ``state``; ``keyframes`` gives the keyframes' images, in order."""
+        """Continue from a saved ``state``. keyframes: the frames of the keyframes, in order."""
 
     def state(self) -> dict[str, NDArray[np.generic]]:
-        """Everything needed to go on later, as plain arrays."""
+        """Everything needed to continue later, as plain arrays."""
         return {**self.records.to_arrays(), **edges_to_arrays(self.edges)}
 
     def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
-        """Poses of all frames of the capture; frames that were never given to ``track`` are "unused"."""
+        """Poses of all frames of the capture. Frames that ``track`` never got are "unused"."""
         return self.records.trajectory(timestamps)
 
     def submaps(self) -> list[Submap]:
-        """The pieces of the path that hang together, the one that is mapped first."""
+        """The connected components of the camera path; the mapped one comes first."""
         return self.records.submaps(self.edges)

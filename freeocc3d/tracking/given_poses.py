@@ -1,4 +1,4 @@
-"""What the trackers share that are given poses instead of estimating them."""
+"""A tracker that takes given poses instead of estimating them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from .overlap import DepthView, measure_mutual_overlap, sample_points
 from .records import Records
 
 _FARTHEST = 2000.0
-_LEAST_COVERED = 0.05  # share of the pixels with a depth, or a frame shows nothing
+_LEAST_COVERED = 0.05  # share of the pixels with depth; with fewer, a frame shows nothing
 
 
 class GivenTracker(Tracker):
-    """Takes (N, 4, 4) poses of a capture's frames as they are; a frame whose pose is NaN is lost, and one that shares
+    """Uses (N, 4, 4) given poses of a capture's frames unchanged. A frame with a NaN pose is lost. A frame that shares
     too little with its keyframe becomes a keyframe."""
 
     def __init__(self, T_world_cam: NDArray[np.float64], keyframe_overlap: float):
@@ -36,11 +36,11 @@ class GivenTracker(Tracker):
         if not np.isfinite(given).all():
             self.records.add_lost(frame.index)
             return Tracked("lost", None, 0.0)
-        T_world_cam = nearest_rigid(given)  # files state poses to a few digits
+        T_world_cam = nearest_rigid(given)  # files round poses to a few digits
         if np.abs(T_world_cam[:3, 3]).max() > _FARTHEST:
             raise TrackingError(
                 f"The pose of frame {frame.index} lies more than {_FARTHEST:g} m from the origin, where positions lose "
-                "their millimeters: subtract a common offset from the poses."
+                "millimeter accuracy: subtract a common offset from all poses."
             )
         view = self._view(frame)
         nothing_seen = np.count_nonzero(frame.depth_m) < _LEAST_COVERED * frame.depth_m.size

@@ -1,4 +1,4 @@
-"""Pose graph over keyframes: Open3D's Levenberg–Marquardt with a line process that switches off wrong edges."""
+"""Pose graph over keyframes: Open3D's Levenberg–Marquardt, with a line process that disables wrong edges."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _SWEEPS = 6
 _HELD_M, _HELD_DEG = 0.1, 5.0
 
 _AGREE_M, _AGREE_DEG = 0.3, 10.0
-"""How far two closures may place a submap from each other: as far as its own path may have drifted between them."""
+"""Largest disagreement of two closures about a submap's pose: the possible drift of its path between them."""
 
 
 @dataclass(frozen=True)
 class Edge:
     """A measured relative pose of two keyframes.
 
-    T_target_source: (4, 4); ``information`` (6, 6), rotation before translation as Open3D has it.
-    uncertain: the line process may switch the edge off; odometry between neighbors is certain.
+    T_target_source: (4, 4).  information: (6, 6), rotation before translation, as in Open3D.
+    uncertain: whether the line process may disable the edge; odometry between neighbors is certain.
     """
 
     source: int
@@ -37,8 +37,8 @@ class Edge:
 def drop_unsupported_closures(
     poses: Sequence[NDArray[np.float64]], submap: Sequence[int], edges: Sequence[Edge]
 ) -> list[Edge]:
-    """The edges without closures between two submaps that no other closure of the two agrees with: nothing else speaks
-    for them, and one alone may be wrong. poses: of the keyframes, each in its submap's frame."""
+    """Remove a loop closure between two submaps if no other closure of the two agrees with it, because a single closure
+    may be wrong. poses: of the keyframes, each in its submap's frame.  submap: number of each keyframe's submap."""
     between: dict[tuple[int, int], list[tuple[int, NDArray[np.float64]]]] = {}
     kept = set()
     for n, e in enumerate(edges):
@@ -57,8 +57,8 @@ def drop_unsupported_closures(
 
 
 def find_connected_components(submap: Sequence[int], edges: Sequence[Edge]) -> list[list[int]]:
-    """Rows of the keyframes that hang together, the largest piece first: those of one submap, and of submaps that an
-    edge ties."""
+    """Keyframe rows of each connected component, the largest first. Edges connect submaps; the keyframes of one submap
+    are always connected."""
     names, own = np.unique(np.asarray(submap, np.int64), return_inverse=True)
     ends = own[np.array([(edge.source, edge.target) for edge in edges], np.int64).reshape(-1, 2)].T
     graph = coo_array((np.ones(ends.shape[1], bool), tuple(ends)), shape=(len(names), len(names)))
@@ -70,8 +70,8 @@ def find_connected_components(submap: Sequence[int], edges: Sequence[Edge]) -> l
 def optimize_component(
     poses: Sequence[NDArray[np.float64]], edges: Sequence[Edge], rows: Sequence[int]
 ) -> list[NDArray[np.float64]]:
-    """Poses of the keyframes ``rows``, which hang together, in the frame of the first: ``optimize`` on these alone,
-    from poses that are laid along the edges where submaps meet."""
+    """Poses of the connected keyframes ``rows``, in the frame of the first one: ``optimize`` for these only. The
+    initial poses follow the edges where submaps meet."""
     place = {row: k for k, row in enumerate(rows)}
     own = [
         Edge(place[e.source], place[e.target], e.T_target_source, e.information, e.uncertain)
@@ -82,11 +82,11 @@ def optimize_component(
 
 
 def _laid_out(poses: list[NDArray[np.float64]], edges: Sequence[Edge]) -> list[NDArray[np.float64]]:
-    """Poses along the edges from the first keyframe, over uncertain edges only where no certain one leads on."""
+    """Chain poses along the edges from the first keyframe. Uncertain edges serve only where no certain edge does."""
     if len(poses) < 2:
         return poses
     measured = {}
-    for e in sorted(edges, key=lambda e: not e.uncertain):  # of two edges between the same keyframes the certain one
+    for e in sorted(edges, key=lambda e: not e.uncertain):  # the certain edge of two keyframes wins
         measured[e.source, e.target] = (e.uncertain, e.T_target_source)
     ends = np.array(list(measured))
     weights = [1000.0 if uncertain else 1.0 for uncertain, _ in measured.values()]
@@ -103,8 +103,8 @@ def _laid_out(poses: list[NDArray[np.float64]], edges: Sequence[Edge]) -> list[N
 def optimize(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArray[np.float64]]:
     """Keyframe poses T_world_keyframe that agree best with the edges; the first keeps its pose.
 
-    A closure that the line process switches off may have bent the path before: what does not hold is left out, and the
-    path is optimized from its start again, until the closures that hold are those that were used.
+    A wrong closure may bend the path before the line process disables it. So closures that disagree with the result are
+    left out, and the optimization restarts from the initial poses, until the used closures are those that agree.
     """
     used = edges
     for _ in range(_SWEEPS):
@@ -117,20 +117,20 @@ def optimize(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArra
 
 
 def agrees_with_edge(poses: Sequence[NDArray[np.float64]], edge: Edge) -> bool:
-    """Whether poses T_world_keyframe agree with a measurement."""
+    """Whether poses T_world_keyframe agree with the measurement of an edge."""
     meters, degrees = measure_pose_difference(invert(poses[edge.target]) @ poses[edge.source], edge.T_target_source)
     return meters <= _HELD_M and degrees <= _HELD_DEG
 
 
 def _optimized(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDArray[np.float64]]:
-    """Levenberg-Marquardt and line process, once.
+    """One run of Levenberg–Marquardt with the line process.
 
     Source: S. Choi, Q.-Y. Zhou, V. Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015.
     """
     import open3d as o3d
 
     if len(poses) < 3 or len(edges) < len(poses):
-        return poses  # a chain has nothing to distribute
+        return poses  # a chain has no error to distribute
     registration = o3d.pipelines.registration
     graph = registration.PoseGraph()
     for pose in poses:
@@ -155,7 +155,7 @@ def _optimized(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDAr
 
 
 def edges_to_arrays(edges: Sequence[Edge]) -> dict[str, NDArray[np.generic]]:
-    """Plain arrays, for saving."""
+    """The edges as plain arrays, for saving."""
     return {
         "edge_nodes": np.array([(e.source, e.target, e.uncertain) for e in edges], np.int64).reshape(-1, 3),
         "edge_T_target_source": np.array([e.T_target_source for e in edges]).reshape(-1, 4, 4),

@@ -1,4 +1,4 @@
-"""The log that every tracker keeps: each frame relative to its keyframe, and the keyframes' poses."""
+"""The log of every tracker: each frame's pose relative to its keyframe, and the keyframes' poses."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from .pose_graph import Edge, agrees_with_edge
 STATUSES = ("unused", "lost", "tracked", "keyframe", "relocalised", "interpolated", "apart")
 
 _LONGEST_GAP = 3
-"""Frames in a row that cannot be placed and are taken for a gap: between two with a pose they are interpolated."""
+"""Longest run of lost frames that is a gap. Poses in a gap are interpolated between the poses around it."""
 
 
 @dataclass
 class Records:
-    """Per frame seen: index in the capture, row of its keyframe (-1 = lost), T_keyframe_cam, status and confidence.
-    Frames hang on keyframes, so that a pose graph that moves a keyframe moves its frames with it.
+    """Per frame: index in the capture, row of its keyframe (-1 = lost), T_keyframe_cam, status and confidence. Poses
+    are relative to keyframes, so a frame moves with its keyframe when the pose graph moves it.
 
-    submap: of each keyframe, the stretch of the path that was tracked without a break.  pieces: rows of the keyframes
-    that hang together after all, the largest first; only that one has a place in the world. Empty: each submap for
-    itself."""
+    submap: number of each keyframe's submap, a part of the camera path without a tracking break.  pieces: keyframe rows
+    of each connected component, the largest first; only the largest has poses in the world. Empty = each submap is its
+    own component."""
 
     index: list[int] = field(default_factory=list)
     keyframe: list[int] = field(default_factory=list)
@@ -39,7 +39,7 @@ class Records:
     pieces: list[list[int]] = field(default_factory=list)
 
     def add_keyframe(self, index: int, T_world_cam: NDArray[np.float64], confidence: float, submap: int = 0) -> None:
-        """The frame becomes the next keyframe."""
+        """Add a frame that becomes the next keyframe."""
         self.submap.append(submap)
         self.pieces = []
         self.keyframe_index.append(index)
@@ -49,11 +49,11 @@ class Records:
     def add_tracked(
         self, index: int, keyframe: int, T_keyframe_cam: NDArray[np.float64], confidence: float, status: str = "tracked"
     ) -> None:
-        """The frame hangs on a keyframe."""
+        """Add a frame with a pose relative to a keyframe."""
         self._add(index, keyframe, T_keyframe_cam, status, confidence)
 
     def add_lost(self, index: int) -> None:
-        """The frame has no pose."""
+        """Add a frame without a pose."""
         self._add(index, -1, np.full((4, 4), np.nan), "lost", 0.0)
 
     def _add(self, index: int, keyframe: int, T: NDArray[np.float64], status: str, confidence: float) -> None:
@@ -64,7 +64,7 @@ class Records:
         self.confidence.append(confidence)
 
     def largest_first(self) -> list[list[int]]:
-        """Rows of the keyframes that hang together, the largest piece first."""
+        """Keyframe rows of each connected component, the largest first."""
         if self.pieces:
             return self.pieces
         rows: dict[int, list[int]] = {}
@@ -73,15 +73,15 @@ class Records:
         return sorted(rows.values(), key=lambda piece: (-len(piece), piece[0]))
 
     def _worth_telling(self) -> list[list[int]]:
-        """Of ``largest_first``, the first, and of the others those of more than a few frames: a blurred frame or a hand
-        before the camera is a gap, not a place."""
+        """``largest_first`` without small components, which are gaps: a blurred frame, or a hand in front of the
+        camera. The first component always stays."""
         frames = np.bincount(np.array([k for k in self.keyframe if k >= 0], np.int64), minlength=len(self.submap))
         first, *others = self.largest_first() or [[]]
         return [first, *(piece for piece in others if frames[piece].sum() > _LONGEST_GAP)]
 
     def trajectory(self, timestamps: NDArray[np.float64]) -> Trajectory:
-        """Poses of all frames of the capture, composed with the keyframes' present poses; frames of other pieces than
-        the largest are "apart", or lost if they are few, and have none."""
+        """Poses of all frames of the capture, from the keyframes' current poses. Frames of other components than the
+        largest have no pose: they are "apart", or "lost" if the component is small."""
         n = len(timestamps)
         T_world_cam = np.full((n, 4, 4), np.nan)
         status = np.full(n, "unused", dtype="<U12")
@@ -104,9 +104,9 @@ class Records:
         return Trajectory(timestamps, T_world_cam, keyframes, status, confidence)
 
     def submaps(self, edges: Sequence[Edge] = ()) -> list[Submap]:
-        """The pieces that hang together, the mapped one first, each in the frame that its keyframes are in.
+        """The connected components of the camera path, the mapped one first, each in the frame of its keyframes.
 
-        edges: measurements between keyframes, of which the uncertain ones are closures.
+        edges: measurements between keyframes; the uncertain ones are loop closures.
         """
         if not self.keyframe_index:
             return []
@@ -131,7 +131,7 @@ class Records:
         return found
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Plain arrays, for saving."""
+        """The records as plain arrays, for saving."""
         return {
             "index": np.array(self.index, np.int64),
             "keyframe": np.array(self.keyframe, np.int64),
@@ -164,7 +164,7 @@ def _fill_gaps(
     confidence: NDArray[np.float32],
     rows: NDArray[np.int64],
 ) -> None:
-    """Poses for short runs of lost frames, in place: on the geodesic between the poses before and after."""
+    """Fill short runs of lost frames in place, with poses on the geodesic between the poses before and after."""
     known = np.flatnonzero(np.isfinite(T_world_cam[rows, 0, 0]))
     for before, after in pairwise(known.tolist()):
         between = after - before - 1

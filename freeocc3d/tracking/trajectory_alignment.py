@@ -1,7 +1,7 @@
-"""The estimated trajectory against the true one: which poses belong together, and the best alignment of the two worlds.
+"""Aligns an estimated trajectory with the true one: matches their poses and finds the best transform between them.
 
-Sources: S. Umeyama, PAMI 1991 (``core.transforms.umeyama``) on the camera centers of the frames that have a pose in
-both (paper, "Coordinate System Alignment"); J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS
+Sources: S. Umeyama, PAMI 1991 (``core.transforms.umeyama``), on the camera centers of the frames with a pose in both
+(paper, "Coordinate System Alignment"); J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS
 2012, for the association by time.
 """
 
@@ -21,13 +21,12 @@ from ..core.transforms import umeyama
 from ..core.types import Trajectory
 
 ALIGNMENTS = ("se3", "sim3", "none")
-"""Rigid, for trajectories with a metric scale; with a scale, for monocular ones; as they are."""
+"""Rigid, for metric trajectories; similarity, for monocular ones; unchanged."""
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of some frames: timestamps (M,) seconds and T_world_cam (M, 4, 4), all finite. They are kept in the order
-    of time, in whatever order they are given."""
+    """Poses of some frames: timestamps (M,) seconds and T_world_cam (M, 4, 4), all finite. They are sorted by time."""
 
     timestamps: NDArray[np.float64]
     T_world_cam: NDArray[np.float64]
@@ -48,9 +47,9 @@ class Poses:
 
 @dataclass(frozen=True)
 class TrajectoryAlignment:
-    """The similarity that takes the estimate's world to the true one: x_true = scale * rotation @ x_est + translation.
+    """The similarity from the estimated world to the true one: x_true = scale * rotation @ x_est + translation.
 
-    scale: 1 unless it was asked for.  rotation: (3, 3).  translation: (3,) meters.
+    scale: 1 unless it is estimated.  rotation: (3, 3).  translation: (3,) meters.
     """
 
     scale: float
@@ -59,26 +58,26 @@ class TrajectoryAlignment:
 
     @staticmethod
     def identity() -> TrajectoryAlignment:
-        """Both worlds are the same."""
+        """The alignment of two equal worlds."""
         return TrajectoryAlignment(1.0, np.eye(3), np.zeros(3))
 
     def to_true(self, points_est: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(..., 3) points of the estimate's world in the true world."""
+        """Transform (..., 3) points from the estimated to the true world."""
         return np.asarray(self.scale * points_est @ self.rotation.T + self.translation)
 
     def to_estimate(self, points_true: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(..., 3) points of the true world in the estimate's world: the inverse of ``to_true``."""
+        """Transform (..., 3) points from the true to the estimated world: the inverse of ``to_true``."""
         return np.asarray((points_true - self.translation) @ self.rotation / self.scale)
 
     def poses(self, T_est_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 4, 4) camera poses of the estimate's world in the true world; rotations stay rotations."""
+        """Transform (..., 4, 4) camera poses from the estimated to the true world; the scale changes positions only."""
         T_true_cam = T_est_cam.copy()
         T_true_cam[..., :3, :3] = self.rotation @ T_est_cam[..., :3, :3]
         T_true_cam[..., :3, 3] = self.to_true(T_est_cam[..., :3, 3])
         return T_true_cam
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """The alignment as plain values."""
         return {
             "scale": self.scale,
             "rotation": self.rotation.tolist(),
@@ -87,12 +86,12 @@ class TrajectoryAlignment:
 
 
 def align_trajectories(estimated: Poses, true: Poses, how: str = "se3") -> TrajectoryAlignment:
-    """The alignment of the camera centers of the frames that have a pose in both.
+    """Align the camera centers of the frames with a pose in both.
 
-    Raises FreeOccError: fewer than three frames match, their centers lie on one line, unknown ``how``.
+    Raises FreeOccError: fewer than three frames match, their centers lie on one line, or ``how`` is unknown.
     """
     if how not in ALIGNMENTS:
-        raise FreeOccError(f"Trajectories are aligned by {', '.join(ALIGNMENTS)}, not by '{how}'.")
+        raise FreeOccError(f"An alignment is one of {', '.join(ALIGNMENTS)}, not '{how}'.")
     if how == "none":
         return TrajectoryAlignment.identity()
     rows_est, rows_true = associate(estimated.timestamps, true.timestamps)
@@ -101,27 +100,27 @@ def align_trajectories(estimated: Poses, true: Poses, how: str = "se3") -> Traje
 
 
 def select_estimated_poses(trajectory: Trajectory) -> Poses:
-    """The frames of a trajectory that have a pose."""
+    """The poses of a trajectory, without frames that have none."""
     rows = np.flatnonzero(trajectory.has_pose)
     return Poses(trajectory.timestamps[rows], trajectory.T_world_cam[rows])
 
 
 def read_true_poses(capture: Capture) -> Poses:
-    """The poses that a capture states. Raises FreeOccError if it has none at all."""
+    """The poses that a capture states. Raises FreeOccError if it states none."""
     stated = [(index, T) for index in range(len(capture)) if (T := capture.pose(index)) is not None]
     if not stated:
-        raise FreeOccError(f"{capture.path} brings no poses to compare with: name a file of true poses with --poses.")
+        raise FreeOccError(f"{capture.path} states no poses to compare with: give a file of true poses with --poses.")
     rows, poses = zip(*stated, strict=True)
     return Poses(capture.timestamps[list(rows)], np.stack(poses))
 
 
 def read_poses(path: str | Path) -> Poses:
-    """Poses of a capture (its folder, or ``builtin:room``) or of a file in any of the forms that
-    ``capture.read_trajectory`` knows; one that states no times counts frames. Raises FreeOccError."""
+    """Read the poses of a capture (a folder, or ``builtin:room``), or a file in any format of
+    ``capture.read_trajectory``. Without times, frames are counted. Raises FreeOccError."""
     if str(path).startswith("builtin:"):
         return read_true_poses(open_capture(path))
     if not Path(path).exists():
-        raise FreeOccError(f"There is no file or capture {path} to take poses from.")
+        raise FreeOccError(f"There is no file or capture {path} with poses: check the path.")
     if Path(path).is_dir():
         try:
             capture = open_capture(path)
@@ -132,7 +131,7 @@ def read_poses(path: str | Path) -> Poses:
                 found = read_trajectory(path)
             except CaptureError:
                 raise no_capture from None
-        else:  # a reconstruction: its images are some of the frames, which are known by the numbers in their names
+        else:  # a reconstruction: numbers in the image names tell which frames it has
             found = read_trajectory(path)
     else:
         found = read_trajectory(path)

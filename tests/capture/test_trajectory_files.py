@@ -147,11 +147,7 @@ def test_names_are_matched_by_their_numbers_where_they_differ(scan) -> None:
         ("a.log", "99999999999 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "is not a trajectory"),
         ("transforms.json", "{}", "is not a trajectory"),
         ("transforms.json", "[1, 2]", "is not a trajectory"),
-        (
-            "transforms.json",
-            '{"frames": [{"file_path": "a.png", "transform_matrix": [[1, 2]]}]}',
-            "is not a trajectory",
-        ),
+        ("transforms.json", '{"frames": [{"file_path": "a", "transform_matrix": [[1, 2]]}]}', "is not a trajectory"),
         ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n", "no readable COLMAP model"),
     ],
 )
@@ -162,7 +158,7 @@ def test_what_is_no_trajectory_is_reported_in_a_sentence(tmp_path, name, text, s
 
 
 def test_missing_files_and_folders_without_poses(tmp_path) -> None:
-    with pytest.raises(CaptureError, match="There is not a trajectory"):
+    with pytest.raises(CaptureError, match="There is no trajectory"):
         read_trajectory(tmp_path / "absent.txt")
     with pytest.raises(CaptureError, match="holds no trajectory"):
         read_trajectory(tmp_path)
@@ -217,7 +213,7 @@ def test_a_scale_that_depth_contradicts_is_refused(room, tmp_path) -> None:
 
 
 def test_a_scale_that_nothing_tells_is_asked_for(scan, tmp_path) -> None:
-    with pytest.raises(TrackingError, match=r"give tracking\.file\.scale"):
+    with pytest.raises(TrackingError, match=r"Give tracking\.file\.scale"):
         file.load(file.Options(path=str(write_tum(tmp_path / "t.txt")), scale=None), scan)
 
 

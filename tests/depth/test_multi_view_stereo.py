@@ -135,7 +135,7 @@ def test_a_damaged_layout_is_reported(computed, tmp_path: Path) -> None:
     assert len(arrays["offsets"]) > 0
     for name, damaged in (("support", arrays["support"][:-1]), ("offsets", arrays["offsets"][:-1])):
         np.savez(path, **{**arrays, name: damaged})
-        with pytest.raises(MapError, match=r"layout.npz is damaged: it has"):
+        with pytest.raises(MapError, match=r"layout.npz is damaged: it holds"):
             _source(capture, tmp_path)
     np.savez(path, **{name: array for name, array in arrays.items() if name != "outermost"})
     with pytest.raises(MapError, match=r"layout.npz is damaged"):

@@ -289,13 +289,13 @@ def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         colmap_reconstruction.read_model(tmp_path, capture)
     for name in ("cameras.bin", "images.bin"):
         (tmp_path / name).write_bytes(b"\x05")
-    with pytest.raises(CaptureError, match="is no COLMAP model"):
+    with pytest.raises(CaptureError, match="holds no readable COLMAP model"):
         colmap_reconstruction.read_model(tmp_path, capture)
     for number, (kind, size, name, sentence) in enumerate(
         [
             ("PINHOLE", (320, 240), "other_000.jpg", "belongs to a frame"),
             ("PINHOLE", (640, 480), "photo_000.jpg", "640 x 480"),
-            ("FOV", (320, 240), "photo_000.jpg", "FOV, which is not read"),
+            ("FOV", (320, 240), "photo_000.jpg", "FOV, which is not supported"),
         ]
     ):
         folder = tmp_path / str(number)

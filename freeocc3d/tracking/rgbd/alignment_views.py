@@ -1,8 +1,8 @@
-"""What dense alignment sees of a frame: at about 160 x 120 pixels, surface points, normals and intensities.
+"""Prepares a frame for dense alignment: surface points, normals and intensities at about 160 x 120 pixels.
 
-The surface is a plane fitted to the depth around each pixel, in inverse depth, in which planes are linear in the pixel
-(and in which stereo and structured-light noise is nearly uniform): that takes most of the sensor's noise away before it
-reaches the alignment, and gives the normal.
+The surface at each pixel is a plane fitted to the inverse depth around it. In inverse depth, planes are linear in the
+pixel, and stereo and structured-light noise is nearly uniform. The fit removes most of the sensor noise before the
+alignment, and gives the normal.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from ...core.types import Frame, Intrinsics
 from .dense_residuals import Surface
 
 WIDTH = 160
-"""Views are about this wide."""
+"""Approximate width of views, pixels."""
 
 _LEVELS = 3
-_WINDOW = 6  # full-size pixels on each side of a pixel's center in which its plane is fitted, at 640 pixels' width
+_WINDOW = 6  # full-size pixels on each side of a center for the plane fit, at an image width of 640
 
 
 @dataclass(frozen=True)
 class AlignmentView:
-    """A frame as the alignment needs it.
+    """A frame, prepared for alignment.
 
-    intrinsics: of the (h, w) images.  points: (h, w, 3) float32, camera frame, meters; 0 where there is no surface.
+    intrinsics: of the (h, w) images.  points: (h, w, 3) float32, camera frame, meters; 0 without a surface.
     normals: (h, w, 3) float32 unit.  sigma_m: (h, w) float32 standard deviations of the depth, meters, or
     ``NOT_STATED``.  gray: intensities 0…1, float32, at full, half and quarter size.
     """
@@ -49,7 +49,7 @@ class AlignmentView:
 
     @property
     def levels(self) -> tuple[Surface, ...]:
-        """The surface with the intensities of each size, the largest first."""
+        """The surface with the intensities at each size, the largest first."""
         return tuple(Surface(self.points, self.normals, self.sigma_m, gray) for gray in self.gray)
 
     @property
@@ -59,7 +59,7 @@ class AlignmentView:
 
 
 def prepare_alignment_view(frame: Frame) -> AlignmentView:
-    """Prepare a frame."""
+    """Prepare a frame for alignment."""
     camera = frame.intrinsics
     step = max(1, round(camera.width / WIDTH))
     w, h = camera.width // step, camera.height // step
@@ -77,8 +77,7 @@ def prepare_alignment_view(frame: Frame) -> AlignmentView:
 
 
 def _average_sigma(frame: Frame, step: int) -> NDArray[np.float32]:
-    """(h, w) means of what the frame states of the pixels with a depth in each square of ``step`` pixels; 0 without
-    any."""
+    """(h, w) mean stated sigma, meters, of the pixels with a depth in each square of ``step`` pixels; 0 without any."""
     if frame.depth_sigma_m is None:
         return NOT_STATED
     h, w = frame.depth_m.shape[0] // step, frame.depth_m.shape[1] // step
@@ -92,8 +91,8 @@ def _average_sigma(frame: Frame, step: int) -> NDArray[np.float32]:
 def fit_planes(
     depth_m: NDArray[np.float32], step: int, window: int, fx: float, fy: float, cx: float, cy: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Points and normals (h, w, 3) of planes 1/z = a + b (u - u0) + c (v - v0) fitted around every ``step``-th pixel's
-    center (u0, v0) to the depths within ``window`` pixels that belong to one surface; 0 where there are too few."""
+    """Points and normals (h, w, 3) of planes 1/z = a + b (u - u0) + c (v - v0), fitted around every ``step``-th pixel
+    center (u0, v0) to the depths of one surface within ``window`` pixels; 0 with too few depths."""
     H, W = depth_m.shape
     h, w = H // step, W // step
     points = np.zeros((h, w, 3), np.float32)

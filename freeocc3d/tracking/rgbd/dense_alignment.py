@@ -4,9 +4,10 @@ With the residuals r_g and r_p of ``dense_residuals`` and their spreads s_g and 
 
     T <- exp(xi) T,   xi = argmin sum rho(r_g / s_g) + photometric sum rho(r_p / s_p)                               (3)
 
-with s from the residuals' median absolute deviation and rho the Geman-McClure function. Gain and offset are solved for
-together with xi, so that a change of exposure moves nothing. The eigenvalues of the normal equations show what the
-residuals do not determine, such as a slide along a bare wall: it stays as it was guessed (``remove_undetermined``).
+with s from the median absolute deviation of the residuals and the robust kernel rho of Geman and McClure. Gain and
+offset are solved together with xi, so a change of exposure does not affect the pose. The eigenvalues of the normal
+equations show which directions the residuals do not determine, such as a slide along a bare wall. These keep the
+initial guess (``remove_undetermined``).
 
 Source: J. Zhang, M. Kaess, S. Singh, On Degeneracy of Optimization-based State Estimation Problems, ICRA 2016.
 """
@@ -25,17 +26,17 @@ from .alignment_views import AlignmentView
 from .dense_residuals import NormalEquations, Surface, Weighting, linearize, make_equations
 
 PHOTOMETRIC = 0.2
-"""Weight of the intensities: neighboring ones are far from independent."""
+"""Weight of the intensities. It is low, because neighboring intensities are far from independent."""
 
 
 @dataclass(frozen=True)
 class ViewAlignment:
     """The pose of a source view in a target view.
 
-    T_target_source: (4, 4).  information: (6, 6) at it, rotation before translation, for T <- exp(xi) T, without what
-    is not determined.  determined: whether all of it is.
-    overlap: share of the source's surface that falls on the target's view.  inliers: share of that which lies on the
-    target's surface where it has one.  correlation: of the intensities there, -1…1, NaN where they hardly vary.
+    T_target_source: (4, 4).  information: (6, 6) for T <- exp(xi) T, rotation before translation, without undetermined
+    directions.  determined: whether all directions are determined.
+    overlap: share of the source's surface that projects into the target's view.  inliers: share of these pixels that
+    lie on the target's surface, where it has one.  correlation: of their intensities, -1…1; NaN if they hardly vary.
     """
 
     T_target_source: NDArray[np.float64]
@@ -47,35 +48,35 @@ class ViewAlignment:
 
 
 ARM_M = 2.0
-"""A turn by one radian moves what is seen by this many meters: compares turns with shifts."""
+"""Distance at which rotations are compared with translations: one radian counts as this many meters."""
 
 NORMALS_NOISE = 1e-3
-"""Share of the largest eigenvalue that noisy normals contribute to any: normals off by 0.03 do, squared."""
+"""Share of the largest eigenvalue that noise in the normals adds to every eigenvalue: an error of 0.03, squared."""
 
 FLAT, FEW = 0.015, 100
-"""Standard deviation of intensities, 4 steps of 8 bits, below which they say nothing; fewer pixels say nothing too."""
+"""Smallest useful standard deviation of intensities, 4 steps of 8 bits, and smallest useful number of pixels."""
 
 COMPARED = 0.15
-"""Share of what is in view that must meet a surface, not a hole."""
+"""Share of the pixels in view that must meet a surface, not a hole."""
 
 FIRST_SPREADS = (6.0, 10.0)
-"""s of depth and of intensities before any residual is known: a guess is off by a few centimeters."""
+"""Initial s of depth and of intensities: an initial guess is off by a few centimeters."""
 
 LEAST_MET = 30
-"""Source pixels that must meet the target's surface for a step, five for each unknown of the pose."""
+"""Source pixels that must meet the target's surface for a step: five per unknown of the pose."""
 
 DAMPING = (1e-6, 1.0)
-"""What is added to the diagonal of the normal equations: this share of it and this much, in 1 / m^2 a meter's
-information. It only keeps what is not determined from moving."""
+"""Terms added to the diagonal of the normal equations: a share of it and a constant, in 1 / m^2. They only keep
+undetermined directions from moving."""
 
 BRIGHTNESS_DAMPING = 1e-9
-"""What is added to the information of gain and offset: they stay where no intensity was compared."""
+"""Added to the information of gain and offset, so that they stay if no intensity is compared."""
 
 STILL = 2e-4
-"""Radians and meters: a step that is smaller ends a level."""
+"""Radians and meters: a smaller step ends the level."""
 
-_SMALL_ANGLE = 1e-7  # radians: below it sin(x) / x and its like are their limits, to rounding
-_TINY = 1e-12  # keeps eigenvalues of exactly 0 from dividing
+_SMALL_ANGLE = 1e-7  # radians: below it sin(x) / x and similar terms equal their limits, up to rounding
+_TINY = 1e-12  # avoids a division by eigenvalues of exactly 0
 
 
 def align_views(
@@ -85,9 +86,9 @@ def align_views(
     iterations: tuple[int, ...] = (8, 6, 6),
     photometric: float = PHOTOMETRIC,
 ) -> ViewAlignment:
-    """Refine the pose of ``source`` in ``target`` from a guess, coarse to fine.
+    """Refine the pose of ``source`` in ``target`` from an initial guess, coarse to fine.
 
-    iterations: at most so many steps at each level, coarsest first.  photometric: weight of the intensities.
+    iterations: largest number of steps at each level, coarsest first.  photometric: weight of the intensities.
     """
     T = np.array(T_target_source, np.float64)
     equations = make_equations()
@@ -101,13 +102,13 @@ def align_views(
 
 
 def compute_inlier_share(stats: NDArray[np.float64]) -> float:
-    """Share of the pixels that lie on the target's surface, of those where it has one, from ``linearize``'s statistics;
-    0 where too few have to tell."""
+    """Share of inliers among the pixels that meet the target's surface, from ``linearize``'s statistics; 0 with too few
+    pixels."""
     return float(stats[3] / stats[2]) if stats[2] >= max(FEW, COMPARED * stats[1]) else 0.0
 
 
 def compute_correlation(stats: NDArray[np.float64]) -> float:
-    """Of the intensities of two views, from ``linearize``'s statistics."""
+    """Correlation of the intensities of two views, from ``linearize``'s statistics; NaN if they hardly vary."""
     n = max(stats[4], 1.0)
     s, t = stats[5] / n, stats[6] / n
     ss, tt, st = stats[7] / n - s * s, stats[8] / n - t * t, stats[9] / n - s * t
@@ -125,8 +126,8 @@ def _descend(
     photometric: float,
     equations: NormalEquations,
 ) -> None:
-    """``align_views``'s loop over the views' levels: T moves in place; the equations are those of the last step's
-    start."""
+    """The loop of ``align_views`` over levels and steps. Updates T in place; the equations are those at the start of
+    the last step."""
     H, g = equations.H, equations.g
     weighting = Weighting(np.array(FIRST_SPREADS), np.array((1.0, 0.0)), photometric)
     for done in range(len(iterations)):
@@ -153,9 +154,9 @@ def _descend(
 def remove_undetermined(
     H: NDArray[np.float64], g: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
-    """(6, 6), (6,) normal equations without what noise in the normals alone would contribute, and whether something of
-    each direction is left. A bare plane whose fitted normals are off by a few hundredths seems to resist a slide by the
-    square of that."""
+    """(6, 6), (6,) normal equations without the contribution of noise in the normals, and whether every direction keeps
+    some information. If the fitted normals of a bare plane are off by a few hundredths, the plane seems to resist a
+    slide by the square of that."""
     scale = np.array((ARM_M, ARM_M, ARM_M, 1.0, 1.0, 1.0))
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     least = NORMALS_NOISE * values[5]
@@ -190,7 +191,7 @@ def apply_twist(T: NDArray[np.float64], xi: NDArray[np.float64]) -> None:
 def eliminate_brightness(
     H: NDArray[np.float64], g: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(6, 6), (6,) normal equations of xi alone, gain and offset eliminated from (8, 8), (8,)."""
+    """(6, 6), (6,) normal equations of xi: eliminates gain and offset from (8, 8), (8,)."""
     D = np.ascontiguousarray(H[6:, 6:])
     D[0, 0] += BRIGHTNESS_DAMPING
     D[1, 1] += BRIGHTNESS_DAMPING

@@ -1,12 +1,12 @@
 """Residuals of two RGB-D views and their normal equations.
 
-With p a source point and p' = T p, n and q the target's normal and point where p' projects, I the intensities,
+p is a source point, p' = T p; n and q are the target's normal and point at the projection of p'; I are intensities:
 
-    r_g = n^T (p' - q),            weighed by 1 / sigma(z)^2                                                        (1)
+    r_g = n^T (p' - q),            weighted by 1 / sigma(z)^2                                                       (1)
     r_p = I_t(pi(p')) - (gain I_s(p) + offset)                                                                      (2)
 
-Each is weighed by the Geman-McClure function's rho'(r) = 1 / (1 + (r / c)^2)^2, c = ``GEMAN_MCCLURE`` s, with s the
-residuals' spread in units of the standard deviation that is expected of them.
+Each is weighted by the Geman-McClure robust kernel, rho'(r) = 1 / (1 + (r / c)^2)^2, with c = ``GEMAN_MCCLURE`` s. s
+is the spread of the residuals in units of their expected standard deviation.
 
 Sources: Y. Chen, G. Medioni, Object Modelling by Registration of Multiple Range Images, IVC 1992 (1); C. Kerl, J.
 Sturm, D. Cremers, Dense Visual SLAM for RGB-D Cameras, IROS 2013 (2).
@@ -24,44 +24,44 @@ from numpy.typing import NDArray
 from ...core.depth_noise import look_up_sigma
 
 NEAREST_M = 0.1
-"""Meters in front of the target's camera that a point must at least be: below it projection is unstable."""
+"""Smallest distance of a point in front of the target's camera, meters. Nearer, projection is unstable."""
 
 GEMAN_MCCLURE = 2.4
-"""Spreads at which a residual's weight has fallen to a quarter. Near the 2.385 at which Cauchy's weight, whose square
-this is, uses Gaussian residuals with 95 % efficiency (Z. Zhang, Parameter Estimation Techniques, IVC 1997)."""
+"""Spreads at which a residual's weight falls to a quarter. The weight is the square of Cauchy's weight, which has 95 %
+efficiency on Gaussian residuals at 2.385 (Z. Zhang, Parameter Estimation Techniques, IVC 1997)."""
 
 NORMALS_AGREE = 0.6
-"""Cosine between two views' normals, 53 degrees, from which they can be of one surface: fitted normals of noisy depth
-are off by up to half of that each."""
+"""Smallest cosine between the normals of two views of one surface: 53 degrees, because each fitted normal of noisy
+depth is off by up to half of that."""
 
 ON_SURFACE = 3.0
-"""Spreads within which a point lies on the target's surface: 99.7 % of Gaussian residuals."""
+"""Spreads within which a point counts as on the target's surface: 99.7 % of Gaussian residuals."""
 
 SAME_SURFACE = 6.0
-"""Spreads beyond which a point is of another surface, so that its intensity says nothing."""
+"""Spreads beyond which a point belongs to another surface, so that its intensity does not count."""
 
 GRAY_SIGMA = 0.01
-"""Standard deviation expected of intensities 0…1: noise and rounding of 8-bit images, two to three of their steps."""
+"""Expected standard deviation of intensities 0…1: noise and rounding of 8-bit images, two to three steps."""
 
 MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a Gaussian over the median of its absolute values, 1 / Phi^-1(3/4)."""
+"""Standard deviation of a Gaussian over the median of its absolute value, 1 / Phi^-1(3/4)."""
 
 LEAST_SPREAD = (0.5, 0.3)
-"""Least s of depth's and of intensities' residuals: with smaller ones single pixels would decide."""
+"""Smallest s of the depth and intensity residuals; with smaller values, single pixels would decide."""
 
 STATISTICS = 10
-"""Numbers in ``NormalEquations.statistics``."""
+"""Length of ``NormalEquations.statistics``."""
 
 _BINS = 512
-_PER_SIGMA = 16.0  # histogram bins per unit of a normalized residual: spreads to 3 %, residuals up to 32 of them
+_PER_SIGMA = 16.0  # histogram bins per unit of a normalized residual: spreads to 3 %, residuals up to 32
 _EXPOSURE = 8  # unknowns: rotation, translation, gain, offset
 _POSE = 6
 
 
 class Surface(NamedTuple):
-    """What the residuals see of a view.
+    """The parts of a view that the residuals use.
 
-    points: (h, w, 3) camera frame, meters; z = 0 where there is none.  normals: (h, w, 3) unit.  sigma_m: (h, w)
+    points: (h, w, 3) camera frame, meters; z = 0 without a surface.  normals: (h, w, 3) unit.  sigma_m: (h, w)
     standard deviations of the points' depth, meters, or ``depth_noise.NOT_STATED``.  gray: intensities 0…1 of the same
     view, its size times a power of two smaller.
     """
@@ -73,10 +73,10 @@ class Surface(NamedTuple):
 
 
 class Weighting(NamedTuple):
-    """How residuals weigh; both arrays change from step to step.
+    """Weights of the residuals; both arrays change from step to step.
 
-    spreads: s of depth's residuals and of the intensities'; ``linearize`` leaves what these residuals have for the next
-    call.  brightness: gain, offset.  photometric: weight of the intensities, 0 = they are not compared.
+    spreads: s of the depth residuals and of the intensity residuals; ``linearize`` updates them for its next call.
+    brightness: gain, offset.  photometric: weight of the intensities; 0 = they are not compared.
     """
 
     spreads: NDArray[np.float64]
@@ -87,8 +87,8 @@ class Weighting(NamedTuple):
 class NormalEquations(NamedTuple):
     """H (8, 8), g (8,) of xi (rotation before translation, T <- exp(xi) T), gain and offset.
 
-    statistics: source pixels with a surface, of these in view, of these where the target has a surface too, of these on
-    it; then of the pixels that were compared by intensity their number and the sums of s, t, s s, t t, s t.
+    statistics: counts of source pixels with a surface, of those in view, of those where the target has a surface, of
+    those on it; then, for pixels with compared intensities s and t, their count and the sums of s, t, s s, t t, s t.
     """
 
     H: NDArray[np.float64]
@@ -97,7 +97,7 @@ class NormalEquations(NamedTuple):
 
 
 def make_equations() -> NormalEquations:
-    """Room for ``linearize``."""
+    """Empty normal equations for ``linearize``."""
     return NormalEquations(np.zeros((_EXPOSURE, _EXPOSURE)), np.zeros(_EXPOSURE), np.zeros(STATISTICS))
 
 
@@ -113,8 +113,8 @@ def linearize(
 ) -> None:
     """Fill the normal equations and statistics at T, the pose of the source in the target.
 
-    camera: fx, fy, cx, cy of the full-size images; the gray images may be smaller by a power of two.  stride: of the
-    source's pixels that are compared.
+    camera: fx, fy, cx, cy of the full-size images; the gray images may be smaller by a power of two.  stride: step
+    between the compared source pixels.
     """
     points_s, normals_s, gray_s = source.points, source.normals, source.gray
     points_t, normals_t, gray_t = target.points, target.normals, target.gray
@@ -214,7 +214,7 @@ def linearize(
 
 @njit(nogil=True, cache=True, inline="always")
 def _fill_jacobian(J: NDArray[np.float64], x: float, y: float, z: float, d0: float, d1: float, d2: float) -> None:
-    """Derivative by xi of a residual whose derivative by the point (x, y, z) is (d0, d1, d2)."""
+    """Derivative by xi of a residual with derivative (d0, d1, d2) by the point (x, y, z)."""
     J[0] = y * d2 - z * d1
     J[1] = z * d0 - x * d2
     J[2] = x * d1 - y * d0
@@ -227,7 +227,7 @@ def _fill_jacobian(J: NDArray[np.float64], x: float, y: float, z: float, d0: flo
 def _add_residual(
     H: NDArray[np.float64], g: NDArray[np.float64], J: NDArray[np.float64], unknowns: int, weight: float, r: float
 ) -> None:
-    """Add a residual's weight J J^T, its upper triangle alone, and weight J r."""
+    """Add a residual's weight J J^T (only the upper triangle) to H, and weight J r to g."""
     for a in range(unknowns):
         wj = weight * J[a]
         g[a] += wj * r
@@ -237,7 +237,7 @@ def _add_residual(
 
 @njit(nogil=True, cache=True, inline="always")
 def _sample_source(gray_s: NDArray[np.float32], i: int, j: int, shrink: float) -> float:
-    """The intensity at a full-size pixel, linearly between the pixels of a smaller image."""
+    """The intensity at a full-size pixel, interpolated linearly in a smaller image."""
     js = (j + 0.5) * shrink - 0.5
     is_ = (i + 0.5) * shrink - 0.5
     if shrink == 1.0:
@@ -263,7 +263,7 @@ def _count_intensities(stats: NDArray[np.float64], value_s: float, value_t: floa
 
 @njit(nogil=True, cache=True)
 def _measure_spread(histogram: NDArray[np.int64], count: int, least: float) -> float:
-    """Standard deviation from the median of absolute residuals, in units of their a-priori one."""
+    """Standard deviation from the median of absolute residuals, in units of the expected one."""
     total = 0
     for k in range(len(histogram)):
         total += histogram[k]

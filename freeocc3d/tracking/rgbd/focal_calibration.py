@@ -1,9 +1,9 @@
-"""Whether color and depth have the same focal length, asked of the scan itself.
+"""Estimates from a scan whether color and depth have the same focal length.
 
-Some sensors are calibrated only roughly: the depth image lies on the color image, but one is larger than the other.
-Depth alone gives the motion between two frames; features lifted by depth and moved by it land where they are matched
-only if the color camera's focal length is right. Of a scan of focal lengths the one with the least reprojection error
-is taken, if it stands out; else nothing is changed.
+Some sensors are calibrated only roughly: the depth image is registered to the color image, but at another scale. Depth
+alone gives the motion between two frames. Back-projected features, moved by it, meet their matches only if the color
+camera's focal length is right. Of many focal lengths, the one with the least reprojection error is taken if it stands
+out; else nothing changes.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from . import dense_alignment, orb_features
 from .keyframe_registration import KeyframeView, decode_keyframe_view, match_keyframes
 
 PAIRS = 36
-"""Pairs of frames that are looked at."""
+"""Number of pairs of frames to compare."""
 
 _GAPS = (24, 12, 6, 3)
 _RATIOS = np.exp(np.linspace(np.log(0.8), np.log(1.25), 46))
-_LEAST_CHANGE = 0.015  # of the focal length: less is within what a scan tells
-_LEAST_GAIN = 0.15  # of the error: a clear minimum takes away more
+_LEAST_CHANGE = 0.015  # relative change of the focal length; smaller ones are within the accuracy of a scan
+_LEAST_GAIN = 0.15  # relative decrease of the error; a clear minimum has more
 _LEAST_PAIRS, _LEAST_MATCHES = 8, 500
-_FAR_PX = 3.0  # an error from which on a match counts as wrong
+_FAR_PX = 3.0  # a match with a larger error counts as wrong
 
 
 def estimate_color_focal(capture: Capture, frames: range) -> float:
-    """Focal length of the color camera over that of the depth camera; 1 where the scan does not clearly say otherwise.
+    """Focal length of the color camera over that of the depth camera; 1 unless the scan clearly shows another value.
 
-    frames: those of the capture that are used. No poses are read.
+    frames: the selected frames of the capture. Does not read poses.
     """
     pairs = _pairs(capture, frames)
     if len(pairs) < _LEAST_PAIRS or sum(len(rows) for _, _, _, rows in pairs) < _LEAST_MATCHES:
@@ -52,7 +52,7 @@ _Pair = tuple[KeyframeView, KeyframeView, NDArray[np.float64], NDArray[np.int64]
 
 
 def _pairs(capture: Capture, frames: range) -> list[_Pair]:
-    """Pairs of frames (source, target), the source's pose in the target by depth alone, and their (M, 2) matches."""
+    """Pairs of frames (source, target), the source's pose in the target from depth alone, and their (M, 2) matches."""
     starts = np.unique(np.linspace(0, max(len(frames) - 1, 0), PAIRS, dtype=int))
     with ThreadPoolExecutor(count_threads()) as pool:
         found = pool.map(lambda start: _pair(capture, frames[start:]), starts.tolist())
@@ -60,7 +60,7 @@ def _pairs(capture: Capture, frames: range) -> list[_Pair]:
 
 
 def _pair(capture: Capture, frames: range) -> _Pair | None:
-    """The first frame with the farthest of a few further on that still shows most of the same."""
+    """The first frame and the farthest of a few later frames that still overlaps most of it."""
     target = decode_keyframe_view(capture, frames[0])
     for gap in _GAPS:
         source = decode_keyframe_view(capture, frames[gap]) if target is not None and gap < len(frames) else None
@@ -78,7 +78,7 @@ def _pair(capture: Capture, frames: range) -> _Pair | None:
 
 
 def _error(pairs: list[_Pair], ratio: float) -> float:
-    """Mean of a saturating reprojection error, 0…1, at a focal length of the color camera."""
+    """Mean saturating reprojection error, 0…1, for a ratio of the focal lengths."""
     total, count = 0.0, 0
     for source, target, T, rows in pairs:
         camera = replace(source.camera, fx=source.camera.fx * ratio, fy=source.camera.fy * ratio)

@@ -1,13 +1,12 @@
-"""All keyframes at once: poses that agree best with dense and feature residuals of every overlapping pair.
+"""Refines all keyframe poses jointly, by the dense and feature residuals of every overlapping pair.
 
 For a pair (s, t) of keyframes with T_ts = T_t^-1 T_s, both kinds of residuals give normal equations H, g of
 T_ts <- exp(xi) T_ts (``dense_residuals``, ``orb_features``). Moving the keyframes by exp(xi_s), exp(xi_t) from the left
-moves T_ts by A (xi_s - xi_t), A = Ad(T_t^-1), so that the pair adds A^T H A to the blocks (s, s), (t, t), and its
-negative to (s, t).
-One Gauss-Newton step solves for all keyframes; correspondences are found anew at each.
+moves T_ts by A (xi_s - xi_t), A = Ad(T_t^-1). So the pair adds A^T H A to the blocks (s, s) and (t, t), and its
+negative to (s, t). Each Gauss-Newton step solves for all keyframes, and each step finds new correspondences.
 
-Source: Q.-Y. Zhou, J. Park, V. Koltun, Fast Global Registration, ECCV 2016, Sec. 3.3 (multi-way), with its pairs'
-objective replaced.
+Source: Q.-Y. Zhou, J. Park, V. Koltun, Fast Global Registration, ECCV 2016, Sec. 3.3 (multi-way), with another
+objective for pairs.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ from . import dense_alignment, orb_features
 from .dense_residuals import Weighting, linearize, make_equations
 from .keyframe_registration import FeatureMatches, KeyframeView, match_keyframes
 
-_STRIDE = 2  # source pixels that are skipped: neighboring ones say nearly the same
+_STRIDE = 2  # step between source pixels: neighboring pixels carry nearly the same information
 _LEAST_SHARE, _LEAST_CORRELATION = 0.5, 0.5
-_STILL, _FAR_M = 5e-5, 0.02  # a step that moves nothing any more, and one after which other pairs may overlap
-_PRIOR = 1.0  # information that holds a keyframe which no pair holds
-_DAMPING = 1e-4  # share of its own information that holds every keyframe: it halves nothing, and bounds a step
+_STILL, _FAR_M = 5e-5, 0.02  # a step that ends the iteration; a motion after which other pairs may overlap
+_PRIOR = 1.0  # information that holds a keyframe without pairs
+_DAMPING = 1e-4  # share of its own information that holds every keyframe, to bound a step
 _FIXED = 1e15  # information of the first keyframe, which stays
-_FIRST_SPREADS = (3.0, 5.0)  # of residuals before any is known; tracking has aligned the keyframes once already
-_LEAST_IN_VIEW = 0.05  # share of the source's pixels that must be in the target's view
-_AGREEMENT_POWER = 4  # of a correlation's agreement, in the intensities' weight
+_FIRST_SPREADS = (3.0, 5.0)  # initial spreads of the residuals, after tracking has aligned the keyframes once
+_LEAST_IN_VIEW = 0.05  # share of the source's pixels that must lie in the target's view
+_AGREEMENT_POWER = 4  # exponent of the agreement in the weight of the intensities
 
 
 @dataclass
@@ -59,8 +58,8 @@ def refine_poses(
 ) -> list[NDArray[np.float64]]:
     """T_world_keyframe of K keyframes, refined; the first keeps its pose.
 
-    neighbors: earlier keyframes that each is paired with, those that share most of its view.  rounds: how often pairs
-    are chosen at most; anew only if keyframes moved far since.
+    neighbors: number of earlier keyframes to pair each keyframe with, those that share most of its view.  rounds: how
+    often pairs are chosen at most; a new round starts only if keyframes moved far.
     """
     T = [np.array(pose) for pose in poses]
     if len(T) < 2:
@@ -90,11 +89,11 @@ def refine_poses(
 def find_overlapping_pairs(
     keyframes: Sequence[KeyframeView], T: Sequence[NDArray[np.float64]], neighbors: int, least: float
 ) -> list[tuple[int, int]]:
-    """(source, target) of the keyframes that share most of their views; each is paired with the one before it."""
+    """(source, target) of the keyframes that share most of their views, and of each keyframe and the one before it."""
     pairs = set()
     centers = np.stack([_seen(keyframe, pose) for keyframe, pose in zip(keyframes, T, strict=True)])
     for n in range(1, len(T)):
-        # The middles of what two cameras see are near where their views overlap: measure only these.
+        # If views overlap, the middles of their scenes are near each other: measure only these pairs.
         near = np.argsort(np.linalg.norm(centers[:n] - centers[n], axis=1), kind="stable")[: 4 * neighbors]
         T_n_world = invert(T[n])
         shared = [
@@ -106,7 +105,7 @@ def find_overlapping_pairs(
 
 
 def _seen(keyframe: KeyframeView, T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3,) world position of the middle of what a keyframe sees."""
+    """(3,) world position of the middle of the points that a keyframe sees."""
     points = keyframe.overlap.points
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     return np.asarray(T[:3, :3] @ middle + T[:3, 3])
@@ -115,7 +114,8 @@ def _seen(keyframe: KeyframeView, T: NDArray[np.float64]) -> NDArray[np.float64]
 def _terms(
     pair: _Pair, keyframes: Sequence[KeyframeView], T: Sequence[NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """A pair's (6, 6), (6,) normal equations of its keyframes' difference in the world frame; None if it disagrees."""
+    """(6, 6), (6,) normal equations of a pair, for the difference of its keyframes' motion in the world; None if the
+    views disagree."""
     source, target = keyframes[pair.source], keyframes[pair.target]
     a, b = source.view, target.view
     T_target_world = invert(T[pair.target])
@@ -127,8 +127,8 @@ def _terms(
     correlation = dense_alignment.compute_correlation(stats)
     if few or dense_alignment.compute_inlier_share(stats) < _LEAST_SHARE or correlation < _LEAST_CORRELATION:
         return None
-    # Intensities that agree less well (color that lies beside its depth, reflections) say less of the pose.
-    if not np.isnan(correlation):  # flat ones say nothing, at any weight
+    # Intensities that agree less (color shifted against depth, reflections) get less weight.
+    if not np.isnan(correlation):  # flat intensities carry no information, at any weight
         agreement = (correlation - _LEAST_CORRELATION) / (1 - _LEAST_CORRELATION)
         pair.weighting = pair.weighting._replace(photometric=dense_alignment.PHOTOMETRIC * agreement**_AGREEMENT_POWER)
     damping = dense_alignment.BRIGHTNESS_DAMPING * np.eye(2)
@@ -142,7 +142,7 @@ def _terms(
 def _solve(
     pairs: Sequence[_Pair], terms: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], count: int
 ) -> NDArray[np.float64]:
-    """(K, 6) steps of all keyframes; the first stays."""
+    """(K, 6) steps of all keyframes; the first keyframe stays."""
     if not pairs:
         return np.zeros((count, 6))
     blocks = np.stack([H for H, _ in terms])

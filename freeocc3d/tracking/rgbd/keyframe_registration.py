@@ -1,4 +1,4 @@
-"""What the tracker keeps of a keyframe, and how two of them are registered."""
+"""Prepares keyframes for tracking, and registers two keyframes by features and dense alignment."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ _OVERLAP_STEP = 5
 
 @dataclass(frozen=True)
 class KeyframeView:
-    """view: for dense alignment.  overlap: its surface, sparsely.  features: ORB.  rays: (N, 2) of the features.
-    points: (N, 3) where they meet the surface, z = 0 where there is none.  camera: of the color image."""
+    """A prepared keyframe. view: for dense alignment.  overlap: sparse sample of its surface.  features: ORB.
+    rays: (N, 2) of the features.  points: (N, 3) where the rays meet the surface, z = 0 if they do not.
+    camera: of the color image."""
 
     view: AlignmentView
     overlap: DepthView
@@ -31,13 +32,13 @@ class KeyframeView:
 
 
 def sample_surface(view: AlignmentView) -> DepthView:
-    """A sparse sample of a view's surface, to measure overlap with."""
+    """A sparse sample of a view's surface, to measure overlap."""
     sample = view.points[_OVERLAP_STEP // 2 :: _OVERLAP_STEP, _OVERLAP_STEP // 2 :: _OVERLAP_STEP].reshape(-1, 3)
     return DepthView(view.points[..., 2], view.intrinsics, sample[sample[:, 2] > 0])
 
 
 def prepare_keyframe_view(frame: Frame, view: AlignmentView | None = None) -> KeyframeView:
-    """Prepare a frame; ``view`` if it is there already."""
+    """Prepare a frame. view: its alignment view, if it exists already."""
     view = view or prepare_alignment_view(frame)
     found = orb_features.detect_features(frame)
     rays = found.rays(frame.intrinsics)
@@ -45,7 +46,7 @@ def prepare_keyframe_view(frame: Frame, view: AlignmentView | None = None) -> Ke
 
 
 def decode_keyframe_view(capture: Capture, index: int) -> KeyframeView | None:
-    """A frame of a capture, prepared; None if it cannot be read."""
+    """Read and prepare a frame of a capture; None if it cannot be read."""
     try:
         return prepare_keyframe_view(capture[index])
     except FrameError:
@@ -54,14 +55,14 @@ def decode_keyframe_view(capture: Capture, index: int) -> KeyframeView | None:
 
 @dataclass(frozen=True)
 class FeatureMatches:
-    """Features of a source that match a target's, with a depth: points_s (M, 3), rays_t (M, 2)."""
+    """Matched features with a source depth: points_s (M, 3) in the source, rays_t (M, 2) in the target."""
 
     points_s: NDArray[np.float32]
     rays_t: NDArray[np.float32]
 
 
 def match_keyframes(source: KeyframeView, target: KeyframeView) -> FeatureMatches:
-    """Match features by their descriptors."""
+    """Match the features of two keyframes by their descriptors."""
     rows = orb_features.match_binary(source.features, target.features)
     points = source.points[rows[:, 0]]
     known = points[:, 2] > 0
@@ -70,7 +71,7 @@ def match_keyframes(source: KeyframeView, target: KeyframeView) -> FeatureMatche
 
 @dataclass(frozen=True)
 class FeatureRegistration:
-    """T_target_source (4, 4) that features give, how many of them agree on it, and the dense alignment from there."""
+    """T_target_source (4, 4) from features, the number of its inliers, and the dense alignment that starts from it."""
 
     by_features: NDArray[np.float64]
     agreeing: int
@@ -80,7 +81,7 @@ class FeatureRegistration:
 def register_by_features(
     source: KeyframeView, target: KeyframeView, iterations: int = 300
 ) -> FeatureRegistration | None:
-    """Pose from features, refined densely; None where they do not tell. iterations: draws of RANSAC at most."""
+    """Pose from features, refined densely; None if too few features agree. iterations: RANSAC draws at most."""
     pairs = match_keyframes(source, target)
     found = orb_features.estimate_pose(pairs.points_s, pairs.rays_t, 1.0 / target.camera.fx, iterations=iterations)
     if found is None:

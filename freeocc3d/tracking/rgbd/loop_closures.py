@@ -1,8 +1,8 @@
-"""Loop closures: keyframes that show the same place, found by their features and verified by their geometry.
+"""Finds loop closures: keyframes that show the same place, found by features and verified by geometry.
 
-A closure has to pass four tests, for one wrong closure can bend a whole map: enough features agree on one pose; dense
-alignment from there finds the surfaces on each other and the intensities alike; it stays where the features were; and a
-neighbor of one of the two, moved along, falls into place on the other as well.
+One wrong closure can bend a whole map, so a closure must pass four tests. Enough features agree on one pose. Dense
+alignment from this pose finds matching surfaces and similar intensities. The aligned pose stays near the pose from the
+features. A neighbor of one of the two keyframes, moved by the closure, also aligns with the other keyframe.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from .orb_features import OrbFeatures, match_binary
 from .place_recognition import Vocabulary, compare_histograms
 
 CANDIDATES = 4
-"""Keyframes that each is compared with: the most similar ones."""
+"""Number of most similar keyframes to compare each keyframe with."""
 
 _LEAST_SIMILAR = 0.15
-_BETWEEN = 3  # keyframes on a path between two that are compared
+_BETWEEN = 3  # smallest number of keyframes on the path between two compared ones
 _FEATURES, _SAMPLE = 20, 300
 _LEAST_OVERLAP, _LEAST_INLIERS, _LEAST_CORRELATION = 0.35, 0.75, 0.7
 _NEAR_M, _NEAR_DEG = 0.10, 4.0
@@ -36,8 +36,8 @@ def find_closures(
 ) -> list[Edge]:
     """Verified closures among K keyframes.
 
-    submap: (K,) of which piece of the path each is.  T_world_keyframe: their poses, of which only those of the same
-    submap are compared.
+    submap: (K,) submap number of each keyframe.  T_world_keyframe: their poses; only poses of the same submap are
+    compared.
     """
     with ThreadPoolExecutor(count_threads()) as pool:
         candidates = _candidates(keyframes, submap, pool)
@@ -48,7 +48,7 @@ def find_closures(
 def _candidates(
     keyframes: Sequence[KeyframeView], submap: Sequence[int], pool: ThreadPoolExecutor
 ) -> list[tuple[int, int]]:
-    """(later, earlier) rows that look alike and are not neighbors on the path anyway."""
+    """(later, earlier) rows that look alike and are not close on the path."""
     described = [keyframe.features.descriptors for keyframe in keyframes]
     if sum(map(len, described)) < _FEATURES * 2:
         return []
@@ -64,7 +64,7 @@ def _candidates(
 
 
 def count_common_features(a: OrbFeatures, b: OrbFeatures) -> int:
-    """How many features of two frames are each other's nearest, and near, of a sample."""
+    """Number of sampled features of two frames that are each other's nearest, and near."""
     few = [OrbFeatures(f.pixels[:_SAMPLE], f.descriptors[:_SAMPLE]) for f in (a, b)]
     return len(match_binary(*few))
 
@@ -76,7 +76,7 @@ def verify_closure(
     source: int,
     target: int,
 ) -> Edge | None:
-    """The closure of two keyframes, or None if a test fails."""
+    """The loop closure of two keyframes, or None if a test fails."""
     found = register_by_features(keyframes[source], keyframes[target])
     if found is None or found.agreeing < _FEATURES:
         return None
@@ -85,14 +85,14 @@ def verify_closure(
         return None
 
     def agrees(a: int, b: int) -> bool:
-        """Whether keyframes a and b fall into place where the closure and the path say."""
+        """Whether keyframes a and b align at the pose that the closure and the path predict."""
         T_source_a = invert(T_world_keyframe[source]) @ T_world_keyframe[a]
         guess = invert(T_world_keyframe[b]) @ T_world_keyframe[target] @ closed.T_target_source @ T_source_a
         aligned = dense_alignment.align_views(keyframes[a].view, keyframes[b].view, guess)
         return _falls_into_place(aligned) and _near(guess, aligned.T_target_source)
 
     def beside(row: int) -> list[int]:
-        """Its neighbors on the path."""
+        """The neighbors of a keyframe on the path."""
         return [n for n in (row - 1, row + 1) if 0 <= n < len(keyframes) and submap[n] == submap[row]]
 
     pairs = [*((n, target) for n in beside(source)), *((source, n) for n in beside(target))]

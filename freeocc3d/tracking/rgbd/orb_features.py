@@ -1,7 +1,7 @@
-"""ORB features of a frame, lifted to 3D by its depth, matched between frames, and the pose that they give.
+"""ORB features of a frame: detection, back-projection by depth, matching, and poses from matches.
 
 Sources: E. Rublee et al., ORB: an Efficient Alternative to SIFT or SURF, ICCV 2011; M. Fischler, R. Bolles, Random
-Sample Consensus, CACM 1981; both as OpenCV has them.
+Sample Consensus, CACM 1981; both as implemented in OpenCV.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ _FARTHEST_PX, _AGREES_PX = 12.0, 4.0
 
 @dataclass(frozen=True)
 class OrbFeatures:
-    """pixels: (N, 2) float32 of the color image.  descriptors: (N, 32) uint8."""
+    """pixels: (N, 2) float32, in the color image.  descriptors: (N, 32) uint8."""
 
     pixels: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
 
     def rays(self, camera: Intrinsics) -> NDArray[np.float32]:
-        """(N, 2) x/z and y/z of the pixels for a color camera."""
+        """(N, 2) rays x/z and y/z of the pixels, for a color camera."""
         center = np.array((camera.cx, camera.cy), np.float32)
         return np.asarray((self.pixels - center) / np.array((camera.fx, camera.fy), np.float32), np.float32)
 
 
 def detect_features(frame: Frame, count: int = COUNT) -> OrbFeatures:
-    """The strongest corners of a frame, spread over it."""
+    """Detect the strongest corners of a frame, spread over the image."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     orb = cv2.ORB_create(nfeatures=count, scaleFactor=1.2, nlevels=8, fastThreshold=10)
     points, descriptors = orb.detectAndCompute(gray, None)
@@ -46,7 +46,7 @@ def detect_features(frame: Frame, count: int = COUNT) -> OrbFeatures:
 
 
 def lift_rays(rays: NDArray[np.float32], view: AlignmentView) -> NDArray[np.float32]:
-    """(N, 3) camera-frame points where the (N, 2) rays meet the planes of the view's pixels, 0 where there is none."""
+    """(N, 3) camera-frame points where the (N, 2) rays meet the fitted planes of the view; 0 without a plane."""
     K = view.intrinsics
     u = np.rint(rays[:, 0] * K.fx + K.cx).astype(int)
     v = np.rint(rays[:, 1] * K.fy + K.cy).astype(int)
@@ -57,12 +57,12 @@ def lift_rays(rays: NDArray[np.float32], view: AlignmentView) -> NDArray[np.floa
     along = (n * directions).sum(axis=1)
     known = inside & (q[:, 2] > 0) & (np.abs(along) > 1e-6)
     z = np.where(known, (n * q).sum(axis=1) / np.where(known, along, 1.0), 0.0)
-    z = np.where(np.abs(z - q[:, 2]) < 0.05 * q[:, 2], z, 0.0)  # at a grazing surface the plane does not tell
+    z = np.where(np.abs(z - q[:, 2]) < 0.05 * q[:, 2], z, 0.0)  # a plane at grazing incidence is unreliable
     return (directions * z[:, None]).astype(np.float32)
 
 
 def match_binary(a: OrbFeatures, b: OrbFeatures) -> NDArray[np.int64]:
-    """(M, 2) rows of a and b whose descriptors are each other's nearest, and near."""
+    """(M, 2) rows of a and b with descriptors that are each other's nearest, and near."""
     if not len(a.pixels) or not len(b.pixels):
         return np.zeros((0, 2), np.int64)
     found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(a.descriptors, b.descriptors)
@@ -76,8 +76,8 @@ def estimate_pose(
     threshold_px: float = 3.0,
     iterations: int = 300,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
-    """T_target_source (4, 4) from (M, 3) source points seen along (M, 2) target rays, and the rows that agree with it;
-    None if too few do. pixel: size of a pixel on the rays, 1 / f.  iterations: draws of RANSAC at most."""
+    """T_target_source (4, 4) from (M, 3) source points and (M, 2) target rays, and the rows of its inliers; None with
+    too few inliers. pixel: size of a pixel in ray units, 1 / f.  iterations: RANSAC draws at most."""
     if len(points_s) < _MIN_INLIERS:
         return None
     cv2.setRNGSeed(1)
@@ -108,8 +108,8 @@ def add_reprojection(
 ) -> tuple[int, int]:
     """Add the reprojection errors of M matches, in pixels, to normal equations (6, 6), (6,) of T <- exp(xi) T.
 
-    points_s: (M, 3), z = 0 where there is no depth.  rays_t: (M, 2).  focal: pixels per unit of a ray.
-    Returns how many matches have a depth, and how many of these agree.
+    points_s: (M, 3), z = 0 without depth.  rays_t: (M, 2).  focal: pixels per ray unit.
+    Returns the number of matches with a depth, and how many of these agree.
     """
     known = agree = 0
     J = np.zeros((2, 6))

@@ -1,10 +1,10 @@
-"""Place recognition: which keyframes show what another one shows, by their features alone.
+"""Place recognition: finds keyframes that show the same place, by features alone.
 
-A vocabulary of visual words is learnt from the scan's own descriptors, a keyframe is its histogram of words, rare words
-count more, and similarity is the cosine.
+A vocabulary of visual words is learned from the scan's own descriptors. A keyframe is described by its histogram of
+words, in which rare words count more. Similarity is the cosine.
 
-Source: J. Sivic, A. Zisserman, Video Google, ICCV 2003, with k-means on binary descriptors as vectors of ±1, whose dot
-product is their Hamming distance.
+Source: J. Sivic, A. Zisserman, Video Google, ICCV 2003, with k-means on binary descriptors as vectors of ±1: their dot
+product corresponds to the Hamming distance.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _WORDS, _SAMPLE, _ROUNDS = 512, 20_000, 6
 
 
 class Vocabulary:
-    """Visual words, learnt from lists of (N, 32) uint8 descriptors."""
+    """Visual words, learned from lists of (N, 32) uint8 descriptors."""
 
     def __init__(self, descriptors: Sequence[NDArray[np.uint8]]):
         rng = np.random.default_rng(0)
@@ -34,7 +34,7 @@ class Vocabulary:
         self._words = words
 
     def histogram(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(W,) how often each word occurs."""
+        """(W,) count of each word."""
         if not len(descriptors):
             return np.zeros(len(self._words), np.float32)
         nearest = np.argmax(_signs(descriptors) @ self._words.T, axis=1)
@@ -42,7 +42,7 @@ class Vocabulary:
 
 
 def compare_histograms(histograms: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(K, K) cosine of K keyframes' (K, W) histograms, square-rooted and weighed by inverse document frequency."""
+    """(K, K) cosine of K keyframes' (K, W) histograms, square-rooted and weighted by inverse document frequency."""
     occurs = np.maximum((histograms > 0).sum(axis=0), 1)
     weighed = np.sqrt(histograms) * np.log(1 + len(histograms) / occurs)
     weighed /= np.maximum(np.linalg.norm(weighed, axis=1, keepdims=True), 1e-9)

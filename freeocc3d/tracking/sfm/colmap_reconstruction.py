@@ -1,4 +1,4 @@
-"""COLMAP's models, read or just made, as reconstructions of a capture's frames."""
+"""Converts COLMAP models, read or newly made, to reconstructions of a capture's frames."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from .reconstruction import Reconstruction
 
 
 def read_model(folder: Path, capture: Capture) -> Reconstruction:
-    """The COLMAP model of a folder (cameras, images and points3D, .bin or .txt) as that of the capture's frames, which
-    are known by their names, or by these without their endings. Its scale is unknown. Raises CaptureError for what
-    cannot be read, TrackingError for a model of other images."""
+    """Read a COLMAP model (cameras, images and points3D, .bin or .txt) as a reconstruction of the capture's frames.
+    Images match frames by file name, with or without suffix. The scale is unknown. Raises CaptureError for an
+    unreadable model, TrackingError for a model of other images."""
     own_folder = colmap_folder(folder)
     if own_folder is None:
         raise CaptureError(
@@ -38,17 +38,17 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
     if not found.has_pose.any():
         first = next((image.name for image in model.images.values()), "no image")
         raise TrackingError(
-            f"No image of the model in {folder} belongs to a frame of {capture.path}: its first is {first}, the "
+            f"No image of the model in {folder} belongs to a frame of {capture.path}: its first image is {first}, the "
             f"capture's {names[0] or 'has no name'}."
         )
     if not len(found.points):
-        raise TrackingError(f"The model in {folder} holds no points of the capture's frames.")
+        raise TrackingError(f"The model in {folder} holds no points that the capture's frames see: use another model.")
     size = capture[int(np.flatnonzero(found.has_pose)[0])].color.shape[1::-1]
     camera = found.lens.camera
     if (camera.width, camera.height) != size:
         raise TrackingError(
-            f"The model in {folder} is of images of {camera.width} x {camera.height} pixels, those of {capture.path} "
-            f"have {size[0]} x {size[1]}: give the images that it was made of."
+            f"The model in {folder} is for images of {camera.width} x {camera.height} pixels, but those of "
+            f"{capture.path} have {size[0]} x {size[1]}: use the images that the model was made from."
         )
     return found
 
@@ -56,10 +56,10 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
 def convert_model(
     model: pycolmap.Reconstruction, frames: int, frame_of: Callable[[str], int | None], source: str
 ) -> Reconstruction:
-    """A model as that of a capture of N ``frames``; ``frame_of`` tells which one an image shows by its name.
+    """Convert a model to a reconstruction of a capture's N ``frames``. frame_of: image name -> frame, or None.
 
-    source: where the model is from, for messages. Raises TrackingError for several cameras, CaptureError for a camera
-    model that is not read.
+    source: where the model comes from, for messages. Raises TrackingError for several cameras, CaptureError for an
+    unsupported camera model.
     """
     T_world_cam = np.full((frames, 4, 4), np.nan)
     seen_frame, seen_id, cameras = [], [], set()
@@ -69,14 +69,14 @@ def convert_model(
             continue
         T_world_cam[frame] = np.eye(4)
         T_world_cam[frame, :3] = image.cam_from_world().inverse().matrix()
-        ids = [point.point3D_id for point in image.get_observation_points2D()]  # pycolmap has no array of them
+        ids = [point.point3D_id for point in image.get_observation_points2D()]  # pycolmap gives no array
         seen_id.append(np.array(ids, np.uint64))
         seen_frame.append(np.full(len(ids), frame, np.int32))
         cameras.add(image.camera_id)
     lenses = {colmap_lens(model.cameras[camera], source) for camera in cameras} or {_NO_LENS}
     if len(lenses) > 1:
         raise TrackingError(
-            f"The model has {len(lenses)} cameras, but a capture has one: make it with one shared camera "
+            f"The model has {len(lenses)} cameras, but a capture has one: make the model with one shared camera "
             "(COLMAP: --ImageReader.single_camera 1)."
         )
     observed = np.concatenate(seen_id) if seen_id else np.zeros(0, np.uint64)

@@ -1,6 +1,6 @@
-"""COLMAP's database of a scan: cameras, features, matches and verified pairs, each of which is there once.
+"""COLMAP's database of a scan: cameras, features, matches and verified pairs, each stored once.
 
-Frame n of the capture is image n + 1, called as ``image_name(n)``. COLMAP's pixels have their centers at halves.
+Frame n of the capture is image n + 1, with the name ``image_name(n)``. COLMAP's pixel centers lie at half-integers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ...core.types import Intrinsics
 from .local_features import LocalFeatures
 
 _BYTES = pycolmap.FeatureExtractorType.SIFT
-_FLOATS = pycolmap.FeatureExtractorType.ALIKED_N16ROT  # any with float descriptors: only the database asks
+_FLOATS = pycolmap.FeatureExtractorType.ALIKED_N16ROT  # any type with float descriptors; only the database uses it
 _SIFT_NORM = np.float32(512)
 
 CAMERA = 1
@@ -30,7 +30,7 @@ def image_name(frame: int) -> str:
 
 
 class SfmDatabase:
-    """An open database, closed at the end of ``with``; what is in it from an interrupted run is kept."""
+    """An open database, closed at the end of ``with``. It keeps the content of an interrupted run."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -45,7 +45,7 @@ class SfmDatabase:
         self._database.close()
 
     def set_camera(self, model: str, camera: Intrinsics, known: bool) -> None:
-        """The one camera of all images, unless there is one."""
+        """Store the shared camera of all images, unless the database has one."""
         if self._database.exists_camera(CAMERA):
             return
         focal = 0.5 * (camera.fx + camera.fy)
@@ -60,7 +60,7 @@ class SfmDatabase:
         self._database.write_rig(rig, use_rig_id=True)
 
     def add(self, frame: int, features: LocalFeatures) -> None:
-        """A frame's features."""
+        """Store a frame's features."""
         image = pycolmap.Image(name=image_name(frame), camera_id=CAMERA, image_id=frame + 1)
         image.frame_id = frame + 1
         moment = pycolmap.Frame(frame_id=frame + 1, rig_id=CAMERA)
@@ -76,28 +76,28 @@ class SfmDatabase:
             self._database.write_descriptors(frame + 1, kept)
 
     def frames(self) -> list[int]:
-        """Those that are there, ascending."""
+        """The stored frames, ascending."""
         return sorted(image.image_id - 1 for image in self._database.read_all_images())
 
     def pixels(self, frame: int) -> NDArray[np.float32]:
-        """(N, 2) of a frame's features."""
+        """(N, 2) pixels of a frame's features."""
         return np.asarray(self._database.read_keypoints(frame + 1)[:, :2] - np.float32(0.5))
 
     def descriptors(self, frame: int) -> NDArray[np.float32]:
-        """(N, D) of unit length."""
+        """(N, D) descriptors of a frame's features, of unit length."""
         kept = self._database.read_descriptors(frame + 1)
         if kept.type == _FLOATS:
             return np.array(kept.to_float().data, np.float32)
         return kept.data.astype(np.float32) / _SIFT_NORM
 
     def verified(self) -> set[tuple[int, int]]:
-        """Pairs of frames (i < j) that were compared and verified, whatever came of it."""
+        """Pairs of frames (i < j) whose verification is done, with any result."""
         ids, _ = self._database.read_two_view_geometry_num_inliers()
         found = (pycolmap.pair_id_to_image_pair(pair) for pair in ids)
         return {(min(a, b) - 1, max(a, b) - 1) for a, b in found}
 
     def add_matches(self, pairs: Sequence[tuple[int, int]], matches: Iterable[NDArray[np.uint32]]) -> None:
-        """Matches of pairs of frames, verified by their geometry."""
+        """Store the matches of pairs of frames, and verify them by geometry."""
         with pycolmap.DatabaseTransaction(self._database):
             for (i, j), rows in zip(pairs, matches, strict=True):
                 if not self._database.exists_matches(i + 1, j + 1):
@@ -110,7 +110,7 @@ class SfmDatabase:
             pycolmap.verify_matches(self.path, names.name, options)
 
     def geometries(self) -> list[tuple[int, int, str, int]]:
-        """(frame, frame, kind, inliers) of the pairs that agree with a geometry."""
+        """(frame, frame, kind of geometry, number of inliers) of the verified pairs."""
         ids, found = self._database.read_two_view_geometries()
         pairs = (pycolmap.pair_id_to_image_pair(pair) for pair in ids)
         return [
@@ -119,7 +119,7 @@ class SfmDatabase:
         ]
 
     def displacement(self, i: int, j: int) -> float:
-        """Median way in pixels of what two frames were verified to show both."""
+        """Median displacement, pixels, of the verified matches of two frames."""
         rows = self._database.read_two_view_geometry(i + 1, j + 1).inlier_matches
         return float(np.median(np.linalg.norm(self.pixels(i)[rows[:, 0]] - self.pixels(j)[rows[:, 1]], axis=1)))
 

@@ -1,4 +1,4 @@
-"""Matches of local features between two images: mutual nearest neighbors that no second neighbor rivals."""
+"""Matches local features of two images: mutual nearest neighbors that are clearly nearer than the second nearest."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-_FARTHEST = 0.7  # radians between descriptors of one point
+_FARTHEST = 0.7  # largest angle between descriptors of one point, radians
 
 
 def match_descriptors(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDArray[np.uint32]:
-    """(M, 2) rows of (N, D) and (K, D) unit descriptors that match.
+    """(M, 2) matching rows of (N, D) and (K, D) unit descriptors.
 
-    ratio: the angle to the nearest must be less than this of that to the second nearest, either way; 1 = not asked.
+    ratio: largest ratio of the angles to the nearest and the second nearest, in both directions; 1 = no such test.
     """
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.uint32)
@@ -25,13 +25,13 @@ def match_descriptors(a: NDArray[np.float32], b: NDArray[np.float32], ratio: flo
 
 
 def _distinct(cosines: NDArray[np.float32], ratio: float) -> NDArray[np.bool_]:
-    """Whether the first of (2, M) cosines, of the nearest and the second nearest, stands out."""
+    """Whether the first of (2, M) cosines (nearest, second nearest) stands out."""
     first, second = np.arccos(np.clip(cosines, -1, 1))
     return np.asarray((first < ratio * second) & (first < _FARTHEST))
 
 
 def _nearest_reference(cosines: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(3, N) of the rows and (3, K) of the columns of (N, K): where the largest is, it, and the second largest."""
+    """(3, N) for the rows and (3, K) for the columns of (N, K): index of the largest, largest, second largest."""
     found = []
     for table in (cosines, cosines.T):
         order = np.argsort(-table, axis=1, kind="stable")[:, :2]

@@ -1,4 +1,4 @@
-"""Which frames of a long scan are reconstructed: sharp ones, with the same way of image motion between them."""
+"""Chooses the frames of a long scan to reconstruct: sharp ones with equal image motion between them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ...core.progress import Progress
 
 _WIDTH = 320  # motion and sharpness are measured in images of this width
 _CORNERS, _LEAST_FOLLOWED = 150, 20
-_LOST = 0.25  # of the width: counted where nothing could be followed
-_ASTRAY_PX = 1.0  # from where a corner was, when it is followed there and back
-_CREEP = 1e-4  # of the width, so that a camera that rests still gets on
+_LOST = 0.25  # of the width: the motion that counts if tracking fails
+_ASTRAY_PX = 1.0  # largest error of a corner that is tracked forth and back
+_CREEP = 1e-4  # of the width: least motion, so that a resting camera advances too
 
 
 def choose_frames(capture: Capture, frames: Sequence[int], budget: int, progress: Progress) -> list[int]:
-    """At most ``budget`` of the frames, ascending; all of them if they are no more. Frames that cannot be decoded are
-    left out of a choice."""
+    """Choose at most ``budget`` of the frames, ascending; all if there are no more. A choice leaves out frames that do
+    not decode."""
     if len(frames) <= budget:
         return list(frames)
     progress.stage("selection", len(frames))
@@ -40,8 +40,9 @@ def choose_frames(capture: Capture, frames: Sequence[int], budget: int, progress
 
 
 def spread_frames(sharp: NDArray[np.float64], moved: NDArray[np.float64], budget: int) -> list[int]:
-    """Rows of (N,) frames: the way of (N,) steps, each from the frame before, is cut into ``budget`` equal parts, and
-    of each the sharpest frame is taken."""
+    """Choose rows of N frames: cut the total motion into ``budget`` equal parts, and take the sharpest frame of each.
+
+    sharp: (N,) sharpness.  moved: (N,) motion from the frame before."""
     way = np.cumsum(np.maximum(moved, _CREEP))
     part = np.minimum((way - way[0]) / max(way[-1] - way[0], 1e-12) * budget, budget - 1).astype(np.int64)
     order = np.lexsort((-sharp, part))
@@ -50,12 +51,12 @@ def spread_frames(sharp: NDArray[np.float64], moved: NDArray[np.float64], budget
 
 
 def measure_sharpness(gray: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian: higher where edges are crisp."""
+    """Variance of the Laplacian: higher for crisp edges."""
     return float(cv2.Laplacian(gray, cv2.CV_32F).var())
 
 
 def measure_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
-    """Median way of corners from one (H, W) gray image to the next, over the width."""
+    """Median motion of corners from one (H, W) gray image to the next, as a share of the width."""
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 8)
     if corners is None or len(corners) < _LEAST_FOLLOWED:
         return _LOST

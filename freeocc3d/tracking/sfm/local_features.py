@@ -1,6 +1,6 @@
-"""Local features of an image: keypoints and descriptors, by SIFT or by a network.
+"""Finds local features of an image, keypoints and descriptors, by SIFT or a network.
 
-Sources: D. Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004, as COLMAP has it;
+Sources: D. Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004, as in COLMAP;
 R. Arandjelović, A. Zisserman, Three Things Everyone Should Know to Improve Object Retrieval, CVPR 2012.
 """
 
@@ -21,14 +21,14 @@ from ...core.threads import count_threads
 SIFT = "sift"
 
 _COUNT = 6000
-_SHRINK_TO = 1600  # pixels of the longer side: what a larger image has more, costs more than it tells
+_SHRINK_TO = 1600  # pixels of the longer side: more cost more than they help
 _GRAY, _COLOR = 1, 3
 
 
 @dataclass(frozen=True)
 class LocalFeatures:
-    """pixels: (N, 2) float32, integer pixels being pixel centers.  descriptors: (N, D), uint8 of length 512 (SIFT) or
-    float32 of length 1."""
+    """pixels: (N, 2) float32; integers are pixel centers.  descriptors: (N, D), uint8 of norm 512 (SIFT) or float32 of
+    norm 1."""
 
     pixels: NDArray[np.float32]
     descriptors: NDArray[np.uint8] | NDArray[np.float32]
@@ -38,8 +38,8 @@ class LocalFeatures:
 
 
 class Detector(Protocol):
-    """Finds features in (H, W, 3) uint8 RGB. ``ratio``: a match is unambiguous if its distance is less than this of the
-    second nearest's; 1 = mutual nearest neighbors are enough."""
+    """Finds features in (H, W, 3) uint8 RGB. ratio: largest ratio of the distances to the nearest and the second
+    nearest for an unambiguous match; 1 = mutual nearest neighbors suffice."""
 
     ratio: float
 
@@ -47,12 +47,12 @@ class Detector(Protocol):
 
 
 def load_detector(name: str) -> Detector:
-    """``"sift"``, or the path of an ONNX network. Raises ModelError."""
+    """Load a detector: ``"sift"``, or the path of an ONNX network. Raises ModelError."""
     return Sift() if name == SIFT else KeypointNetwork(Path(name).expanduser())
 
 
 class Sift:
-    """Thread-safe."""
+    """SIFT, as in COLMAP. Thread-safe."""
 
     ratio = 0.8
 
@@ -81,10 +81,10 @@ def _sift() -> Any:
 
 
 class KeypointNetwork:
-    """A network that finds and describes keypoints, as exports of SuperPoint, DISK and ALIKED do.
+    """A network that finds and describes keypoints, such as an export of SuperPoint, DISK or ALIKED.
 
-    Its input is (1, 1 or 3, H, W) float32 in 0…1; among its outputs are one whose name holds "keypoint", (1, N, 2) or
-    (N, 2) pixels x, y, and one whose name holds "descriptor", (1, N, D), (N, D) or (1, D, N). Raises ModelError.
+    Input: (1, 1 or 3, H, W) float32 in 0…1. Outputs: one with "keypoint" in its name, (1, N, 2) or (N, 2) pixels x, y,
+    and one with "descriptor" in its name, (1, N, D), (N, D) or (1, D, N). Raises ModelError.
     """
 
     ratio = 1.0
@@ -93,13 +93,13 @@ class KeypointNetwork:
         import onnxruntime as ort
 
         if not path.is_file():
-            raise ModelError(f"There is no network {path} (tracking.colmap.features): give 'sift', or an .onnx file.")
+            raise ModelError(f"There is no network {path}: set tracking.colmap.features to sift, or to an .onnx file.")
         options = ort.SessionOptions()
         options.intra_op_num_threads = count_threads()
         options.log_severity_level = 3
         try:
             self._session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's exceptions have no common base of their own
+        except Exception as error:  # onnxruntime's exceptions share no base class
             said = " ".join(str(error).split())[:200].rstrip(".")
             raise ModelError(f"{path} is not an ONNX network that onnxruntime can run: {said}.") from error
         self._path = path
@@ -108,8 +108,8 @@ class KeypointNetwork:
         shape = inputs[0].shape if len(inputs) == 1 else []
         if len(shape) != 4 or shape[1] not in (_GRAY, _COLOR) or None in self._named:
             raise ModelError(
-                f"{path} finds no local features: it must take one image (1, 1 or 3, H, W) and give keypoints and "
-                f"descriptors, but takes {[i.name for i in inputs]} and gives {outputs}."
+                f"{path} is not a network for local features: it must take one image (1, 1 or 3, H, W) and give "
+                f"keypoints and descriptors, but takes {[i.name for i in inputs]} and gives {outputs}."
             )
         self._input, self._channels = inputs[0].name, shape[1]
         self._size = tuple(side if isinstance(side, int) else None for side in shape[2:])
@@ -126,8 +126,8 @@ class KeypointNetwork:
             found = found.T
         if len(found) != len(pixels) or not (np.isfinite(found).all() and np.isfinite(pixels).all()):
             raise ModelError(
-                f"{self._path} gives keypoints {keypoints.shape} and descriptors {descriptors.shape}, which do not "
-                "belong together or are not finite."
+                f"{self._path} gives unusable features: keypoints {keypoints.shape} and descriptors "
+                f"{descriptors.shape} do not match, or are not finite."
             )
         scale = np.array(color.shape[1::-1], np.float32) / np.array((width, height), np.float32)
         norm = np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)

@@ -1,7 +1,7 @@
-"""Poses and points from verified matches, by COLMAP's incremental or global mapper, and a last adjustment of all.
+"""Finds poses and points from verified matches, by COLMAP's incremental or global mapper and bundle adjustment.
 
 Sources: J. Schönberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016; L. Pan et al., Global
-Structure-from-Motion Revisited (GLOMAP), ECCV 2024; both as pycolmap has them.
+Structure-from-Motion Revisited (GLOMAP), ECCV 2024; both as in pycolmap.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pycolmap
 
-_GROWTH = 1.4  # of a model between two adjustments of all of it
-_REFINEMENTS = 2, 1  # of a model, and of what is around a new image: ``adjust_model`` refines the whole in the end
+_GROWTH = 1.4  # growth of a model between two global adjustments
+_REFINEMENTS = 2, 1  # global and local; ``adjust_model`` refines everything at the end
 _TOLERANCES = 1e-5, 1e-4
 _LEAST_IMAGES = 3
 _MOST_MODELS = 8
 _ITERATIONS = 40
-_CLEARLY_BETTER = 0.98  # of the squared error, with distortion; where there is none it is 0.9998
+_CLEARLY_BETTER = 0.98  # ratio of the squared errors with and without distortion; about 0.9998 if there is none
 
 _DISTORTED = "SIMPLE_RADIAL"
 
@@ -26,9 +26,9 @@ _DISTORTED = "SIMPLE_RADIAL"
 def map_incrementally(
     database: Path, folder: Path, fixed: bool, registered: Callable[[], None], start: Path | None = None
 ) -> list[pycolmap.Reconstruction]:
-    """Models, the largest first. fixed: intrinsics stay.  registered: called for each image that gets a pose.
+    """Models, the largest first. fixed: keep the intrinsics.  registered: called for each image that gets a pose.
 
-    start: a saved model that is to be continued.
+    start: a saved model to continue.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
@@ -48,7 +48,7 @@ def map_incrementally(
 
 
 def map_globally(database: Path, folder: Path, fixed: bool) -> list[pycolmap.Reconstruction]:
-    """Models, the largest first: all images at once, which is faster and needs more matches."""
+    """Models, the largest first. Places all images at once, which is faster but needs more matches."""
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
     options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False
@@ -61,7 +61,7 @@ def map_globally(database: Path, folder: Path, fixed: bool) -> list[pycolmap.Rec
 def continue_mapping(
     database: Path, folder: Path, fixed: bool, model: pycolmap.Reconstruction
 ) -> pycolmap.Reconstruction:
-    """The model with the images that it lacks, where they can be placed now that all of it is there."""
+    """The model with those missing images that can be placed now that the model is complete."""
     begun = _fresh(folder / "begun")
     model.write(begun)
     more = map_incrementally(database, folder, fixed, lambda: None, begun)
@@ -69,7 +69,7 @@ def continue_mapping(
 
 
 def silence_colmap() -> None:
-    """COLMAP prints nothing: what went wrong is told in errors and warnings."""
+    """Make COLMAP print nothing: errors and warnings say what went wrong."""
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
 
 
@@ -84,8 +84,8 @@ def _largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.R
 
 
 def adjust_model(model: pycolmap.Reconstruction, fixed: bool, distorts: bool) -> pycolmap.Reconstruction:
-    """The model after an adjustment of everything with a robust loss; with distortion where ``distorts`` says so, or
-    where that lowers the error clearly. It is changed in place, and not what is returned."""
+    """The model after bundle adjustment with a robust loss. ``distorts``: the camera model has distortion. Otherwise
+    distortion is added if that clearly lowers the error. Changes the model in place, but may return another one."""
     if fixed or distorts:
         _adjust(model, fixed)
         return model
@@ -97,7 +97,7 @@ def adjust_model(model: pycolmap.Reconstruction, fixed: bool, distorts: bool) ->
 
 
 def _adjust(model: pycolmap.Reconstruction, fixed: bool) -> float:
-    """The sum of robust squared errors afterwards."""
+    """Run bundle adjustment. Returns the sum of robust squared errors."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = options.refine_extra_params = not fixed
@@ -113,7 +113,7 @@ def _adjust(model: pycolmap.Reconstruction, fixed: bool) -> float:
 
 
 def _distort(camera: pycolmap.Camera) -> None:
-    """Give a pinhole camera the parameters of a lens, which are 0 at first."""
+    """Add distortion parameters, initially 0, to a pinhole camera."""
     bent = pycolmap.Camera.create_from_model_name(
         camera.camera_id, _DISTORTED, camera.mean_focal_length(), camera.width, camera.height
     )

@@ -1,6 +1,7 @@
-"""Which images of a scan are compared: those that follow each other, and those that look alike.
+"""Chooses the pairs of images to compare: those that follow each other, and those that look alike.
 
-An image is described by its features' residuals to words that are learnt from the scan; similarity is the cosine.
+An image is described by the residuals of its features to words that are learned from the scan. Similarity is the
+cosine.
 
 Source: H. Jégou et al., Aggregating Local Descriptors into a Compact Image Representation, CVPR 2010 (VLAD).
 """
@@ -15,14 +16,14 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 OF_IMAGE = 1000
-"""Features of an image that are enough to describe it."""
+"""Number of features that suffice to describe an image."""
 
 _WORDS, _SAMPLE, _ROUNDS = 64, 20_000, 8
-_NEAR = 5  # successors in a video are among the images most like each
+_NEAR = 5  # in a video, the next frame is among this many most similar images
 
 
 def compare_images(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """(N, N) cosine of N images' descriptors of descriptors, each (F, D) of unit length."""
+    """(N, N) cosine similarity of N images. descriptors: (F, D) of each image, of unit length."""
     rng = np.random.default_rng(0)
     sampled = [d[rng.permutation(len(d))[: max(_SAMPLE // len(descriptors), 1)]] for d in descriptors]
     words = _words(np.concatenate(sampled), rng)
@@ -31,10 +32,10 @@ def compare_images(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.flo
 
 
 def _words(sample: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """(W, D) centers of clusters."""
+    """(W, D) cluster centers."""
     start = sample[rng.permutation(len(sample))[:_WORDS]]
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "One of the clusters is empty")  # it keeps its center
+        warnings.filterwarnings("ignore", "One of the clusters is empty")  # an empty cluster keeps its center
         return np.asarray(kmeans2(sample, start, _ROUNDS, minit="matrix")[0], np.float32)
 
 
@@ -43,7 +44,7 @@ def _assigned(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> N
 
 
 def _vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(W·D,) sums of residuals to the words, each and all of unit length."""
+    """(W·D,) sums of residuals to the words; each sum has unit length, and so has the whole vector."""
     sums = np.zeros_like(words)
     if len(descriptors):
         nearest = _assigned(descriptors, words)
@@ -53,7 +54,7 @@ def _vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArr
 
 
 def is_sequence(alike: NDArray[np.float32]) -> bool:
-    """Whether images that follow each other look alike, as those of a video, given all similarities (N, N)."""
+    """Whether successive images look alike, as in a video. alike: (N, N) similarities."""
     if len(alike) <= 2 * _NEAR:
         return False
     others = np.where(np.eye(len(alike), dtype=bool), -np.inf, alike)
@@ -63,10 +64,10 @@ def is_sequence(alike: NDArray[np.float32]) -> bool:
 
 
 def choose_pairs(alike: NDArray[np.float32], follow: int, retrieved: int) -> NDArray[np.int64]:
-    """(P, 2) ascending pairs (i < j) of N images: each with the next ``follow`` ones and with as many as ``retrieved``
-    of those most like it, the nearest first.
+    """(P, 2) pairs (i < j) of N images, the closest in order first: each image with the next ``follow`` images and with
+    the ``retrieved`` most similar ones.
 
-    alike: (N, N). ``follow`` 0 for images in no order. With N - 1 ``retrieved`` every pair is there.
+    alike: (N, N) similarities. Use ``follow`` 0 for images in no order. ``retrieved`` N - 1 gives all pairs.
     """
     n = len(alike)
     rows = np.arange(n)

@@ -1,4 +1,4 @@
-"""What structure from motion finds of a scan, as plain data."""
+"""The result of structure from motion, as plain data."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _OF_LENS = ("camera", "fisheye")
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Poses and sparse points of a scan by structure from motion, or read from a model.
+    """Poses and sparse points of a scan, from structure from motion or from an existing model.
 
-    T_world_cam: (N, 4, 4) float64, row n = frame n of the capture, NaN where it has no pose.
+    T_world_cam: (N, 4, 4) float64, row n = frame n of the capture, NaN without a pose.
     lens: of all frames.  points: (P, 3) float32 world.
-    seen_frame, seen_point: (O,) int32, point ``seen_point[i]`` is seen in frame ``seen_frame[i]``.
+    seen_frame, seen_point: (O,) int32; frame ``seen_frame[i]`` sees point ``seen_point[i]``.
     metric: whether the world's unit is the meter.
-    apart: (N,) whether the frame is in another model than this, which nothing ties to it.
-    chosen: (N,) whether the frame was used at all.  warnings: what the user should know.
+    apart: (N,) whether the frame is in another, unconnected model.
+    chosen: (N,) whether the frame was selected for reconstruction.  warnings: for the user.
     """
 
     T_world_cam: NDArray[np.float64]
@@ -48,32 +48,32 @@ class Reconstruction:
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:
-        """(N,) which frames have one."""
+        """(N,) whether each frame has a pose."""
         return np.asarray(np.isfinite(self.T_world_cam).all(axis=(1, 2)))
 
     @cached_property
     def rectified(self) -> Rectified:
-        """Resamples frames as a pinhole camera would have taken them."""
+        """Resamples frames to a pinhole camera."""
         return Rectified(self.lens, None)
 
     def depths(self) -> NDArray[np.float64]:
-        """(O,) of each observation: the point's z in the frame's camera."""
+        """(O,) depth of each observation: the point's z in the frame's camera."""
         T = self.T_world_cam[self.seen_frame]
         moved = self.points[self.seen_point].astype(np.float64) - T[:, :3, 3]
         return np.asarray((moved * T[:, :3, 2]).sum(axis=1))
 
     def scaled(self, scale: float) -> Reconstruction:
-        """The same in units of which ``scale`` make one of the present."""
+        """The reconstruction with every length multiplied by ``scale``."""
         T_world_cam = self.T_world_cam.copy()
         T_world_cam[:, :3, 3] *= scale
         return replace(self, T_world_cam=T_world_cam, points=self.points * np.float32(scale))
 
     def normalized(self) -> Reconstruction:
-        """With the median depth ``NOMINAL_DEPTH``, unless the scale is known."""
+        """The reconstruction scaled to a median depth of ``NOMINAL_DEPTH``, unless its scale is known."""
         return self if self.metric else self.scaled(NOMINAL_DEPTH / float(np.median(self.depths())))
 
     def save(self, path: Path) -> None:
-        """As an .npz file that is whole or not there."""
+        """Write an .npz file, completely or not at all. Raises OSError."""
         camera = self.lens.camera
         numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *self.lens.distortion)
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _EXPECTED if name not in _OF_LENS}

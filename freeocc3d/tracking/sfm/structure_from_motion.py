@@ -1,8 +1,8 @@
-"""Structure from motion of a capture: which frames, their features, what they share, and poses and points from that.
+"""Structure from motion of a capture.
 
-Each stage leaves its result in a folder, and is not done again. The stages: frames are chosen (``selection``), features
-found (``local_features``), pairs of images proposed (``candidates``), matched and verified (``matching``), mapped and
-adjusted (``mapping``).
+The stages choose frames (``frame_selection``), find features (``local_features``), propose pairs of images
+(``pair_selection``), match and verify them (``feature_matching``, ``database``), map and adjust (``mapping``). Each
+stage saves its result in a folder and does not run again.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from .reconstruction import Reconstruction
 _DATABASE, _CHOSEN, _RESULT = "database.db", "chosen.json", "reconstruction.npz"
 
 _ALL_PAIRS = 60
-"""Images in no order of which all pairs are compared; of more, those that look alike."""
+"""Largest number of unordered images with all pairs compared; with more images, only similar ones are compared."""
 
 _FOLLOW, _ALIKE, _ALIKE_UNORDERED = 5, 8, 24
 _CHUNK = 64
@@ -45,7 +45,7 @@ _CACHED = 128
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a capture is reconstructed; ``colmap.Options`` says what each means."""
+    """How to reconstruct a capture; see ``trackers.colmap.Options`` for the fields."""
 
     frames: int = 300
     order: str = "auto"
@@ -57,9 +57,10 @@ class Recipe:
 def reconstruct_poses(
     capture: Capture, frames: Sequence[int], folder: Path, recipe: Recipe, progress: Progress
 ) -> Reconstruction:
-    """Poses and points of the capture's frames, in a unit in which the median depth is ``NOMINAL_DEPTH``.
+    """Poses and points of the capture's frames, scaled to a median depth of ``NOMINAL_DEPTH``.
 
-    folder: takes what lets an interrupted call go on. Raises TrackingError for a scan that gives none, ModelError.
+    folder: keeps what an interrupted call needs to continue. Raises TrackingError if the scan gives no poses, and
+    ModelError.
     """
     if (folder / _RESULT).is_file():
         return Reconstruction.load(folder / _RESULT)
@@ -86,7 +87,7 @@ def reconstruct_poses(
     apart, pieces = _apart(models, result.has_pose)
     if pieces:
         text = (
-            f"{what} fell into {pieces + 1} models that nothing ties together: the largest, of {largest} images, is "
+            f"{what} gave {pieces + 1} models that are not connected: only the largest, of {largest} images, is "
             "mapped. Film the way between them, or reconstruct them one by one (capture.start, capture.stop)."
         )
         warnings.append(Notice("models-apart", text))
@@ -101,8 +102,8 @@ def reconstruct_poses(
 
 
 def _apart(models: Sequence[pycolmap.Reconstruction], has_pose: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int]:
-    """(N,) frames that are in other models than the first, and how many such models there are: what another model has
-    of its own must be more than a few frames."""
+    """(N,) frames that are only in other models than the first, and the number of such models. A model counts if it has
+    more than a few frames of its own."""
     apart, pieces = np.zeros(len(has_pose), bool), 0
     for model in models[1:]:
         own = np.array(model.reg_image_ids(), np.int64) - 1
@@ -114,7 +115,7 @@ def _apart(models: Sequence[pycolmap.Reconstruction], has_pose: NDArray[np.bool_
 
 
 def _chosen(capture: Capture, frames: Sequence[int], path: Path, budget: int, progress: Progress) -> list[int]:
-    """The frames that are reconstructed."""
+    """The frames to reconstruct; the choice is saved at ``path``."""
     if path.is_file():
         return list(json.loads(path.read_text(encoding="utf-8")))
     found = frame_selection.choose_frames(capture, frames, budget, progress)
@@ -130,8 +131,8 @@ def _extract(
     recipe: Recipe,
     progress: Progress,
 ) -> list[Notice]:
-    """Features of the chosen frames into the database; a frame that cannot be decoded, or of another size than the
-    first, is left out. Returns warnings."""
+    """Store the features of the chosen frames in the database. Leaves out frames that do not decode or differ in size
+    from the first. Returns warnings."""
     progress.stage("features", len(chosen))
     there = set(database.frames())
     waiting = [index for index in chosen if index not in there]
@@ -165,14 +166,14 @@ def _extract(
 
 
 def _model(capture: Capture, recipe: Recipe) -> str:
-    """COLMAP's name of the camera that images are matched and mapped with."""
+    """COLMAP's name of the camera model for matching and mapping."""
     if recipe.intrinsics == "fixed":
         return "PINHOLE"
     return "SIMPLE_PINHOLE" if capture.intrinsics_known else "SIMPLE_RADIAL"
 
 
 def _compare(database: SfmDatabase, frames: Sequence[int], order: str, ratio: float, progress: Progress) -> None:
-    """Match the pairs of images that may show the same, and verify what matches by its geometry."""
+    """Match pairs of images that may overlap, and verify the matches by geometry."""
     descriptors = functools.lru_cache(_CACHED)(database.descriptors)
     proposed = [(frames[i], frames[j]) for i, j in _pairs(descriptors, frames, order).tolist()]
     verified = database.verified()
@@ -189,7 +190,7 @@ def _compare(database: SfmDatabase, frames: Sequence[int], order: str, ratio: fl
 
 
 def _pairs(descriptors: Callable[[int], NDArray[np.float32]], frames: Sequence[int], order: str) -> NDArray[np.int64]:
-    """(P, 2) rows of ``frames`` to be compared."""
+    """(P, 2) pairs of rows of ``frames`` to compare."""
     rng = np.random.default_rng(0)
     sampled = []
     for frame in frames:
@@ -202,7 +203,7 @@ def _pairs(descriptors: Callable[[int], NDArray[np.float32]], frames: Sequence[i
 
 
 def _mapped(folder: Path, images: int, recipe: Recipe, progress: Progress) -> list[pycolmap.Reconstruction]:
-    """Models, the largest first. Images that a model lacks are tried again when all of it is there."""
+    """Models, the largest first. Images without a pose get a second try when the model is complete."""
     fixed = recipe.intrinsics == "fixed"
     progress.stage("mapping", images)
     placed = itertools.count(1)

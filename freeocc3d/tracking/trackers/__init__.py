@@ -1,1 +1,1 @@
-"""Trackers, one file each; ../base.py is their contract."""
+"""Trackers, one file each; ``../base.py`` defines their contract."""

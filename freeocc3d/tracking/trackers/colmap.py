@@ -24,34 +24,35 @@ REQUIRES: tuple[str, ...] = ("pycolmap",)
 
 
 class Options(KeyframeOptions, frozen=True):
-    """Which frames, how they are matched and mapped, the camera, and an existing model."""
+    """The frames, how to match and map them, the camera, and an existing model."""
 
     frames: PositiveInt = 300
-    """The most frames that are reconstructed: of more, the sharpest ones with the same way of image motion between."""
+    """Largest number of frames to reconstruct; of more, the sharpest with equal image motion between them are used."""
     order: Literal["auto", "video", "photos"] = "auto"
-    """"video": each frame shows much of the one before; "photos": images in no order; "auto": as the images say."""
+    """"video": each frame overlaps the one before; "photos": images in no order; "auto": decide by the images."""
     features: str = "sift"
-    """"sift", or the path of an ONNX network that finds keypoints and descriptors (SuperPoint, DISK, ALIKED)."""
+    """"sift", or the path of an ONNX network for keypoints and descriptors (SuperPoint, DISK, ALIKED)."""
     mapping: Literal["incremental", "global"] = "incremental"
-    """"incremental" adds image by image; "global" places all at once: faster, but needs each seen in many others."""
+    """"incremental": add image by image; "global": place all at once, which is faster but needs more overlap."""
     intrinsics: Literal["refine", "fixed"] = "refine"
-    """"refine": those of the capture are a start; "fixed": they are kept as they are."""
+    """"refine": start from the capture's intrinsics; "fixed": keep them unchanged."""
     model: str | None = None
-    """Folder of a COLMAP model (cameras, images, points3D) of the capture's images that is taken instead."""
+    """Folder of an existing COLMAP model (cameras, images, points3D) of the capture's images to use instead."""
 
 
 def load(options: Options, capture: Capture) -> ColmapTracker:
-    """The tracker; the capture's depth and poses are not read. Raises ConfigError."""
+    """Load the tracker. It does not read the capture's depth or poses. Raises ConfigError."""
     if options.intrinsics == "fixed" and not capture.intrinsics_known and options.model is None:
         raise ConfigError(
-            f"tracking.colmap.intrinsics=fixed needs the camera of {capture.path}: give capture.intrinsics, or refine."
+            f"tracking.colmap.intrinsics=fixed needs the camera of {capture.path}: give capture.intrinsics, or set "
+            "tracking.colmap.intrinsics=refine."
         )
     return ColmapTracker(options, capture)
 
 
 class ColmapTracker(GivenTracker):
-    """Poses are known when ``prepare`` is done; frames that were not chosen are "unused", those of smaller models
-    "apart". Frames are given as a pinhole camera would have taken them."""
+    """Takes the poses that ``prepare`` finds. Frames that are not selected are "unused", those of smaller models
+    "apart". Frames are undistorted to a pinhole camera."""
 
     world: ClassVar[str] = "OpenCV camera axes of the model's world, in units of half the median depth of its points"
     estimates_camera = True
@@ -82,7 +83,7 @@ class ColmapTracker(GivenTracker):
         return found if scale is None else found.scaled(scale)
 
     def prepare_frame(self, frame: Frame) -> Frame:
-        """Undistorted."""
+        """Undistort the frame."""
         assert self.reconstruction is not None, "prepare comes first"
         rectified = self.reconstruction.rectified
         return replace(frame, color=rectified.color(frame.color), intrinsics=rectified.intrinsics)

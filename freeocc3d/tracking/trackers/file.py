@@ -1,4 +1,4 @@
-"""Takes another system's poses from a file: TUM, KITTI, Open3D .log, COLMAP, nerfstudio, 7-Scenes."""
+"""Reads another system's poses from a file: TUM, KITTI, Open3D .log, COLMAP, nerfstudio, 7-Scenes."""
 
 from __future__ import annotations
 
@@ -24,34 +24,34 @@ from ..rgbd.keyframe_registration import decode_keyframe_view
 REQUIRES: tuple[str, ...] = ("open3d",)
 
 _PAIRS, _LEAST_PAIRS = 24, 6
-_LEAST_STEP = 0.05  # of the depth: a shorter way between two frames tells no scale
-_TOLERATED = 1.1  # of the scale, either way
-_CELL = 8  # pixels; in one of them a cloud's points hide what lies behind
-_BEHIND = 0.05  # of the depth
+_LEAST_STEP = 0.05  # of the depth: frames that are nearer to each other give no reliable scale
+_TOLERATED = 1.1  # largest ratio of the stated and the measured scale, either way
+_CELL = 8  # pixels: within a cell, a cloud's points hide those behind them
+_BEHIND = 0.05  # of the depth: how far behind a point must lie to be hidden
 
 
 class Options(KeyframeOptions, frozen=True):
-    """Which file, how its poses are told apart, its scale, and a point cloud that came with it."""
+    """The trajectory file, how to match its poses to frames, its scale, and its point cloud."""
 
     path: str = ""
-    """The trajectory: a file, or a folder of 7-Scenes' poses or with a COLMAP model; also looked for in the capture."""
+    """The trajectory: a file, or a folder of 7-Scenes poses or a COLMAP model; may be relative to the capture."""
     max_time_difference: Positive = 0.02
-    """Seconds by which a pose and its frame may differ, for files that state times."""
+    """Largest time difference of a pose and its frame, seconds, for files with times."""
     scale: Positive | None = 1.0
-    """Meters per unit of the file; null = as the capture's depth says, for monocular systems, and without depth as
-    capture.scale says, else unknown."""
+    """Meters per unit of the file. null (for monocular systems) = estimate it from the capture's depth; without depth,
+    use capture.scale, else it is unknown."""
     points: str | None = None
-    """Point cloud (PLY, PCD, XYZ) in the file's world: where a frame has no depth, its points are the anchors."""
+    """Point cloud (PLY, PCD, XYZ) in the file's world, which gives depth to frames where they have none."""
 
 
 def load(options: Options, capture: Capture) -> FileTracker:
-    """The tracker that reads ``options.path``.
+    """Load the tracker for the file ``options.path``.
 
-    Raises ConfigError (no path), CaptureError (a file that cannot be read or has no pose of this capture),
-    TrackingError (a scale that the depth contradicts).
+    Raises ConfigError (no path), CaptureError (the file is unreadable or has no pose for this capture), TrackingError
+    (the depth contradicts the scale).
     """
     if not options.path:
-        raise ConfigError("tracking.backend=file needs tracking.file.path, the trajectory that is to be taken.")
+        raise ConfigError("tracking.backend=file needs a trajectory: set tracking.file.path.")
     found = read_trajectory(_beside(options.path, capture))
     T_world_cam = found.of_frames(capture, options.max_time_difference)
     points = None if options.points is None else read_points(_beside(options.points, capture)).astype(np.float32)
@@ -64,8 +64,8 @@ def load(options: Options, capture: Capture) -> FileTracker:
 
 
 class FileTracker(GivenTracker):
-    """The world frame is the file's, in meters. With a point cloud, (P, 3) world, frames get its depth where they have
-    none of their own."""
+    """Takes the poses of a file. The world frame is the file's, in meters. A point cloud, (P, 3) world, gives depth to
+    pixels that have none."""
 
     world: ClassVar[str] = "world frame of the trajectory file, scaled to meters"
 
@@ -88,8 +88,8 @@ class FileTracker(GivenTracker):
 
 
 def project_depth(points_cam: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:
-    """(H, W) meters: (P, 3) camera-frame points at the pixels where they fall, the nearest first; 0 elsewhere. A cloud
-    has gaps, so points far behind others in a neighborhood of pixels count as hidden."""
+    """Project (P, 3) camera-frame points to an (H, W) depth map, meters; the nearest point of a pixel wins, 0 = none. A
+    cloud has gaps, so a point far behind others in the same cell of pixels counts as hidden."""
     camera = frame.intrinsics
     front = points_cam[points_cam[:, 2] > 0.05]
     pixels, z = project(front, camera)
@@ -105,38 +105,38 @@ def project_depth(points_cam: NDArray[np.float32], frame: Frame) -> NDArray[np.f
 
 
 def _beside(path: str, capture: Capture) -> Path:
-    """The path as given, or, where there is no such file, in the capture's folder or beside the video."""
+    """The path as given or, if it does not exist, the path in the capture's folder or the folder of the video."""
     given = Path(path).expanduser()
     inside = (capture.path.parent if capture.path.is_file() else capture.path) / given
     return inside if not given.exists() and inside.exists() else given
 
 
 def _scale(T_world_cam: NDArray[np.float64], capture: Capture, options: Options) -> float:
-    """Meters per unit, from the options, checked against what depth says, or from depth; 1 where nothing says it."""
+    """Meters per unit: from the options, checked against depth, or else from depth; 1 if unknown."""
     if not capture.has_depth:
         return capture.options.scale or options.scale or 1.0
     measured = estimate_depth_scale(T_world_cam, capture)
     if options.scale is None:
         if measured is None:
             raise TrackingError(
-                f"The scale of {options.path} cannot be told from the depth of {capture.path}: too few frames with a "
-                "pose and depth show the same; give tracking.file.scale."
+                f"The scale of {options.path} cannot be estimated from the depth of {capture.path}: too few frames "
+                "with a pose and depth overlap. Give tracking.file.scale."
             )
         return measured
     off = None if measured is None else max(measured / options.scale, options.scale / measured)
     if off is not None and off > _TOLERATED:
         raise TrackingError(
-            f"By the depth of {capture.path} a unit of {options.path} is {measured:.3g} m, not {options.scale:g} m: "
-            "give tracking.file.scale, null to take what depth says, or check that the file is this capture's."
+            f"By the depth of {capture.path}, a unit of {options.path} is {measured:.3g} m, not {options.scale:g} m: "
+            "correct tracking.file.scale, set it to null to use depth, or check that the file belongs to this capture."
         )
     return options.scale
 
 
 def estimate_depth_scale(T_world_cam: NDArray[np.float64], capture: Capture) -> float | None:
-    """Meters per unit of (N, 4, 4) poses by the capture's depth; None where too little tells.
+    """Estimate meters per unit of (N, 4, 4) poses from the capture's depth; None with too few matches.
 
-    Where two frames match features with depths p_s, p_t, p_t = R p_s + scale t: each match gives a scale along t, and
-    the median over a pair, then over pairs, is taken.
+    For matched features of two frames, back-projected to p_s and p_t, p_t = R p_s + scale t. Each match gives a scale
+    along t. The result is the median over pairs of the median within each pair.
     """
     posed = np.flatnonzero(np.isfinite(T_world_cam).all(axis=(1, 2)))
     scales = []

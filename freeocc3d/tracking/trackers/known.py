@@ -1,4 +1,4 @@
-"""Takes the capture's own poses; a frame that shares too little with its keyframe becomes a keyframe."""
+"""Uses the capture's own poses. A frame that shares too little with its keyframe becomes a keyframe."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ REQUIRES: tuple[str, ...] = ()
 
 
 class Options(KeyframeOptions, frozen=True):
-    """Keyframes."""
+    """When a frame becomes a keyframe."""
 
 
 def load(options: Options, capture: Capture) -> KnownTracker:
-    """The tracker that reads ``capture.pose``. Raises TrackingError if the capture has no poses at all."""
+    """Load the tracker, which reads ``capture.pose``. Raises TrackingError if the capture has no poses."""
     stated = [capture.pose(index) for index in range(len(capture))]
     if all(pose is None for pose in stated):
-        raise TrackingError(f"{capture.path} brings no poses: use tracking.backend=rgbd, which estimates them.")
+        raise TrackingError(f"{capture.path} has no poses: use tracking.backend=rgbd, which estimates them.")
     none = np.full((4, 4), np.nan)
     given = np.stack([none if pose is None else pose for pose in stated])
     tracker = KnownTracker(given, options.keyframe_overlap)
@@ -31,6 +31,6 @@ def load(options: Options, capture: Capture) -> KnownTracker:
 
 
 class KnownTracker(GivenTracker):
-    """The world frame is that of the capture's poses; a frame without a pose is lost."""
+    """Takes the capture's poses. The world frame is that of these poses; a frame without a pose is lost."""
 
     world: ClassVar[str] = "world frame of the capture's poses, meters"

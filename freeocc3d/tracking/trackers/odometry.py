@@ -1,4 +1,4 @@
-"""Open3D's hybrid odometry against keyframes and a pose graph over them, with which "rgbd" is compared."""
+"""Runs Open3D's hybrid odometry against keyframes, and a pose graph over them; a baseline for "rgbd"."""
 
 from __future__ import annotations
 
@@ -28,23 +28,24 @@ class Options(KeyframeOptions, frozen=True):
     """Odometry and keyframes."""
 
     device: str = "cpu"
-    """Where the odometry runs: "cpu", or "cuda:0" and so on with an Open3D that has CUDA."""
+    """Device of the odometry: "cpu", or "cuda:0" and so on if Open3D has CUDA."""
     width: PositiveInt = 320
-    """Images are tracked at this width (a smaller one is kept)."""
+    """Image width for tracking, pixels; smaller images keep their size."""
     iterations: Advanced[tuple[NotNegativeInt, NotNegativeInt, NotNegativeInt]] = (10, 6, 4)
     """Gauss–Newton iterations per pyramid level, coarse to fine."""
     depth_difference: Advanced[Positive] = 0.07
-    """Pixels whose depths differ by more than this many meters are no correspondence."""
+    """Largest depth difference of a correspondence, meters."""
     min_fitness: Advanced[Positive] = 0.3
-    """Share of pixels that must find a correspondence."""
+    """Smallest share of pixels with a correspondence."""
     max_residual: Advanced[Positive] = 0.03
-    """Largest root mean square of the odometry's residual (meters and gray levels, 0…1, mixed)."""
+    """Largest root mean square of the odometry's residual, which mixes meters and gray levels 0…1."""
     min_information: Advanced[Finite] = 1e-3
-    """Smallest eigenvalue of the information matrix, per correspondence, that still counts as constrained."""
+    """Smallest eigenvalue of the information matrix, per correspondence, of a constrained pose."""
     overlap_edges: Advanced[NotNegativeInt] = 6
-    """Earlier keyframes that a new one is registered to, beyond the last: those that share most of its view."""
+    """Number of earlier keyframes, besides the last, to register a new keyframe to: those that share most of its
+    view."""
     min_edge_overlap: Advanced[Finite] = 0.4
-    """Share of the view that such a keyframe must have in common."""
+    """Smallest share of the view that such a keyframe has in common."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -54,7 +55,7 @@ class Options(KeyframeOptions, frozen=True):
 
 @dataclass(frozen=True)
 class _View(DepthView):
-    """A frame as the odometry needs it, at tracking size."""
+    """A frame, prepared for the odometry at tracking size."""
 
     rgbd: object
 
@@ -68,13 +69,13 @@ class _Match:
 
 
 def load(options: Options, capture: Capture) -> OdometryTracker:
-    """The tracker; ``capture`` is not read. Raises ConfigError for a device that is not there."""
+    """Load the tracker; it does not read ``capture``. Raises ConfigError for a missing device."""
     return OdometryTracker(options)
 
 
 class OdometryTracker(Tracker):
-    """Registers each frame to the present keyframe, starting from constant velocity; a frame that shares too little
-    with it becomes the next keyframe, and is registered to earlier keyframes that look at the same place.
+    """Registers each frame to the current keyframe, starting from constant velocity. A frame that shares too little
+    with it becomes the next keyframe, and is registered to earlier keyframes that see the same place.
 
     Odometry: J. Park, Q.-Y. Zhou, V. Koltun, Colored Point Cloud Registration Revisited, ICCV 2017, in Open3D's tensor
     implementation (hybrid photometric and geometric residual, multi-scale).
@@ -87,7 +88,7 @@ class OdometryTracker(Tracker):
         self.options = options
         self.device = _device(options.device)
         self._keyframes: list[_View] = []
-        self._T_keyframe_last: NDArray[np.float64] | None = None  # last tracked frame, in the present keyframe
+        self._T_keyframe_last: NDArray[np.float64] | None = None  # last tracked frame, in the current keyframe
         self._velocity = np.eye(4)  # T_previous_last
         self._frames_lost = 0
 
@@ -122,7 +123,7 @@ class OdometryTracker(Tracker):
         return Tracked("keyframe", np.eye(4), 1.0)
 
     def _register_to_keyframe(self, view: _View) -> _Match | None:
-        """The match with the present keyframe from the first starting guess that passes the failure test."""
+        """The match with the current keyframe, from the first initial guess that passes the failure test."""
         assert self._T_keyframe_last is not None
         guesses = [self._T_keyframe_last @ self._velocity, self._T_keyframe_last]
         for guess in guesses:
@@ -132,7 +133,7 @@ class OdometryTracker(Tracker):
         return None
 
     def _register(self, source: _View, target: _View, T_target_source: NDArray[np.float64]) -> _Match:
-        """Odometry of ``source`` against ``target`` and its failure test."""
+        """Run the odometry of ``source`` against ``target``, with a failure test."""
         import open3d as o3d
 
         odometry = o3d.t.pipelines.odometry
@@ -148,7 +149,7 @@ class OdometryTracker(Tracker):
                 odometry.Method.Hybrid,
                 odometry.OdometryLossParams(self.options.depth_difference, 0.05, 0.1),
             )  # fmt: skip
-        except RuntimeError:  # a singular system: nothing to align
+        except RuntimeError:  # a singular system: there is nothing to align
             return failed
         T = result.transformation.cpu().numpy()
         fitness, residual = result.fitness / valid, result.inlier_rmse
@@ -183,7 +184,7 @@ class OdometryTracker(Tracker):
         self._add_overlap_edges(row)
 
     def _add_overlap_edges(self, row: int) -> None:
-        """Register keyframe ``row`` to the earlier ones that share most of its view by the present poses."""
+        """Register keyframe ``row`` to the earlier keyframes that share most of its view at the current poses."""
         view, T_cam_world = self._keyframes[row], invert(self.records.T_world_keyframe[row])
         shared = [
             measure_mutual_overlap(other, view, T_cam_world @ self.records.T_world_keyframe[k])
@@ -234,7 +235,7 @@ class OdometryTracker(Tracker):
 
 
 def _device(name: str) -> object:
-    """The Open3D device of a name such as "cpu" or "cuda:0". Raises ConfigError if there is none."""
+    """The Open3D device with a name such as "cpu" or "cuda:0". Raises ConfigError if it does not exist."""
     import open3d as o3d
 
     kind, _, number = name.lower().partition(":")

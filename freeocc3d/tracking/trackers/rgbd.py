@@ -30,16 +30,16 @@ from ..rgbd.keyframe_registration import (
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 
-_LEAST_COVERED = 0.05  # share of the pixels that show a surface, or there is nothing to track
-_LEAST_OVERLAP, _LEAST_INLIERS, _LEAST_CORRELATION = 0.3, 0.6, 0.5  # or the frame is lost
-_CONFIRMED_OVERLAP, _CONFIRMED_M, _CONFIRMED_DEG = 0.15, 0.15, 8.0  # features and surfaces say the same
+_LEAST_COVERED = 0.05  # smallest share of pixels with a surface to track
+_LEAST_OVERLAP, _LEAST_INLIERS, _LEAST_CORRELATION = 0.3, 0.6, 0.5  # the smallest; below them the frame is lost
+_CONFIRMED_OVERLAP, _CONFIRMED_M, _CONFIRMED_DEG = 0.15, 0.15, 8.0  # features and surfaces agree
 _RECOGNIZED_OVERLAP = 0.5
-_SURE_INLIERS, _SURE_CORRELATION = 0.75, 0.96  # or features are asked
+_SURE_INLIERS, _SURE_CORRELATION = 0.75, 0.96  # below them features are matched too
 _LIKELY_CORRELATION = 0.8
-_JUMP_M, _JUMP_DEG = 0.10, 6.0  # from where the camera was going; or features are asked
+_JUMP_M, _JUMP_DEG = 0.10, 6.0  # from the predicted pose; beyond it features are matched too
 _FEATURES = 20
-_DRAWS = 1000  # of RANSAC for a lost frame, which is worth more of them
-_RECENT = 4  # keyframes that a lost frame is compared with, besides those that look alike
+_DRAWS = 1000  # of RANSAC for a lost frame, which deserves more draws
+_RECENT = 4  # last keyframes to compare a lost frame with, besides similar ones
 
 
 class Options(KeyframeOptions, frozen=True):
@@ -47,21 +47,21 @@ class Options(KeyframeOptions, frozen=True):
 
     keyframe_overlap: Positive = 0.8
     close_loops: Advanced[bool] = True
-    """Recognize places that were seen before, and make the path agree with them."""
+    """Find loop closures, and make the camera path agree with them."""
     refine: Advanced[bool] = True
     """Align all overlapping keyframes jointly at the end."""
     neighbors: Advanced[PositiveInt] = 16
-    """Earlier keyframes that each is aligned with in the refinement."""
+    """Number of earlier keyframes to align each keyframe with in the refinement."""
 
 
 def load(options: Options, capture: Capture) -> RgbdTracker:
-    """The tracker; ``capture`` is not read."""
+    """Load the tracker; it does not read ``capture``."""
     return RgbdTracker(options)
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """A frame as the tracker needs it; its features are detected when they are asked for."""
+    """A prepared frame; its features are detected on first use."""
 
     frame: Frame
     view: AlignmentView
@@ -76,12 +76,13 @@ class _Seen:
 
 
 class RgbdTracker(Tracker):
-    """Aligns each frame densely to a keyframe, starting from constant velocity; when the result is in doubt, from the
-    pose that matched features give. A frame that shares too little with its keyframe becomes the next one. A frame that
-    cannot be placed is looked for in the keyframes so far; if none shows what it shows, it begins a submap.
+    """Aligns each frame densely to a keyframe, starting from constant velocity. If the result is doubtful, it starts
+    from the pose that matched features give. A frame that shares too little with its keyframe becomes the next
+    keyframe. A lost frame is relocalized against the keyframes so far; if no keyframe shows the same place, it begins a
+    new submap.
 
-    ``optimize`` closes loops, ties submaps together where they show the same place, and aligns all keyframes jointly.
-    The largest piece that hangs together is what is mapped.
+    ``optimize`` closes loops, connects submaps that show the same place, and aligns all keyframes jointly. The largest
+    connected component is mapped.
     """
 
     needs_depth: ClassVar[bool] = True
@@ -94,7 +95,7 @@ class RgbdTracker(Tracker):
         self._T_keyframe_last = np.eye(4)  # last tracked frame, in that keyframe
         self._velocity = np.eye(4)  # T_previous_last
         self._frames_lost = 0
-        self._last: _Seen | None = None  # not kept over an interruption: keyframes are enough to go on
+        self._last: _Seen | None = None  # not saved: keyframes are enough to continue
 
     def track(self, frame: Frame) -> Tracked:
         view = prepare_alignment_view(frame)
@@ -128,7 +129,7 @@ class RgbdTracker(Tracker):
         self.records.pieces = pieces
 
     def _follow(self, seen: _Seen) -> dense_alignment.ViewAlignment | None:
-        """The alignment to the current keyframe; None if there is none that can be trusted."""
+        """The alignment to the current keyframe; None if it is not reliable."""
         target = self.keyframes[self._current]
         guess = self._T_keyframe_last @ self._velocity
         aligned = dense_alignment.align_views(seen.view, target.view, guess)
@@ -139,12 +140,13 @@ class RgbdTracker(Tracker):
         if found is not None and _confirmed(found) and _score(found.aligned) >= _score(aligned):
             return found.aligned
         steady = meters <= _JUMP_M and degrees <= _JUMP_DEG and self._frames_lost == 0
-        alike = not aligned.correlation < _LIKELY_CORRELATION  # where nothing varies, nothing disagrees
+        alike = not aligned.correlation < _LIKELY_CORRELATION  # NaN: flat intensities cannot disagree
         good = alike and aligned.overlap >= _LEAST_OVERLAP and aligned.inliers >= _SURE_INLIERS
         return aligned if good and (steady or aligned.correlation >= _SURE_CORRELATION) else None
 
     def _relocalize(self, seen: _Seen) -> Tracked | None:
-        """Place a frame that the current keyframe does not show, by the last frame or by the other keyframes."""
+        """Relocalize a frame that does not align with the current keyframe: by the last frame, or by other
+        keyframes."""
         self._velocity = np.eye(4)
         if self._last is not None:
             found = register_by_features(seen.full, self._last.full, _DRAWS)
@@ -164,7 +166,7 @@ class RgbdTracker(Tracker):
         return self._place(seen, best[0], "relocalised")
 
     def _alike(self, seen: _Seen) -> list[int]:
-        """Keyframes that a lost frame may show: the last ones, and those with most features in common."""
+        """Keyframes that a lost frame may show: the last ones, and those with most common features."""
         described = seen.full.features
         last = len(self.keyframes) - 1
         recent = [row for row in range(last, max(-1, last - _RECENT), -1) if row != self._current]
@@ -178,7 +180,7 @@ class RgbdTracker(Tracker):
         return recent + [row for _, row in sorted(scored, reverse=True)[: loop_closures.CANDIDATES]]
 
     def _place(self, seen: _Seen, aligned: dense_alignment.ViewAlignment, status: str) -> Tracked:
-        """Hang the frame on the current keyframe, or make it the next one."""
+        """Add the frame to the current keyframe, or make it the next keyframe."""
         self._frames_lost = 0
         self._last = seen
         self._T_keyframe_last = aligned.T_target_source
@@ -226,17 +228,17 @@ class RgbdTracker(Tracker):
 
 
 def _confirmed(found: FeatureRegistration) -> bool:
-    """Whether enough features agree, dense alignment stays where they say, and what is seen there agrees."""
+    """Whether enough features agree, dense alignment stays near their pose, and surfaces and intensities agree."""
     aligned = found.aligned
     meters, degrees = measure_pose_difference(found.by_features, aligned.T_target_source)
-    alike = not aligned.correlation < _LEAST_CORRELATION  # where nothing varies, nothing disagrees
+    alike = not aligned.correlation < _LEAST_CORRELATION  # NaN: flat intensities cannot disagree
     seen = aligned.overlap >= _CONFIRMED_OVERLAP and aligned.inliers >= _LEAST_INLIERS
     return found.agreeing >= _FEATURES and alike and seen and meters <= _CONFIRMED_M and degrees <= _CONFIRMED_DEG
 
 
 def _recognized(found: FeatureRegistration) -> bool:
-    """Whether a frame of which nothing was known is where it was found: by features and surfaces, or, where these saw
-    the way from afar only, by surfaces that share much and look the same."""
+    """Whether a lost frame is relocalized reliably: by features and surfaces that agree, or, if the feature pose is
+    rough, by surfaces that overlap much and look the same."""
     seen_again = _sure(found.aligned) and found.aligned.overlap >= _RECOGNIZED_OVERLAP
     return seen_again or (_confirmed(found) and _likely(found.aligned))
 
