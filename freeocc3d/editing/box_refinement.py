@@ -198,7 +198,8 @@ def lift_features_again(
     settings: Settings,
     progress: Progress,
 ) -> NDArray[np.float16]:
-    """Layer 3 of these Gaussians. If the encoder cannot be loaded, the features of the map's nearest Gaussians."""
+    """Layer 3 of these Gaussians. If the encoder cannot be loaded, each takes the features of the map's nearest
+    Gaussian."""
     try:
         encoder = scan_map.encoder
     except FreeOccError as error:

@@ -81,7 +81,7 @@ class Mapper:
         self.refined = True
 
     def state(self, done: int) -> dict[str, NDArray[Any]]:
-        """What ``restore`` needs after ``done`` frames, apart from the keyframes, whose index is saved here."""
+        """What ``restore`` needs after ``done`` frames, apart from the keyframes, whose index this writes."""
         self.keyframes.save_index()
         counts = {"done": done, "keyframes": len(self.keyframes), "refined": self.refined}
         return {**{name: np.array(count) for name, count in counts.items()}, **self.tracker.state()}

@@ -72,7 +72,7 @@ def reconstruct(
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Whether the error is Ctrl-C, which a compiled function turns into the cause of a SystemError."""
+    """Whether the error is Ctrl-C. A compiled function raises a SystemError with Ctrl-C as its cause."""
     return isinstance(error, KeyboardInterrupt) or (error is not None and _is_interrupt(error.__cause__))
 
 

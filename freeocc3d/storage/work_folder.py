@@ -196,7 +196,7 @@ class WorkFolder:
         return self.folder / _OFFLINE
 
     def finish(self, output: Path) -> None:
-        """Give the work folder the map's name. A map that it replaces is removed only after that."""
+        """Give the work folder the map's name. A map that it replaces is removed only when that has succeeded."""
         for path in self.folder.iterdir():
             if path.name in _STAGE_FILES or is_temporary(path):
                 path.unlink()

@@ -40,7 +40,7 @@ def test_list_names_every_backend_without_importing_them() -> None:
     assert "encoder" in json.loads(run("list", "--json").stdout)
     exporters = run("list", "exporters").stdout
     assert exporters == run("list", "export").stdout
-    assert "min_height = 0.1  (float) Metres above the floor" in exporters
+    assert "min_height = 0.1  (a number) Metres above the floor" in exporters
     assert "rgbd" not in exporters
     assert list(json.loads(run("list", "trackers", "--json").stdout)) == ["tracker"]
 
