@@ -27,7 +27,8 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """form: such as "binary_little_endian".  elements: (name, count, property lines, split into words) of each.
+    """The header of a PLY file. form: such as "binary_little_endian".  elements: (name, count, property lines, split
+    into words) of each.
     length: bytes of the header."""
 
     form: str

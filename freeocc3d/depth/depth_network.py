@@ -1,4 +1,4 @@
-"""Runs a monocular depth network, an ONNX file that predicts (inverse) depth from one image, and fuses it with stereo.
+"""Runs a monocular depth network (ONNX), which predicts depth or inverse depth from one image. Fuses it with stereo.
 
 Such a prediction is correct up to a scale and a shift of inverse depth (R. Ranftl et al., Towards Robust Monocular
 Depth Estimation, PAMI 2022). The stereo depth of each frame determines both.

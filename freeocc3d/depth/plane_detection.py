@@ -298,16 +298,16 @@ def _outermost(points: ScanPoints, centers: NDArray[np.float64], axes: NDArray[n
     anything behind them. Each extends to all squares that no ray crosses."""
     X, cell = points.points, points.cell_m
     everything, planes = np.ones(len(X), bool), []
-    for outwards in np.concatenate((axes, -axes)):
-        height = X @ outwards
+    for outward in np.concatenate((axes, -axes)):
+        height = X @ outward
         lowest = float(height.min())
         count = np.bincount(_layer(height, _LAYER * cell)).astype(float)
         count[:-1] += count[1:]
         offsets = lowest + (np.arange(len(count)) + 1) * _LAYER * cell
         behind = 1.0 - np.searchsorted(np.sort(height), offsets + _SEEN_THROUGH * cell) / len(X)
-        count[(behind > _BEHIND) | (offsets < (centers @ outwards).max())] = 0.0
+        count[(behind > _BEHIND) | (offsets < (centers @ outward).max())] = 0.0
         best = int(np.argmax(count))
-        plane = _tilted(X, points.sigma_m, everything, outwards, offsets[best], cell) if count[best] else None
+        plane = _tilted(X, points.sigma_m, everything, outward, offsets[best], cell) if count[best] else None
         bounded = None if plane is None else _bounded(points, centers, *plane)
         if bounded is not None and bounded.held >= _OUTERMOST:
             planes.append(replace(bounded.plane, support=bounded.free, outermost=True))

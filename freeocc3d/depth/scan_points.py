@@ -23,8 +23,8 @@ _UNCONFIRMED = 4  # times as many cells are kept before unconfirmed ones are dro
 
 @dataclass(frozen=True)
 class ScanPoints:
-    """points: (P, 3) float64 world, meters.  sigma_m: (P,) meters.  ray_point, ray_camera: (R,) int32, point and camera
-    of each measuring ray.  cell_m: edge of the cells, meters; each cell holds one point."""
+    """The points of a scan. points: (P, 3) float64 world, meters.  sigma_m: (P,) meters.  ray_point, ray_camera: (R,)
+    int32, point and camera of each measuring ray.  cell_m: edge of the cells, meters; each cell holds one point."""
 
     points: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
@@ -79,7 +79,8 @@ def merge_points(
 
 @dataclass(frozen=True)
 class _Cells:
-    """keys: (K,) int64, ascending, packed cell indices.  sums: (K, 5) sums of weights and of weighted x, y, z, sigma.
+    """Sums over the points in each cell. keys: (K,) int64, ascending, packed cell indices.  sums: (K, 5) sums of
+    weights and of weighted x, y, z, sigma.
     ray_key, ray_camera: (R,) unique pairs of a cell and a camera that measured a point in it."""
 
     edge: float

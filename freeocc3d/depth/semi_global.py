@@ -35,14 +35,14 @@ def _swept(costs: Tensor, step: float, jump: Tensor, diagonal: bool) -> Tensor:
     height, width, labels = costs.shape
     directions = 3 if diagonal else 1
     total = torch.zeros_like(costs)
-    for downwards in (True, False):
+    for downward in (True, False):
         paths = costs.new_zeros((directions, width, labels))
-        for row in range(height) if downwards else range(height - 1, -1, -1):
+        for row in range(height) if downward else range(height - 1, -1, -1):
             if diagonal:
                 left, right = F.pad(paths[1, :-1], (0, 0, 1, 0)), F.pad(paths[2, 1:], (0, 0, 0, 1))
                 paths = torch.stack((paths[0], left, right))
             paths = paths - paths.amin(dim=-1, keepdim=True)
-            price = jump[row] if downwards else jump[min(row + 1, height - 1)]
+            price = jump[row] if downward else jump[min(row + 1, height - 1)]
             beside = F.pad(paths + step, (1, 1), value=torch.inf)
             change = torch.minimum(torch.minimum(beside[..., :-2], beside[..., 2:]), price[None, :, None])
             paths = costs[row] + torch.minimum(paths, change)

@@ -17,9 +17,8 @@ _CERTAIN = 7.0  # standard deviations before a point at which space is certainly
 
 @dataclass(frozen=True)
 class Tetrahedra:
-    """vertices: (V, 3) float64.  corners: (T, 4) int32, vertices of each tetrahedron.  beside: (T, 4) int32, the
-    neighbor
-    opposite each corner: a tetrahedron, or T for the cell outside all tetrahedra."""
+    """A division of space. vertices: (V, 3) float64 world, meters.  corners: (T, 4) int32, vertices of each
+    tetrahedron.  beside: (T, 4) int32, neighbor opposite each corner; T = the cell outside all tetrahedra."""
 
     vertices: NDArray[np.float64]
     corners: NDArray[np.int32]

@@ -31,7 +31,7 @@ APART = ViewAngles(14.0, 6.0, 10.0)
 
 @dataclass(frozen=True)
 class SelectedViews:
-    """partners: per frame, indices of the views to compare it with, the best first; may be empty.
+    """The views to compare. partners: per frame, indices of the views to compare it with, the best first; may be empty.
     near, far: (N,) depth range of each frame, meters."""
 
     partners: list[NDArray[np.int64]]

@@ -1,5 +1,4 @@
-"""Builds the closed surface that explains a scan's rays best, between the free space of rays and the matter behind
-points.
+"""Builds the closed surface that explains a scan's rays best: it separates free space from matter behind points.
 
 Sources: P. Labatut, J.-P. Pons, R. Keriven, Robust and Efficient Surface Reconstruction from Range Data, CGF 2009 (the
 energy, its cut, the quality of facets); M. Jancosek, T. Pajdla, Multi-View Reconstruction Preserving Weakly-Supported
@@ -43,8 +42,8 @@ class RayHits:
 
 @dataclass(frozen=True)
 class WatertightSurface:
-    """vertices: (V, 3) float32 world, meters.  sigma_m: (V,) float32 standard deviations, meters.  triangles: (F, 3)
-    int32.  cell_m: distance of adjacent measured vertices, meters."""
+    """A closed surface. vertices: (V, 3) float32 world, meters.  sigma_m: (V,) float32 standard deviations, meters.
+    triangles: (F, 3) int32.  cell_m: distance of adjacent measured vertices, meters."""
 
     vertices: NDArray[np.float32]
     sigma_m: NDArray[np.float32]

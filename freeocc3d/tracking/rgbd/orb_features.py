@@ -24,7 +24,7 @@ _FARTHEST_PX, _AGREES_PX = 12.0, 4.0
 
 @dataclass(frozen=True)
 class OrbFeatures:
-    """pixels: (N, 2) float32, in the color image.  descriptors: (N, 32) uint8."""
+    """The ORB features of a frame. pixels: (N, 2) float32, in the color image.  descriptors: (N, 32) uint8."""
 
     pixels: NDArray[np.float32]
     descriptors: NDArray[np.uint8]

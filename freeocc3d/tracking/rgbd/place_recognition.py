@@ -44,9 +44,9 @@ class Vocabulary:
 def compare_histograms(histograms: NDArray[np.float32]) -> NDArray[np.float32]:
     """(K, K) cosine of K keyframes' (K, W) histograms, square-rooted and weighted by inverse document frequency."""
     occurs = np.maximum((histograms > 0).sum(axis=0), 1)
-    weighed = np.sqrt(histograms) * np.log(1 + len(histograms) / occurs)
-    weighed /= np.maximum(np.linalg.norm(weighed, axis=1, keepdims=True), 1e-9)
-    return np.asarray(weighed @ weighed.T, np.float32)
+    weighted = np.sqrt(histograms) * np.log(1 + len(histograms) / occurs)
+    weighted /= np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-9)
+    return np.asarray(weighted @ weighted.T, np.float32)
 
 
 def _signs(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:

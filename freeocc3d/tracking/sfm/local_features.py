@@ -27,8 +27,8 @@ _GRAY, _COLOR = 1, 3
 
 @dataclass(frozen=True)
 class LocalFeatures:
-    """pixels: (N, 2) float32; integers are pixel centers.  descriptors: (N, D), uint8 of norm 512 (SIFT) or float32 of
-    norm 1."""
+    """The features of an image. pixels: (N, 2) float32; integers are pixel centers.  descriptors: (N, D), uint8 of norm
+    512 (SIFT) or float32 of norm 1."""
 
     pixels: NDArray[np.float32]
     descriptors: NDArray[np.uint8] | NDArray[np.float32]

@@ -42,8 +42,7 @@ class Options(KeyframeOptions, frozen=True):
     min_information: Advanced[Finite] = 1e-3
     """Smallest eigenvalue of the information matrix, per correspondence, of a constrained pose."""
     overlap_edges: Advanced[NotNegativeInt] = 6
-    """Number of earlier keyframes, besides the last, to register a new keyframe to: those that share most of its
-    view."""
+    """Number of earlier keyframes to register a new keyframe to, besides the last: those with most overlap."""
     min_edge_overlap: Advanced[Finite] = 0.4
     """Smallest share of the view that such a keyframe has in common."""
 
