@@ -1,6 +1,6 @@
 """Published ground truth: the packages of EmbodiedOcc-ScanNet and ReplicaOcc.
 
-    global_occ_package/<scene>.pkl                              a scene's labelled grid
+    global_occ_package/<scene>.pkl                              a scene's labeled grid
     streme_occ_new_package/{train,test,val}/<scene>_<idx>_new.pkl   which of its voxels a frame sees
 
 Sources of the layout: the loaders that the projects publish. Wu et al., EmbodiedOcc, ICCV 2025 (global package and
@@ -35,7 +35,7 @@ GLOBAL_FOLDER, FRAMES_FOLDER = "global_occ_package", "streme_occ_new_package"
 _SPLITS = ("train", "test", "val")
 
 _FARTHEST = 1e6
-"""Metres; larger coordinates, infinity and NaN are damage."""
+"""Meters; larger coordinates, infinity and NaN are damage."""
 
 
 def load_global_package(path: Path, classes: tuple[str, ...] | None = None) -> GroundTruth:
@@ -43,7 +43,7 @@ def load_global_package(path: Path, classes: tuple[str, ...] | None = None) -> G
 
     classes: names of the labels, the first, of label 0, not used, for a package that neither brings names itself (under
     ``classes`` or ``class_names``) nor has EmbodiedOcc's labels.
-    ``global_pts`` are voxel centres, in the frame of the true poses. ``global_mask`` is not used: neither EmbodiedOcc
+    ``global_pts`` are voxel centers, in the frame of the true poses. ``global_mask`` is not used: neither EmbodiedOcc
     nor FreeOcc score by it. Where ``streme_occ_new_package`` lies beside the package's folder and has frames of the
     scene, they give ``frames_mask``.
     Raises FreeOccError: unreadable, an array missing or of another form, an irregular grid, a label without a name.
@@ -189,12 +189,12 @@ def _labels(values: NDArray[Any], path: Path, key: str = "global_labels") -> NDA
 
 
 def _lattice(points: NDArray[Any], shape: tuple[int, int, int], path: Path) -> tuple[NDArray[np.float64], float]:
-    """Lower corner (3,) and voxel size, metres, of a grid whose centres are (X, Y, Z, 3) or (X * Y * Z, 3)."""
+    """Lower corner (3,) and voxel size, meters, of a grid whose centers are (X, Y, Z, 3) or (X * Y * Z, 3)."""
     what = f"'global_pts' of {path}"
     if points.dtype.kind != "f" or points.shape not in ((*shape, 3), (math.prod(shape), 3)):
         raise FreeOccError(f"{what} must be points {(*shape, 3)} as 'scene_dim', got {points.dtype} {points.shape}.")
     if not (np.abs(points) < _FARTHEST).all():
-        raise FreeOccError(f"{what} must be finite, in metres.")
+        raise FreeOccError(f"{what} must be finite, in meters.")
     points = points.reshape(*shape, 3)
     first = points[0, 0, 0].astype(np.float64)
     axes = [axis for axis in range(3) if shape[axis] > 1]
@@ -210,7 +210,7 @@ def _lattice(points: NDArray[Any], shape: tuple[int, int, int], path: Path) -> t
     tolerance = 0.01 * voxel_size
     if not (voxel_size > 0 and (np.abs(spacings - voxel_size) < tolerance).all()):
         along = ", ".join(f"{'xyz'[axis]} {spacing:.4g}" for axis, spacing in zip(axes, spacings, strict=True))
-        raise FreeOccError(f"{what} must be the centres of cubes, but are apart along {along} m.")
+        raise FreeOccError(f"{what} must be the centers of cubes, but are apart along {along} m.")
     for axis in range(3):
         line = (first[axis] + voxel_size * np.arange(shape[axis])).reshape([-1 if a == axis else 1 for a in range(3)])
         if not np.abs(points[..., axis] - line).max() < tolerance:

@@ -74,13 +74,13 @@ def read_grid_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def read_lattice(arrays: dict[str, NDArray[Any]], path: Path) -> tuple[NDArray[np.float64], float]:
-    """Origin (3,) and voxel size of a grid, metres. Raises FreeOccError."""
+    """Origin (3,) and voxel size of a grid, meters. Raises FreeOccError."""
     origin = require_array(arrays, "origin", path)
     size = require_array(arrays, "voxel_size", path)
     if origin.dtype.kind != "f" or origin.shape != (3,) or not np.isfinite(origin).all():
-        raise FreeOccError(f"'origin' of {path} must be three finite numbers in metres.")
+        raise FreeOccError(f"'origin' of {path} must be three finite numbers in meters.")
     if size.dtype.kind != "f" or size.shape != () or not 1e-3 <= size <= 10:
-        raise FreeOccError(f"'voxel_size' of {path} must be one number of metres, from 0.001 to 10.")
+        raise FreeOccError(f"'voxel_size' of {path} must be one number of meters, from 0.001 to 10.")
     return origin.astype(np.float64), float(size)
 
 

@@ -1,7 +1,7 @@
 """What is claimed about the voxels of a truth's lattice: by a map, by Gaussians of any origin, by a finished grid.
 
 Gaussians are moved into the true frame (paper, "Coordinate System Alignment") and projected at the truth's own voxel
-centres: nothing is resampled from a finished grid, unless a finished grid is all that there is.
+centers: nothing is resampled from a finished grid, unless a finished grid is all that there is.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def predict_from_frames(
     """The claim of per-frame Gaussians fused by true poses, and the number of frames fused: the paper's protocol for
     methods that predict each frame by itself (GaussTR, GaussianOcc).
 
-    folder: a file per frame in the camera's frame (OpenCV axes, metres), the last number in its name being the frame's
+    folder: a file per frame in the camera's frame (OpenCV axes, meters), the last number in its name being the frame's
     timestamp: a 3DGS PLY, or an NPZ with means (N, 3), scales (N, 3), quats_wxyz (N, 4), opacities (N,) and perhaps
     semantics (N, C) over the scored classes or labels (N,), which count them from 1.
     Raises FreeOccError: no such files, none has a pose, a file is damaged.
@@ -118,7 +118,7 @@ def predict_from_frames(
         raise FreeOccError(f"No file of {folder} has the number of a frame with a true pose.")
     parts, semantics = [], []
     for time, T_world_cam in zip(times[rows], poses.T_world_cam[rows_true], strict=True):
-        read = _read_frame if numbered[time].suffix == ".npz" else _read_labelled
+        read = _read_frame if numbered[time].suffix == ".npz" else _read_labeled
         gaussians, weights = read(numbered[time], classes)
         parts.append(anchors.align_gaussians(gaussians, 1.0, T_world_cam[:3, :3], T_world_cam[:3, 3]))
         semantics.append(weights)
@@ -133,7 +133,7 @@ def predict_from_frames(
 def predict_from_grid(
     path: Path, alignment: TrajectoryAlignment, truth: GroundTruth, classes: ClassMap
 ) -> tuple[Prediction, str]:
-    """The claim of a finished voxel grid, read at the truth's voxel centres, and one sentence if the lattices differ.
+    """The claim of a finished voxel grid, read at the truth's voxel centers, and one sentence if the lattices differ.
 
     path: NPZ as ``export --format npz`` or a ground truth writes it. Raises FreeOccError: damaged, another voxel size.
     """
@@ -165,8 +165,8 @@ def predict_from_grid(
     note = ""
     if off > _SAME_LATTICE:
         note = (
-            f"{path.name} lies on another lattice (centres up to {off:.2f} voxels apart): each voxel takes the state "
-            "of the grid's voxel that holds its centre."
+            f"{path.name} lies on another lattice (centers up to {off:.2f} voxels apart): each voxel takes the state "
+            "of the grid's voxel that holds its center."
         )
     if labels is None or "classes" not in arrays:
         return Prediction(occupied), note
@@ -183,7 +183,7 @@ def predict_from_grid(
 
 
 def _scaled(scan_map: Map, alignment: TrajectoryAlignment) -> Iterator[PosedFrame]:
-    """Keyframes in the true frame, depth in its metres; a similarity scales the cameras' frames as well."""
+    """Keyframes in the true frame, depth in its meters; a similarity scales the cameras' frames as well."""
     poses = alignment.poses(scan_map.trajectory.T_world_keyframe)
     for row, (frame, T) in enumerate(zip(scan_map.keyframes, poses, strict=True)):
         yield PosedFrame(frame.scaled(alignment.scale), T, row)
@@ -195,7 +195,7 @@ def _splatting(settings: Settings, truth: GroundTruth) -> splat.Options:
 
 
 def _least_scale(settings: Settings, alignment: TrajectoryAlignment, truth: GroundTruth) -> float:
-    """What the map's Gaussians are widened to on the truth's lattice, metres."""
+    """What the map's Gaussians are widened to on the truth's lattice, meters."""
     cell_size = settings.gaussians.cell_size or 0.5 * settings.occupancy.voxel_size
     return anchors.compute_least_scale(settings.gaussians, alignment.scale * cell_size, truth.voxel_size)
 
@@ -232,7 +232,7 @@ def encode_one_hot(labels: NDArray[np.integer] | None, classes: ClassMap, path: 
     return one_hot[:, 1:]
 
 
-def _read_labelled(path: Path, classes: ClassMap) -> tuple[Gaussians, NDArray[np.float32] | None]:
+def _read_labeled(path: Path, classes: ClassMap) -> tuple[Gaussians, NDArray[np.float32] | None]:
     gaussians, labels = read_standard_ply(path)
     return gaussians, encode_one_hot(labels, classes, path)
 

@@ -3,7 +3,7 @@
 (i)   Every ``pixel_stride``-th pixel of every frame is back-projected with the capture's own pose; the points of a
       voxel vote for its class by their class images' values.
 (ii)  The voxels are placed into a regular grid over their extent, lattice planes at ``lattice_offset`` + n * size.
-(iii) A voxel is observed if, in one of every ``frame_stride``-th frame, its centre lies in front of the camera, inside
+(iii) A voxel is observed if, in one of every ``frame_stride``-th frame, its center lies in front of the camera, inside
       the image and no farther than the measured depth plus ``tolerance`` voxels.
 
 An observed voxel has its class, or is free if it has none; all else is 255.
@@ -38,7 +38,7 @@ from .true_occupancy import GroundTruth
 _LARGEST_GRID = 1 << 29
 _ROWS_BEFORE_MERGE = 4_000_000
 _MOST_CLASSES = 254
-UNLABELLED = "occupied"
+UNLABELED = "occupied"
 """Class of every surface where a capture has no class images."""
 
 
@@ -46,22 +46,22 @@ class Options(TypedOptions, frozen=True):
     """The protocol's parameters, with the paper's values."""
 
     voxel_size: Positive = 0.08
-    """Edge of a voxel, metres."""
+    """Edge of a voxel, meters."""
     pixel_stride: PositiveInt = 4
     """Every n-th pixel, in both directions, is back-projected."""
     frame_stride: PositiveInt = 2
     """Every n-th frame decides what was observed."""
     max_range: Positive = 10.0
-    """Depth beyond this many metres counts as not measured."""
+    """Depth beyond this many meters counts as not measured."""
     lattice_offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    """Metres by which the lattice is shifted: half a voxel in z puts a floor at z = 0 inside a voxel, not on a face."""
+    """Meters by which the lattice is shifted: half a voxel in z puts a floor at z = 0 inside a voxel, not on a face."""
     min_points: PositiveInt = 1
     """Points that a voxel needs; the noise of a sensor scatters some into the voxels next to a surface."""
     fill: Literal["inside", "within"] = "inside"
     """"inside": a cell is occupied if a point lies in it; "within": also if a cell next to it, no farther than one
-    voxel from centre to centre, is."""
+    voxel from center to center, is."""
     tolerance: NotNegative = 1.0
-    """Voxel edges that a voxel's centre may lie behind the measured depth and still be observed."""
+    """Voxel edges that a voxel's center may lie behind the measured depth and still be observed."""
     dilation: NotNegativeInt = 0
     """Voxels by which what was observed is grown, across faces."""
 
@@ -95,7 +95,7 @@ def build_truth_from_capture(capture: Capture, options: Options, progress: Progr
     names, labels_of = _classes(capture, frames)
     votes = Votes(options, len(names))
     _each(capture, frames, "points", progress, lambda frame, T: votes.add(frame, T, labels_of(frame)))
-    voxels, labels = votes.labelled()
+    voxels, labels = votes.labeled()
     if not len(voxels):
         raise FreeOccError(f"{capture.path} measured nothing within {options.max_range:g} m, so there is no surface.")
     low = voxels.min(axis=0)
@@ -140,7 +140,7 @@ class Votes:
         if sum(map(len, self._counts)) > _ROWS_BEFORE_MERGE:
             self._merge()
 
-    def labelled(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    def labeled(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """(V, 3) voxels in which points lie and (V,) the class of most of them; of equally many the first in the list.
         Points without a class do not vote; a voxel that holds no others is 255, one with too few points is left out."""
         self._merge()
@@ -193,7 +193,7 @@ def mark_observed(
 @njit(parallel=True, cache=True)
 def _observe(
     seen: NDArray[np.bool_],
-    R: NDArray[np.float64],  # voxels to metres in the camera's frame
+    R: NDArray[np.float64],  # voxels to meters in the camera's frame
     t: NDArray[np.float64],
     camera: NDArray[np.float64],
     depth_m: NDArray[np.float32],
@@ -223,7 +223,7 @@ def _observe(
 def _classes(capture: Capture, frames: list[int]) -> tuple[tuple[str, ...], Callable[[Frame], NDArray[np.uint8]]]:
     """The names of the classes, and what gives a frame's class image at the size of its depth."""
     if len(capture.classes) < 2 or capture.labels(frames[0]) is None:
-        return (taxonomy.FREE, UNLABELLED), lambda frame: np.ones(frame.depth_m.shape, np.uint8)
+        return (taxonomy.FREE, UNLABELED), lambda frame: np.ones(frame.depth_m.shape, np.uint8)
     if len(capture.classes) > _MOST_CLASSES + 1:
         raise FreeOccError(f"{capture.path} names more than {_MOST_CLASSES} classes, which a byte cannot tell apart.")
 
@@ -278,9 +278,9 @@ def _grid(voxels: NDArray[np.int64], labels: NDArray[np.uint8], options: Options
     grid[tuple(voxels.T)] = labels
     if options.fill == "within":
         inside = grid.copy()
-        for axis in range(3):  # of several neighbours at the same distance the first in this order counts
+        for axis in range(3):  # of several neighbors at the same distance the first in this order counts
             for ahead in (False, True):
-                here, there = _neighbours(axis, ahead)
+                here, there = _neighbors(axis, ahead)
                 free = grid[here] == 0
                 grid[here][free] = inside[there][free]
     return grid
@@ -291,13 +291,13 @@ def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     grown = mask.copy()
     for axis in range(3):
         for ahead in (False, True):
-            here, there = _neighbours(axis, ahead)
+            here, there = _neighbors(axis, ahead)
             grown[here] |= mask[there]
     return grown
 
 
-def _neighbours(axis: int, ahead: bool) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Slices that put each voxel beside its neighbour along an axis."""
+def _neighbors(axis: int, ahead: bool) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Slices that put each voxel beside its neighbor along an axis."""
     low, high = [slice(None)] * 3, [slice(None)] * 3
     low[axis], high[axis] = slice(None, -1), slice(1, None)
     return (tuple(low), tuple(high)) if ahead else (tuple(high), tuple(low))

@@ -33,7 +33,7 @@ DIFFERENCES = {
     "missed": (40, 110, 220),
     "invented": (220, 50, 50),
 }
-"""What the picture of differences tells apart, in its colours."""
+"""What the picture of differences tells apart, in its colors."""
 
 
 def write_report(evaluation: Evaluation, path: Path, overwrite: bool = False) -> None:
@@ -210,8 +210,8 @@ def _difference_colors() -> NDArray[np.uint8]:
 
 
 def _drawn_way(scene: ScoredScene) -> dict[str, Any]:
-    """The trajectories from above, in centimetres, y downwards as on screens: points of the true one, and pieces of the
-    estimated one with the colour of their error."""
+    """The trajectories from above, in centimeters, y downwards as on screens: points of the true one, and pieces of the
+    estimated one with the color of their error."""
     errors = scene.errors
     assert errors is not None
     R = turn_upright(scene.up, errors.true)
@@ -222,7 +222,7 @@ def _drawn_way(scene: ScoredScene) -> dict[str, Any]:
     true, way = true - low, way - low
     off = errors.errors_m[::step]
     worst = max(float(errors.errors_m.max()), 1e-9)
-    colors = color_by_value(1 - 0.85 * off / worst)  # the palest of the colours would vanish on white
+    colors = color_by_value(1 - 0.85 * off / worst)  # the palest of the colors would vanish on white
     unit = max(float(extent.max()), 1.0)
     return {
         "box": (-0.04 * unit, -0.04 * unit, extent[0] + 0.08 * unit, extent[1] + 0.08 * unit),
@@ -243,5 +243,5 @@ def _percent(fraction: float | None) -> str:
     return "not available" if fraction is None else f"{100 * fraction:.1f}"
 
 
-def _cm(metres: float | None) -> str:
-    return "not available" if metres is None else f"{100 * metres:.2f} cm"
+def _cm(meters: float | None) -> str:
+    return "not available" if meters is None else f"{100 * meters:.2f} cm"

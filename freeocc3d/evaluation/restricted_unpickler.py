@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..core.errors import FreeOccError
 
 _LARGEST_FILE = 1 << 30
-"""EmbodiedOcc's largest grid, 200 x 220 x 90 voxels with float64 centres and int64 labels, takes 0.2 GB."""
+"""EmbodiedOcc's largest grid, 200 x 220 x 90 voxels with float64 centers and int64 labels, takes 0.2 GB."""
 
 _MOST_OPERATIONS = 1_000_000
 _MOST_TUPLES = 10_000

@@ -153,7 +153,7 @@ def _aligned(
                 "the trajectory that it was made with (--trajectory)" if trajectory is None else "true poses (--poses)"
             )
             raise FreeOccError(
-                f"{path} is aligned by camera centres, for which {lacking} must be given; if it is in the frame of the "
+                f"{path} is aligned by camera centers, for which {lacking} must be given; if it is in the frame of the "
                 "true poses already, use --align none."
             )
         return TrajectoryAlignment.identity(), None

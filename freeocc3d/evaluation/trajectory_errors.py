@@ -1,8 +1,8 @@
-"""Errors of a trajectory after its alignment: absolute (ATE) and relative by travelled distance (RPE).
+"""Errors of a trajectory after its alignment: absolute (ATE) and relative by traveled distance (RPE).
 
 Sources: J. Sturm et al., IROS 2012, Sec. IV; pairs of frames as evo's ``--all_pairs --pairs_from_reference -u m``
 chooses them (M. Grupp, evo, https://github.com/MichaelGrupp/evo), so that figures compare: from each frame to the one
-whose travelled distance along the true path is nearest to the asked one, within a tenth of it.
+whose traveled distance along the true path is nearest to the asked one, within a tenth of it.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from ..core.transforms import invert
 from ..tracking.trajectory_alignment import Poses, TrajectoryAlignment
 
 DISTANCES_M = (0.1, 0.5, 1.0, 2.0)
-"""Travelled distances of the relative errors."""
+"""Traveled distances of the relative errors."""
 
 _TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
 class RelativeError:
-    """Root mean square over pairs of frames that are ``distance_m`` of path apart: metres and degrees."""
+    """Root mean square over pairs of frames that are ``distance_m`` of path apart: meters and degrees."""
 
     distance_m: float
     pairs: int
@@ -38,7 +38,7 @@ class RelativeError:
 class TrajectoryErrors:
     """What is left after the alignment, over the M frames that have a pose in both.
 
-    timestamps: (M,) of the estimate.  true, aligned: (M, 3) camera centres in the true world, metres.
+    timestamps: (M,) of the estimate.  true, aligned: (M, 3) camera centers in the true world, meters.
     relative: one per distance that some pair of frames is apart.
     """
 
@@ -49,16 +49,16 @@ class TrajectoryErrors:
 
     @property
     def errors_m(self) -> NDArray[np.float64]:
-        """(M,) distances of the aligned camera centres from the true ones, metres."""
+        """(M,) distances of the aligned camera centers from the true ones, meters."""
         return np.asarray(np.linalg.norm(self.aligned - self.true, axis=1))
 
     @property
     def ate_rmse_m(self) -> float:
-        """Absolute trajectory error, root mean square, metres."""
+        """Absolute trajectory error, root mean square, meters."""
         return float(np.sqrt((self.errors_m**2).mean()))
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values; lengths in metres, angles in degrees."""
+        """Plain values; lengths in meters, angles in degrees."""
         errors = self.errors_m
         return {
             "frames_matched": len(errors),
@@ -114,7 +114,7 @@ def measure_relative_error(
 
 
 def pair_by_path(centers: NDArray[np.float64], distance_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows (P,), (P,) of the (M, 3) centres between which the path is ``distance_m`` long, within a tenth of it."""
+    """Rows (P,), (P,) of the (M, 3) centers between which the path is ``distance_m`` long, within a tenth of it."""
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(centers, axis=0), axis=1))))
     first = np.arange(len(path) - 1)
     beyond = np.maximum(np.searchsorted(path, path[first] + distance_m), first + 1)

@@ -1,4 +1,4 @@
-"""The truth about a scene: a labelled voxel grid with what was observed of it."""
+"""The truth about a scene: a labeled voxel grid with what was observed of it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class GroundTruth:
     """True occupancy of a scene, ``ground_truth.npz``.
 
     labels: (X, Y, Z) uint8, 0 free, k = ``classes[k]``, 255 not observed.
-    origin: (3,) float64 lower corner of voxel (0, 0, 0) in the frame of the true poses, metres.
-    voxel_size: edge of a voxel, metres.  classes: names of the labels; ``classes[0]`` is not used.
+    origin: (3,) float64 lower corner of voxel (0, 0, 0) in the frame of the true poses, meters.
+    voxel_size: edge of a voxel, meters.  classes: names of the labels; ``classes[0]`` is not used.
     frames_mask: (X, Y, Z) bool, the union of the frames' own masks, where the data set has such masks.
     """
 
@@ -33,7 +33,7 @@ class GroundTruth:
         return x, y, z
 
     def centers(self) -> NDArray[np.float64]:
-        """(X, Y, Z, 3) voxel centres in the frame of the true poses, metres."""
+        """(X, Y, Z, 3) voxel centers in the frame of the true poses, meters."""
         return self.origin + (np.moveaxis(np.indices(self.shape), 0, -1) + 0.5) * self.voxel_size
 
     def masks(self) -> dict[str, NDArray[np.bool_]]:

@@ -1,10 +1,10 @@
 """Euclidean signed distances to the nearest obstacle, for trajectory optimisers: NumPy arrays, or OpenVDB (`.vdb`).
 
 Keys of the arrays:
-    distance (X, Y, Z) float32, metres, from a voxel's center to the face of the nearest obstacle: to its center, less
+    distance (X, Y, Z) float32, meters, from a voxel's center to the face of the nearest obstacle: to its center, less
     half a voxel; negative within obstacles, to the nearest voxel that is none; NaN for unknown with `unknown=nan`
     state (X, Y, Z) uint8: 0 free, 1 occupied, 255 unknown; origin (3,) lower corner of voxel (0, 0, 0); voxel_size
-    metres; frame; T_frame_map and T_world_map (4, 4)
+    meters; frame; T_frame_map and T_world_map (4, 4)
 A .vdb has one grid `distance`, whose active voxels are the known ones, others reading 0; index 0 is a voxel's center.
 """
 
@@ -39,7 +39,7 @@ class Options(VoxelOptions, frozen=True):
     unknown: Literal["free", "obstacle", "nan"] = "free"
     """Unknown space: "free" is no obstacle, "obstacle" is one, "nan" is none and has no distance itself."""
     box: Box | None = None
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centers lie in
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in meters: only voxels whose centers lie in
     it are written, and only obstacles in it count; null = all."""
 
 

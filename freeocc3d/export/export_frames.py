@@ -29,14 +29,14 @@ class BoxOptions(TypedOptions, frozen=True):
     """The part of a map that is written."""
 
     box: Box | None = None
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in metres: only voxels whose centers lie in
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in meters: only voxels whose centers lie in
     it are written; null = all."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.box is not None and not np.less(self.box[:3], self.box[3:]).all():
             raise ConfigError(
-                "'box' has a lower and an upper corner, x0, y0, z0, x1, y1, z1 in metres, each of the first three less "
+                "'box' has a lower and an upper corner, x0, y0, z0, x1, y1, z1 in meters, each of the first three less "
                 f"than its counterpart; got {', '.join(f'{value:g}' for value in self.box)}."
             )
 
@@ -54,7 +54,7 @@ class PlacedVoxels:
     """Voxels in a frame.
 
     occupancy: in coordinates of the frame, without features where it is not the map's own.  rows: (V,) row of the map's
-    occupied voxel that each occupied one stands for.  T_frame_map: (4, 4).  metric: whether lengths are metres.
+    occupied voxel that each occupied one stands for.  T_frame_map: (4, 4).  metric: whether lengths are meters.
     """
 
     occupancy: Occupancy
@@ -66,7 +66,7 @@ class PlacedVoxels:
     @property
     def unit(self) -> str:
         """What lengths are in."""
-        return "metres" if self.metric else "units of unknown length"
+        return "meters" if self.metric else "units of unknown length"
 
     def described(self) -> dict[str, Any]:
         """What a reader of an export has to know of its frame; of plain values."""
@@ -158,7 +158,7 @@ def _within(there: PlacedVoxels, corners: NDArray[np.float64]) -> PlacedVoxels:
 
 
 def find_floor_z(scan_map: Map, T_frame_map: NDArray[np.float64]) -> float:
-    """Height of the floor in a frame whose z points up, metres."""
+    """Height of the floor in a frame whose z points up, meters."""
     return float((T_frame_map @ invert(scan_map.T_gravity_map))[2, 3])
 
 

@@ -1,9 +1,9 @@
 """GeoJSON: what words find, as outlines on the floor for maps and fleet managers.
 
 A FeatureCollection with one Polygon for each region: the convex outline of its voxels seen from above, x and y in
-metres of the frame (no longitudes), with word, score, confidence, centroid, height_min_m and height_max_m,
+meters of the frame (no longitudes), with word, score, confidence, centroid, height_min_m and height_max_m,
 area and volume. Members `frame` and `T_frame_map` of the collection say what frame that is, `unit`
-whether its lengths are metres. Source: RFC 7946.
+whether its lengths are meters. Source: RFC 7946.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _feature(word: str, region: Region, corners: NDArray[np.float64], centroid: 
 
 def outline(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """The convex hull of (N, 2) points that do not lie on a line, as a closed counter-clockwise ring of
-    corners to the millimetre, and its area."""
+    corners to the millimeter, and its area."""
     from scipy.spatial import ConvexHull
 
     points = np.round(points[ConvexHull(points).vertices], 3)

@@ -25,16 +25,16 @@ from .map_server_files import COSTS, CellGrid, encode_costs, write_map
 TOGETHER = "avoid"
 """What the mask of all words together is called."""
 _FORBIDDEN = 100
-_FARTHEST = 1000.0  # metres
-_SYNTAX = "as in carpet, glass:0.5 (metres to keep from it) or plant:0.5:60% (a cost that falls off over them)"
+_FARTHEST = 1000.0  # meters
+_SYNTAX = "as in carpet, glass:0.5 (meters to keep from it) or plant:0.5:60% (a cost that falls off over them)"
 
 
 @dataclass(frozen=True)
 class Avoided:
-    """A word with the metres to keep from it, and the cost of being there in per cent; 100 is not allowed."""
+    """A word with the meters to keep from it, and the cost of being there in per cent; 100 is not allowed."""
 
     word: str
-    metres: float = 0.0
+    meters: float = 0.0
     cost: int = _FORBIDDEN
 
     @property
@@ -44,7 +44,7 @@ class Avoided:
 
 
 def parse_avoided(entries: Sequence[str]) -> list[Avoided]:
-    """``WORD``, ``WORD:METRES``, ``WORD:COST%`` or ``WORD:METRES:COST%``. Raises ConfigError."""
+    """``WORD``, ``WORD:METERS``, ``WORD:COST%`` or ``WORD:METERS:COST%``. Raises ConfigError."""
     found = [_parsed(entry) for entry in entries]
     parts = [TOGETHER, *(avoided.file_part for avoided in found)]
     if len(set(parts)) < len(parts):
@@ -59,12 +59,12 @@ def _parsed(entry: str) -> Avoided:
     word, *numbers = (part.strip() for part in entry.split(":"))
     try:
         cost = float(numbers.pop().removesuffix("%")) if numbers and numbers[-1].endswith("%") else float(_FORBIDDEN)
-        metres = float(numbers.pop()) if numbers else 0.0
+        meters = float(numbers.pop()) if numbers else 0.0
     except ValueError:
-        metres = cost = np.nan
-    if not word or numbers or not (0 <= metres <= _FARTHEST and 1 <= cost <= _FORBIDDEN and cost == int(cost)):
+        meters = cost = np.nan
+    if not word or numbers or not (0 <= meters <= _FARTHEST and 1 <= cost <= _FORBIDDEN and cost == int(cost)):
         raise ConfigError(f"'avoid' takes words, {_SYNTAX}, costs being whole and 1 to 100, got '{entry}'.")
-    return Avoided(word, metres, int(cost))
+    return Avoided(word, meters, int(cost))
 
 
 def write_layers(
@@ -98,7 +98,7 @@ def write_layers(
         layer = path.with_name(f"{path.stem}.{one.file_part}.yaml")
         about = f"costs of {json.dumps(one.word)}: {_about(one)}"
         write_map(layer, encode_costs(costs), grid, COSTS, f"{about}; for Nav2's KeepoutFilter")
-        told = {"word": one.word, "distance_m": one.metres, "cost": one.cost}
+        told = {"word": one.word, "distance_m": one.meters, "cost": one.cost}
         layers.append({**told, "matched": bool(inside.any()), "file": layer.name})
         together = np.maximum(together, costs)
     everything = path.with_name(f"{path.stem}.{TOGETHER}.yaml")
@@ -117,7 +117,7 @@ def compute_cost_map(
     costs = np.zeros(shape, np.uint8)
     if not len(cells):
         return costs
-    reach = int(np.ceil(avoided.metres / size))
+    reach = int(np.ceil(avoided.meters / size))
     near = cells[((cells >= -reach) & (cells < np.array(shape) + reach)).all(axis=1)]
     if not len(near):
         return costs
@@ -127,11 +127,11 @@ def compute_cost_map(
     part = tuple(slice(-first, -first + length) for first, length in zip(low, shape, strict=True))
     distance = size * np.asarray(ndimage.distance_transform_edt(away))[part]
     if avoided.cost == _FORBIDDEN:
-        return np.where(distance <= avoided.metres * (1 + 1e-9), _FORBIDDEN, 0).astype(np.uint8)
-    share = np.clip(1 - distance / avoided.metres, 0, 1) if avoided.metres > 0 else distance == 0
+        return np.where(distance <= avoided.meters * (1 + 1e-9), _FORBIDDEN, 0).astype(np.uint8)
+    share = np.clip(1 - distance / avoided.meters, 0, 1) if avoided.meters > 0 else distance == 0
     return np.rint(avoided.cost * share).astype(np.uint8)
 
 
 def _about(avoided: Avoided) -> str:
     fall = "within" if avoided.cost == _FORBIDDEN else "falling to 0 over"
-    return f"{avoided.cost}" + (f", {fall} {avoided.metres:g} m" if avoided.metres else "")
+    return f"{avoided.cost}" + (f", {fall} {avoided.meters:g} m" if avoided.meters else "")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Where cells are: x of cell (i, j) is origin[0] + [i, i + 1) * size, metres; y likewise of j.
+    """Where cells are: x of cell (i, j) is origin[0] + [i, i + 1) * size, meters; y likewise of j.
 
     origin: (2,) lower corner of cell (0, 0).  frame: name of the frame that this is in.
     """

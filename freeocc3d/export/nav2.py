@@ -34,17 +34,17 @@ class Options(BoxOptions, frozen=True):
     frame: UprightFrame = "gravity"
     """"gravity" (walls along x and y) or "first-camera" (origin there, x where it looked)."""
     min_height: Finite = 0.1
-    """Metres above the floor from which something is an obstacle; what is lower is driven over."""
+    """Meters above the floor from which something is an obstacle; what is lower is driven over."""
     max_height: Positive = 1.8
-    """Metres above the floor up to which something is an obstacle; what is higher is driven under."""
+    """Meters above the floor up to which something is an obstacle; what is higher is driven under."""
     min_free: Share = 0.5
     """Share of a column's voxels between the heights that have to be free for its cell to be free, 0…1; 0 = any."""
     inflation: NotNegative = 0.0
-    """Metres around obstacles that are occupied as well; planners mostly inflate by themselves."""
+    """Meters around obstacles that are occupied as well; planners mostly inflate by themselves."""
     avoid: tuple[str, ...] = ()
-    """Words whose places cost a robot, as in [carpet:40%, glass:0.5]: WORD is not to be entered, WORD:METRES to be kept
-    this far from, WORD:COST% may be entered at a cost of 1 to 99, and WORD:METRES:COST% near by at a cost that falls to
-    0 over the metres. What hangs above max_height does not count."""
+    """Words whose places cost a robot, as in [carpet:40%, glass:0.5]: WORD is not to be entered, WORD:METERS to be kept
+    this far from, WORD:COST% may be entered at a cost of 1 to 99, and WORD:METERS:COST% near by at a cost that falls to
+    0 over the meters. What hangs above max_height does not count."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -78,7 +78,7 @@ def plan(
     occupancy: Occupancy, low: float, high: float, min_free: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """(X, Y) FREE, OCCUPIED or UNKNOWN of the columns over the known voxels' box, from the voxels of one size whose
-    centers lie between two heights z, and the (2,) lower corner of cell (0, 0), metres. Raises ExportError."""
+    centers lie between two heights z, and the (2,) lower corner of cell (0, 0), meters. Raises ExportError."""
     size, (x0, y0, z0) = occupancy.voxel_size, occupancy.origin
     first, last = int(np.ceil((low - z0) / size - 0.5)), int(np.floor((high - z0) / size - 0.5))
     columns = {}

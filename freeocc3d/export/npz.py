@@ -5,7 +5,7 @@ Keys of the dense form (`form=dense`), over the box of all known voxels:
     probability (X, Y, Z) float16: alpha of the voxel's center
     labels (X, Y, Z) uint8: 0 free, k = classes[k - 1], len(classes) + 1 = occupied by nothing known, 255 unknown
     classes (C,) names, C = 0 without a vocabulary; at most 253, so that every label fits into a byte
-    origin (3,) lower corner of voxel (0, 0, 0), metres; voxel_size metres; frame, the name of the arrays' frame;
+    origin (3,) lower corner of voxel (0, 0, 0), meters; voxel_size meters; frame, the name of the arrays' frame;
     T_world_map (4, 4) from the arrays' frame to the map's world
 Of the sparse form: voxels (V, 3) int32 indices, state (V,) uint8 as above, probability (V,), labels (V,), classes,
 origin, voxel_size, frame, T_world_map; voxel (i, j, k) covers origin + [i, i + 1) * voxel_size in both. Of a map of

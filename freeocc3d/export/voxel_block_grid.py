@@ -5,7 +5,7 @@ Blocks of 8 x 8 x 8 voxels with these attributes for each voxel, zeros where it 
     free, hits (1) uint16: number of depth images that saw through the voxel, and that ended in it
     color (3) uint8 RGB, and feature (R) float32, the unit language feature: of occupied voxels
 The file holds more arrays, which Open3D ignores and `numpy.load` reads:
-    origin (3,) lower corner of voxel (0, 0, 0), metres; T_world_map (4, 4) from the grid's frame to the map's world
+    origin (3,) lower corner of voxel (0, 0, 0), meters; T_world_map (4, 4) from the grid's frame to the map's world
     feature_basis (R, D): the cosine of a feature and a word's unit feature t (D,) is feature @ (feature_basis @ t)
     words: names of the map's vocabulary as UTF-8 bytes, one a line; word_features (W, R): their features in the basis,
     so that cosines are feature @ word_features.T; word_attainable (W,): a score is a cosine over this

@@ -28,7 +28,7 @@ def build_occupancy(
 
     origin: (3,) lower corner of voxel (0, 0, 0); the world's origin by default.  blocks: only the blocks (0, 0, 0) …
     blocks - 1 are made, and all of them; those that anything touches by default.  progress: called with the number of
-    frames looked at.  least_scale: metres that Gaussians are widened to, should they be finer than the lattice shows.
+    frames looked at.  least_scale: meters that Gaussians are widened to, should they be finer than the lattice shows.
     """
     origin = np.zeros(3) if origin is None else np.asarray(origin, np.float64)
     size = splatting.voxel_size

@@ -33,7 +33,7 @@ def compute_log_odds(free: NDArray[np.uint16], hits: NDArray[np.uint16], options
 class DepthEvidence:
     """Counts, for every voxel, the depth images that saw through it and those that ended in it.
 
-    A voxel's centre and the four points half a voxel beside it (along the image's axes) are looked up in the depth
+    A voxel's center and the four points half a voxel beside it (along the image's axes) are looked up in the depth
     image: it is seen through only if none of the five shows anything in front of its back, so that a chair's leg that
     fills a quarter of a voxel is not seen through beside the leg.
 
@@ -160,7 +160,7 @@ class DepthEvidence:
 def _count(
     keys: NDArray[np.int32],
     rows: NDArray[np.int64],
-    R: NDArray[np.float32],  # voxels to metres in the camera's frame
+    R: NDArray[np.float32],  # voxels to meters in the camera's frame
     t: NDArray[np.float32],
     camera: NDArray[np.float32],
     depth_m: NDArray[np.float32],

@@ -1,4 +1,4 @@
-"""Connected components of very many voxels, compiled: neighbours are looked up in blocks of 8 x 8 x 8."""
+"""Connected components of very many voxels, compiled: neighbors are looked up in blocks of 8 x 8 x 8."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _connected(
             block, last = find_row(table, rows, packed[n]), packed[n]
         at[block, ((voxels[n, 0] & 7) * BLOCK + (voxels[n, 1] & 7)) * BLOCK + (voxels[n, 2] & 7)] = n
     parent = np.arange(len(voxels)).astype(np.int32)
-    near = np.empty(27, np.int32)  # rows of the block's neighbours, itself in the middle
+    near = np.empty(27, np.int32)  # rows of the block's neighbors, itself in the middle
     for b in range(len(keys)):
         for side in range(27):
             i, j, k = side // 9 - 1, side // 3 % 3 - 1, side % 3 - 1
@@ -54,7 +54,7 @@ def _connected(
                     here = at[b, (i * BLOCK + j) * BLOCK + k]
                     if here < 0:
                         continue
-                    for step in range(14, 27):  # half of the neighbours: the others look this way
+                    for step in range(14, 27):  # half of the neighbors: the others look this way
                         x, y, z = i + step // 9 - 1, j + step // 3 % 3 - 1, k + step % 3 - 1
                         side = near[((x >> 3) + 1) * 9 + ((y >> 3) + 1) * 3 + (z >> 3) + 1]
                         if side < 0:

@@ -55,8 +55,8 @@ def _touching_larger(
 def _touching(voxels: NDArray[np.int32]) -> NDArray[np.int64]:
     """(2, P) pairs of rows of (V, 3) distinct voxels of one size that touch.
 
-    Among sorted keys, a voxel's three neighbours in a column along k are successive, so that one search serves each of
-    the four columns that hold half of the 26 neighbours but for the one above.
+    Among sorted keys, a voxel's three neighbors in a column along k are successive, so that one search serves each of
+    the four columns that hold half of the 26 neighbors but for the one above.
     """
     n = len(voxels)
     keys = pack_voxels(voxels)

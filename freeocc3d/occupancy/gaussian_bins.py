@@ -1,4 +1,4 @@
-"""Gaussians sorted into the voxel blocks that their neighbourhoods touch; ``splat`` has the equations."""
+"""Gaussians sorted into the voxel blocks that their neighborhoods touch; ``splat`` has the equations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MODES = {"probabilistic": PROBABILISTIC, "poisson": POISSON, "integrated": INTEG
 """Names of the modes of projection, and their numbers in compiled code."""
 
 SMALLEST_SCALE_M = 1e-5
-"""Least standard deviation, metres, that is not yet flat: its inverse square stays within float32."""
+"""Least standard deviation, meters, that is not yet flat: its inverse square stays within float32."""
 
 LEAST_OPACITY = 1e-6
 """Opacity whose logarithm a weight has at least: a Gaussian that is never seen has next to no say."""
@@ -28,13 +28,13 @@ LEAST_OPACITY = 1e-6
 
 @dataclass(frozen=True)
 class Bins:
-    """Gaussians sorted into the voxel blocks that their neighbourhoods touch.
+    """Gaussians sorted into the voxel blocks that their neighborhoods touch.
 
     packed: (B,) ascending packed block keys.  start: (B + 1,) and gaussian: (P,) list block b's Gaussians as
     ``gaussian[start[b]:start[b + 1]]``.  means: (N, 3) float32 in voxels, relative to the lattice's origin. form: (N,
     6) float32 upper triangle of a matrix: Sigma^-1 in voxels^-2; integrated: Sigma in voxels^2; released: Sigma in
-    metres^2, times what turns voxels into metres twice.  lo, hi: (N, 3) int32 first and last voxel of the
-    neighbourhood's box.  opacities: (N,) float32.  share: (N,) float32, what phi is multiplied by.  log_weight: (N,)
+    meters^2, times what turns voxels into meters twice.  lo, hi: (N, 3) int32 first and last voxel of the
+    neighborhood's box.  opacities: (N,) float32.  share: (N,) float32, what phi is multiplied by.  log_weight: (N,)
     float32 log of the part of w_k that is the same at all voxels, up to a common constant.  mode, squared_cutoff: of
     the projection.  device: where they run.
     """
@@ -114,7 +114,7 @@ def prepare_gaussians(
                 lo[g, i], hi[g, i] = math.floor(mean) - dilation, math.floor(mean) + dilation
             elif mode == INTEGRATED:  # any part of the voxel
                 lo[g, i], hi[g, i] = math.floor(mean - reach), math.floor(mean + reach)
-            else:  # its centre
+            else:  # its center
                 lo[g, i], hi[g, i] = math.ceil(mean - reach - 0.5), math.floor(mean + reach - 0.5)
     return means, form, log_weight, lo, hi
 

@@ -11,15 +11,15 @@ from ..core.types import Gaussians
 from .up_direction import estimate_up
 
 _SAMPLES = 20_000
-_NEIGHBOURS = 24
+_NEIGHBORS = 24
 _FLAT = 0.3  # thickness of flat surroundings over their width
 _LEVEL = np.cos(np.deg2rad(20.0))  # a normal within this of up belongs to a level surface
 _UPRIGHT = np.sin(np.deg2rad(15.0))  # … and below this to a wall
-_BIN = 0.02  # metres
+_BIN = 0.02  # meters
 _FLOOR_SHARE = 0.25  # of the largest level surface below the cameras: less is not a floor
-_BAND = (0.08, 0.05, 0.03)  # metres around the floor within which it is fitted, in turn
+_BAND = (0.08, 0.05, 0.03)  # meters around the floor within which it is fitted, in turn
 _LARGEST_TURN = np.deg2rad(3.0)
-_EXTENT = 0.5  # metres: standard deviation of a floor's points along its narrow side; a smaller one says no tilt
+_EXTENT = 0.5  # meters: standard deviation of a floor's points along its narrow side; a smaller one says no tilt
 
 
 def estimate_gravity_frame(T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> NDArray[np.float64]:
@@ -62,7 +62,7 @@ def is_floor_seen(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.floa
 def compute_first_camera_frame(
     T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(4, 4) rigid ``T_first_map``: z up, the origin at the centre of the camera ``T_map_cam`` (4, 4), x where it
+    """(4, 4) rigid ``T_first_map``: z up, the origin at the center of the camera ``T_map_cam`` (4, 4), x where it
     looked, as robots take the place that they start from."""
     T_gravity_cam = T_gravity_map @ T_map_cam
     x = _heading(np.array((0.0, 0.0, 1.0)), T_gravity_cam[:3, 2], -T_gravity_cam[:3, 1])
@@ -131,11 +131,11 @@ def _heading(up: NDArray[np.float64], forward: NDArray[np.float64], above: NDArr
 
 def _planes(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(P, 3) some of the points, evenly spread over storage, that lie on something flat, and the (P, 3) normals of
-    planes through their neighbours. Gaussians have none of their own: by default they are spheres."""
-    if len(means) < _NEIGHBOURS:
+    planes through their neighbors. Gaussians have none of their own: by default they are spheres."""
+    if len(means) < _NEIGHBORS:
         return np.zeros((0, 3)), np.zeros((0, 3))
     points = means[:: max(1, len(means) // _SAMPLES)].astype(np.float64)
-    near = means[KDTree(means).query(points, _NEIGHBOURS)[1]].astype(np.float64)
+    near = means[KDTree(means).query(points, _NEIGHBORS)[1]].astype(np.float64)
     off = near - near.mean(axis=1, keepdims=True)
     spread, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", off, off))
     flat = spread[:, 0] < _FLAT**2 * spread[:, 1]

@@ -56,12 +56,12 @@ def make_uniform(occupancy: Occupancy, level: int = 0) -> Occupancy:
 
     Larger voxels are cut, each part saying what the whole says. Smaller ones are put together: a voxel is occupied if
     any of its eight parts is, else unknown if any is, else free; it has the highest probability, the most evidence, and
-    the mean colour and feature of its occupied parts. Features are decoded.
+    the mean color and feature of its occupied parts. Features are decoded.
     """
     current = occupancy
     if not (current.levels != level).any():
         return current.replace(voxel_size=occupancy.voxel_size / 2**level, levels=np.zeros_like(current.levels))
-    rows = np.full(current.state.shape, -1, np.int64)  # of each occupied voxel in features and colours
+    rows = np.full(current.state.shape, -1, np.int64)  # of each occupied voxel in features and colors
     rows[current.state == OCCUPIED] = np.arange(np.count_nonzero(current.state == OCCUPIED))
     arrays = {name: getattr(current, name) for name in PER_BLOCK if name != "keys"} | {"rows": rows}
     keys, levels = current.keys, current.levels.astype(int)
@@ -108,7 +108,7 @@ def _joined(
     features: NDArray[np.float16],
     colors: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int32], dict[str, NDArray[np.generic]], NDArray[np.float16], NDArray[np.uint8]]:
-    """Blocks put together to those of the level before: their keys and arrays, and features and colours with rows
+    """Blocks put together to those of the level before: their keys and arrays, and features and colors with rows
     added for the new voxels. Where a block's sibling is not there, nothing is known."""
     parents, row = np.unique(pack_voxels(keys >> 1), return_inverse=True)
     octant = (keys & 1) @ np.array((4, 2, 1))

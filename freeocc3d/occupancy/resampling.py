@@ -22,7 +22,7 @@ def resample_occupancy(
     each occupied one the row of the old map's occupied voxel that it stands for.
 
     T_new_old: (4, 4), rigid.  origin: (3,) lower corner of the new voxel (0, 0, 0), in the new frame. A voxel takes the
-    state of the old one that holds its centre. One that holds an old occupied voxel's centre is occupied as well, so
+    state of the old one that holds its center. One that holds an old occupied voxel's center is occupied as well, so
     that no surface gets holes: thin things are found where they were, and never lost.
     """
     T_old_new = invert(T_new_old)

@@ -1,6 +1,6 @@
 """Gaussian-to-occupancy projection (paper, Sec. "Gaussian-to-Occupancy Projection") over sparse voxel blocks.
 
-Every mode is a product over the neighbouring Gaussians H(x) of a voxel with centre x and box V(x),
+Every mode is a product over the neighboring Gaussians H(x) of a voxel with center x and box V(x),
 
     alpha(x) = 1 - prod_{k in H(x)} (1 - c_k(x)),                                                             (B)
 
@@ -22,7 +22,7 @@ exp(-cutoff^2 / 2) each, 0.011 at the default of 3. Integrated: all whose boundi
 that leaves out is less than 6 Phi(-cutoff) of a Gaussian's mass, 0.008. Released: all whose voxel is, along each axis,
 at most ceil(cutoff s_max / voxel) voxels away.
 
-Gaussians that are finer than the lattice can show would fall between the voxels' centres. A deviation s_ki below a
+Gaussians that are finer than the lattice can show would fall between the voxels' centers. A deviation s_ki below a
 given s_min becomes s_min, and phi_k is multiplied by (prod_i s_ki / max(s_ki, s_min))^(2/3), the areas' ratio, so that
 what a surface of Gaussians adds up to stays as it is. Such a limit is Mip-Splatting's (Z. Yu et al., CVPR 2024, Sec.
 5.1); that its weight goes with the area is due to occupancy, whose Gaussians stand side by side on surfaces.
@@ -57,7 +57,7 @@ def bin_gaussians(
     """Sort Gaussians into blocks of the lattice whose voxel (0, 0, 0) has its lower corner at ``origin``.
 
     shape: only the voxels (0, 0, 0) … shape - 1 are evaluated, however far a Gaussian reaches; all by default.
-    least_scale: s_min, metres.
+    least_scale: s_min, meters.
     """
     check(options)
     mode = MODES[options.projection]
@@ -79,7 +79,7 @@ def bin_gaussians(
 def widen_scales(
     scales: NDArray[np.float32], least_scale: float, options: Options
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(N, 3) deviations of at least s_min, metres, and the (N,) shares that the phi are multiplied by. A mass within
+    """(N, 3) deviations of at least s_min, meters, and the (N,) shares that the phi are multiplied by. A mass within
     a voxel needs no such thing, nor does what is dilated."""
     if least_scale == 0 or MODES[options.projection] not in (PROBABILISTIC, POISSON):
         return scales, np.ones(len(scales), np.float32)
@@ -107,7 +107,7 @@ def compute_posterior_mean(
     """(V, D) posterior expectation of per-Gaussian values (N, D) at some voxels: equations (C) and (D).
 
     slots: (B, 512) row of the output for each voxel of the bins' blocks, -1 for voxels that are not asked for. A voxel
-    without a neighbouring Gaussian gets zeros. values: float16 ones are taken as they are, without a copy of all.
+    without a neighboring Gaussian gets zeros. values: float16 ones are taken as they are, without a copy of all.
     """
     rows = int(slots.max(initial=-1)) + 1
     if bins.device != "cpu":

@@ -85,7 +85,7 @@ def splat_mass(
 def _window(
     key: NDArray[np.int32], lo: NDArray[np.int32], hi: NDArray[np.int32]
 ) -> tuple[int, int, int, int, int, int]:
-    """First voxel, and the one after the last, of a Gaussian's neighbourhood within a block."""
+    """First voxel, and the one after the last, of a Gaussian's neighborhood within a block."""
     x0, y0, z0 = key[0] * BLOCK, key[1] * BLOCK, key[2] * BLOCK
     return (
         max(lo[0] - x0, 0), max(lo[1] - y0, 0), max(lo[2] - z0, 0),

@@ -15,8 +15,8 @@ from .splat import Options
 def compute_contributions_reference(
     gaussians: Gaussians, points: NDArray[np.float64], options: Options, least_scale: float = 0.0
 ) -> NDArray[np.float64]:
-    """(P, N) c_k at voxels whose centres are the (P, 3) world points; cutoff included, except for "released", whose
-    neighbourhood is a box of the lattice: there it is all space. least_scale: s_min, which those two do without."""
+    """(P, N) c_k at voxels whose centers are the (P, 3) world points; cutoff included, except for "released", whose
+    neighborhood is a box of the lattice: there it is all space. least_scale: s_min, which those two do without."""
     if options.projection == "integrated":
         return _masses(gaussians, points, options)
     o = gaussians.opacities.astype(np.float64)
@@ -35,7 +35,7 @@ def compute_contributions_reference(
 def compute_probability_reference(
     gaussians: Gaussians, points: NDArray[np.float64], options: Options, least_scale: float = 0.0
 ) -> NDArray[np.float64]:
-    """(P,) alpha of voxels, given by their centres: equation (B)."""
+    """(P,) alpha of voxels, given by their centers: equation (B)."""
     return np.asarray(
         1.0 - np.prod(1.0 - compute_contributions_reference(gaussians, points, options, least_scale), axis=1)
     )
@@ -44,7 +44,7 @@ def compute_probability_reference(
 def compute_posterior_mean_reference(
     gaussians: Gaussians, points: NDArray[np.float64], values: NDArray[np.floating], options: Options
 ) -> NDArray[np.float64]:
-    """(P, D) posterior expectation of values (N, D) at voxels, given by their centres: equations (C) and (D)."""
+    """(P, D) posterior expectation of values (N, D) at voxels, given by their centers: equations (C) and (D)."""
     o = gaussians.opacities.astype(np.float64)
     if options.projection == "integrated":
         weight = compute_contributions_reference(gaussians, points, options) * o

@@ -1,4 +1,4 @@
-"""The projection in torch, for a GPU: all pairs of a Gaussian and a voxel of its neighbourhood, summed by voxel.
+"""The projection in torch, for a GPU: all pairs of a Gaussian and a voxel of its neighborhood, summed by voxel.
 
 Products become sums of logarithms, in an order that the device chooses: equal to ``splat`` to rounding.
 """

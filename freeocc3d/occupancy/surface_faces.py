@@ -12,7 +12,7 @@ from ..core.voxel_keys import contains, pack_voxels
 def find_exposed_faces(
     occupancy: Occupancy, chosen: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64]]:
-    """The faces between occupied voxels and all others: (4 F, 3) vertices in metres, (F, 4) quads that index them,
+    """The faces between occupied voxels and all others: (4 F, 3) vertices in meters, (F, 4) quads that index them,
     counter-clockwise seen from outside, and (F,) the occupied voxel's row that each face belongs to.
 
     chosen: (V,) the occupied voxels to draw, as if there were no others; all by default.
@@ -30,7 +30,7 @@ def build_faces(
     """The faces of voxels as ``find_exposed_faces``, but with (4 F, 3) corners on the lattice.
 
     voxels: (V, 3) lower corners, |i| < 2^20.  edges: (V,) powers of two that divide them; 1 by default. A face whose
-    neighbour is cut into smaller voxels is drawn, whichever of them are there.
+    neighbor is cut into smaller voxels is drawn, whichever of them are there.
     """
     edges = np.ones(len(voxels), np.int32) if edges is None else edges
     sizes = np.unique(edges)
@@ -40,11 +40,11 @@ def build_faces(
         own = np.flatnonzero(edges == size)
         for axis in range(3):
             for side in (0, 1):
-                neighbour = voxels[own].astype(np.int64)
-                neighbour[:, axis] += size * (2 * side - 1)
+                neighbor = voxels[own].astype(np.int64)
+                neighbor[:, axis] += size * (2 * side - 1)
                 hidden = np.zeros(len(own), bool)
-                for other in sizes[sizes >= size]:  # the neighbour, or a larger voxel that holds it
-                    hidden |= contains(ascending[other], pack_voxels(neighbour // other))
+                for other in sizes[sizes >= size]:  # the neighbor, or a larger voxel that holds it
+                    hidden |= contains(ascending[other], pack_voxels(neighbor // other))
                 exposed = own[~hidden]
                 b, c = (axis + 1) % 3, (axis + 2) % 3
                 turn = [(0, 0), (1, 0), (1, 1), (0, 1)] if side else [(0, 0), (0, 1), (1, 1), (1, 0)]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SAMPLES = 20_000
-_BIN = 0.05  # metres
+_BIN = 0.05  # meters
 _SIDEWAYS = 0.4
 """By how much more of its length the mean of the cameras' x axes has to keep than that of their y axes before a camera
 counts as held sideways: one that nods from floor to ceiling without turning keeps 0.36 more."""

@@ -23,7 +23,7 @@ def find_blocks_along_rays(
     origin: NDArray[np.float64],
     voxel_size: float,
 ) -> NDArray[np.int64]:
-    """Ascending packed keys of all blocks that the segments from a camera's centre to (P, 3) points pass through."""
+    """Ascending packed keys of all blocks that the segments from a camera's center to (P, 3) points pass through."""
     edge = BLOCK * voxel_size
     ends = (np.asarray(points_world, np.float64) - origin) / edge
     return np.sort(_walked((np.asarray(center_world, np.float64) - origin) / edge, ends))
@@ -35,7 +35,7 @@ def find_touched_blocks(lo: NDArray[np.int32], hi: NDArray[np.int32]) -> NDArray
     (lo > hi) touch none."""
     table = np.full(1024, -1, np.int64)
     count = 0
-    last = np.int64(-1)  # neighbours in memory are mostly neighbours in space
+    last = np.int64(-1)  # neighbors in memory are mostly neighbors in space
     for g in range(len(lo)):
         if lo[g, 0] > hi[g, 0] or lo[g, 1] > hi[g, 1] or lo[g, 2] > hi[g, 2]:
             continue

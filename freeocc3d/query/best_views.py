@@ -36,7 +36,7 @@ def best_views(
     """For each region, at most ``most`` keyframes that show a part of it: those that show most voxels, to a tenth
     of what the best one shows, and of these the ones in whose images it is largest.
 
-    A keyframe shows a voxel whose centre falls on a pixel with a depth that differs from the centre's by no more than
+    A keyframe shows a voxel whose center falls on a pixel with a depth that differs from the center's by no more than
     the voxel's edge. Raises MapError for a broken keyframe.
     """
     voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
@@ -66,7 +66,7 @@ def best_views(
 
 
 def _box(pixels: NDArray[np.float64], half: NDArray[np.float64], width: int, height: int) -> tuple[int, int, int, int]:
-    """Pixels around (P, 2) voxels' centres that reach (P, 2) pixels to each side, within the image."""
+    """Pixels around (P, 2) voxels' centers that reach (P, 2) pixels to each side, within the image."""
     x0, y0 = np.maximum(np.floor((pixels - half).min(axis=0) + 0.5), 0).astype(int).tolist()
     x1, y1 = np.minimum(np.floor((pixels + half).max(axis=0) + 0.5), (width - 1, height - 1)).astype(int).tolist()
     return x0, y0, x1, y1

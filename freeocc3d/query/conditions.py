@@ -28,8 +28,8 @@ _Condition = tuple[Callable[[Region], bool], str]
 class Where:
     """Conditions that regions have to meet, all of them.
 
-    within: x0, y0, z0, x1, y1, z1, map frame, metres: the centroid lies in this box.
-    near, near_m: between some voxel of the region and one that the word matches is a gap of at most near_m metres.
+    within: x0, y0, z0, x1, y1, z1, map frame, meters: the centroid lies in this box.
+    near, near_m: between some voxel of the region and one that the word matches is a gap of at most near_m meters.
     on: some voxel of the region's underside stands over one that the word matches: they overlap as seen from above, and
     the vertical gap between them is at most 1.5 voxels (of the map's largest). The underside are the voxels that reach
     no more than a voxel higher with their lower face than the lowest does.
@@ -48,11 +48,11 @@ class Where:
             len(self.within) == 6 and np.isfinite(self.within).all() and np.less(self.within[:3], self.within[3:]).all()
         ):
             raise ConfigError(
-                "'within' has a lower and an upper corner, x0 y0 z0 x1 y1 z1 in metres, each of the first three less "
+                "'within' has a lower and an upper corner, x0 y0 z0 x1 y1 z1 in meters, each of the first three less "
                 f"than its counterpart; got {' '.join(f'{value:g}' for value in self.within)}."
             )
         if not 0 <= self.near_m < np.inf:
-            raise ConfigError(f"'near' takes a distance of 0 metres or more, got {self.near_m:g}.")
+            raise ConfigError(f"'near' takes a distance of 0 meters or more, got {self.near_m:g}.")
         if self.pick not in (None, *PICKS):
             raise ConfigError(f"'pick' must be one of {', '.join(PICKS)}, got '{self.pick}'.")
 
@@ -63,14 +63,14 @@ class Where:
 
 
 def near_word(text: str) -> tuple[str, float]:
-    """Word and metres of "WORD" or "WORD:METRES". Raises ConfigError."""
+    """Word and meters of "WORD" or "WORD:METERS". Raises ConfigError."""
     word, separator, distance = text.rpartition(":")
     if not separator:
         return text, Where.near_m
     try:
         return word, float(distance)
     except ValueError as error:
-        raise ConfigError(f"'near' takes a word and metres, as in sink:0.5, got '{text}'.") from error
+        raise ConfigError(f"'near' takes a word and meters, as in sink:0.5, got '{text}'.") from error
 
 
 def only_where(
@@ -168,7 +168,7 @@ class _Space:
             raise MapError(f"The box lies outside of the map, which reaches from {spans} m.")
 
     def near(self, region: Region, references: _References, distance: float) -> bool:
-        """Whether the gap between any two voxels is at most so many metres."""
+        """Whether the gap between any two voxels is at most so many meters."""
         # The nearest points of two cubes of a lattice are found among the lattice's points in both.
         reach = distance / self.occupancy.finest * (1 + 1e-9) + 1e-9
         tree = references.tree(references.shared(region))
@@ -197,7 +197,7 @@ class _Space:
 
     @functools.cached_property
     def _every_level(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(V, 3) centres in a frame with z up, and (V,) edges, metres."""
+        """(V, 3) centers in a frame with z up, and (V,) edges, meters."""
         centers = self.occupancy.centers(self.voxels, self.edges)
         return centers @ self.R_level_map.T, np.asarray(self.edges * self.occupancy.finest, np.float64)
 

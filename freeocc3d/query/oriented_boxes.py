@@ -20,8 +20,8 @@ _SAME_AREA, _SAME_EDGE = 1.0 + 1e-6, 1.0 + 1e-3  # a lattice that is hardly tilt
 class OrientedBox:
     """An upright box: its z points up, its x along its longer level edge.
 
-    extent: (3,) metres along its own x, y, z.  yaw: radians in (-pi/2, pi/2], from the gravity frame's x to the box's.
-    T_map_box: (4, 4) rigid, from the box's frame, whose origin is the box's centre, to the map's.
+    extent: (3,) meters along its own x, y, z.  yaw: radians in (-pi/2, pi/2], from the gravity frame's x to the box's.
+    T_map_box: (4, 4) rigid, from the box's frame, whose origin is the box's center, to the map's.
     """
 
     extent: NDArray[np.float64]

@@ -73,7 +73,7 @@ def _footprint(
     first /= np.linalg.norm(first)
     level = np.stack((first, np.cross(up, first)), axis=1) / edges.max()
     middle = (occupancy.occupied_voxels()[rows[order]] + 0.5 * edges[:, None]) @ level
-    middle += 0.5 - middle[0] + 1e-6  # a level lattice's centres come to lie in the cells' middles
+    middle += 0.5 - middle[0] + 1e-6  # a level lattice's centers come to lie in the cells' middles
     offsets = np.unique((_QUARTERS @ level).round(2), axis=0)  # half of them where the lattice is about level
     low = np.floor(middle.min(axis=0) - 1)
     shape = (np.floor(middle.max(axis=0) + 1) - low + 1).astype(np.int64)

@@ -22,15 +22,15 @@ outrank a large object, and the size of the voxels has no part in it."""
 class Region:
     """A connected set of matching voxels, or one of the things that it holds.
 
-    score: 0…1, by which regions are ranked: the mean score of its voxels times V / (V + 1 litre), V being its volume,
-    as if a litre that does not match belonged to it. A voxel's is its cosine with the word over the one that a perfect
+    score: 0…1, by which regions are ranked: the mean score of its voxels times V / (V + 1 liter), V being its volume,
+    as if a liter that does not match belonged to it. A voxel's is its cosine with the word over the one that a perfect
     example reaches, so that 1 is a large thing all of whose voxels say the word and no other. It says how well the word
     fits, and compares within an encoder.
     confidence: 0…1, how probable the word is beside what else the voxels could be: the mean, by volume, of their
     softmax probabilities of the word against the contrast words, at the encoder's temperature (for a picture, which has
     no contrast words, the mean score). A region may fit badly (low score) and still be nothing else (high confidence).
-    centroid: (3,) mean of the voxels' centres, map frame, metres.
-    box_min, box_max: (3,) corners of the axis-aligned box around the voxels, faces included, metres.  rows: (n,) rows
+    centroid: (3,) mean of the voxels' centers, map frame, meters.
+    box_min, box_max: (3,) corners of the axis-aligned box around the voxels, faces included, meters.  rows: (n,) rows
     of ``Occupancy.occupied_voxels()``.  label: the word that it was found by.
     """
 
@@ -113,7 +113,7 @@ def _specks(
     volume: NDArray[np.number],
     share: float,
 ) -> NDArray[np.int64]:
-    """Regions of a few voxels whose box lies within half a metre of that of a region which they are less than ``share``
+    """Regions of a few voxels whose box lies within half a meter of that of a region which they are less than ``share``
     of: a chair's feet are no chairs, and a cup in the middle of a room is no part of the carpet."""
     few, things = np.flatnonzero((size > 0) & (size < _PATCH)), np.flatnonzero(size >= _PATCH)
     if not len(few) or not len(things):

@@ -1,6 +1,6 @@
 """A map that answers: words, classes, pictures, and where the regions are that it finds. Imports little, to start fast.
 
-Lengths are metres and coordinates the map's frame throughout, unless ``SavedMap.metric`` says otherwise.
+Lengths are meters and coordinates the map's frame throughout, unless ``SavedMap.metric`` says otherwise.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Map(SavedMap):
 
     def stand_of(self, region: Region) -> NDArray[np.float64] | None:
         """(3,) the nearest place on the floor, map frame, where a robot could stand and see a region; see
-        ``query.standing_places``. None where there is none, or where lengths are not metres, for a robot has a size."""
+        ``query.standing_places``. None where there is none, or where lengths are not meters, for a robot has a size."""
         return self.stands_of([region])[0]
 
     def stands_of(self, regions: Sequence[Region]) -> list[NDArray[np.float64] | None]:

@@ -17,9 +17,9 @@ from ..occupancy.resampling import resample_occupancy
 from .regions import Region
 
 _MOST_CELLS = 1 << 29
-_DRIVEN_OVER = 0.1  # metres above the floor up to which nothing is an obstacle
+_DRIVEN_OVER = 0.1  # meters above the floor up to which nothing is an obstacle
 _MIN_FREE = 0.5  # share of a column's voxels that were seen through
-_HALF_DIAGONAL = 0.5**0.5  # cells: no part of an obstacle's cell is nearer than its centre by more
+_HALF_DIAGONAL = 0.5**0.5  # cells: no part of an obstacle's cell is nearer than its center by more
 _SAMPLES = 16  # of a region's voxels that are looked at
 _SEEN = 0.25  # share of these that have to be seen
 _AT_ONCE = 256  # places that are tried together
@@ -29,7 +29,7 @@ _AT_ONCE = 256  # places that are tried together
 class Robot:
     """An upright cylinder that looks from the middle of its top.
 
-    radius, height: metres.
+    radius, height: meters.
     """
 
     radius: float = 0.3
@@ -44,7 +44,7 @@ def standing_places(
 
     T_gravity_map: (4, 4) rigid, to the frame with z up and the floor at z = 0. There is room where, within the radius,
     nothing is occupied from 10 cm above the floor up to the height and half of it or more is known to be free, and the
-    floor is known in the middle. A voxel is seen if no occupied voxel that is not the region's lies between its centre
+    floor is known in the middle. A voxel is seen if no occupied voxel that is not the region's lies between its center
     and the robot's top. Raises MapError for a map that is too large.
     """
     robot = robot or Robot()
@@ -94,7 +94,7 @@ class _Cells:
         body = self.state[:, :, (heights >= _DRIVEN_OVER) & (heights <= robot.height)]
         layers = max(1, int((robot.height - _DRIVEN_OVER) / self.size))
         room = ~(body == OCCUPIED).any(axis=2) & ((body == FREE).sum(axis=2) >= _MIN_FREE * layers)
-        to_obstacle = ndimage.distance_transform_edt(np.pad(room, 1))[1:-1, 1:-1]  # of the cells' centres
+        to_obstacle = ndimage.distance_transform_edt(np.pad(room, 1))[1:-1, 1:-1]  # of the cells' centers
         floor = (self.state[:, :, np.abs(heights) < 1.25 * self.size] == OCCUPIED).any(axis=2)
         cells = np.argwhere(floor & ((to_obstacle - _HALF_DIAGONAL) * self.size >= robot.radius))
         return np.asarray(self.origin[:2] + (cells + 0.5) * self.size)
@@ -102,7 +102,7 @@ class _Cells:
     def nearest(
         self, places: NDArray[np.float64], targets: NDArray[np.float64], own: NDArray[np.int32], eye: float
     ) -> NDArray[np.float64] | None:
-        """(2,) the nearest of the places to the targets, (N, 3) centres of a region, that sees them."""
+        """(2,) the nearest of the places to the targets, (N, 3) centers of a region, that sees them."""
         distance = KDTree(targets[:, :2]).query(places)[0] if len(places) else np.zeros(0)
         order = np.argsort(distance, kind="stable")
         some = targets[np.unique(np.linspace(0, len(targets) - 1, _SAMPLES).astype(np.int64))]

@@ -53,7 +53,7 @@ class Options(TypedOptions, frozen=True):
     """Smaller regions are left out, unless all are smaller."""
     min_share: Share = 0.001
     """Regions of less than this share of the volume of the word's largest one are left out, and those of one to three
-    voxels within half a metre of one that they are less than 50 times the share of: specks by a thing. 0 = none."""
+    voxels within half a meter of one that they are less than 50 times the share of: specks by a thing. 0 = none."""
     narrow: Share = 0.5
     """Things that touch are told apart where their region, seen from above, narrows to less than this share of the
     narrower one, and to four voxels or less; 0 = regions stay whole."""

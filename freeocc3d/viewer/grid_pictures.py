@@ -19,7 +19,7 @@ SIZE = 880, 600
 @dataclass(frozen=True)
 class LabelGrid:
     """labels: (X, Y, Z) uint8, 0 is not drawn.  colors: (K, 3) uint8 RGB of label 0, 1, …  path: (P, 3) the camera's
-    way, metres, in the frame that the grid lies in."""
+    way, meters, in the frame that the grid lies in."""
 
     labels: NDArray[np.uint8]
     colors: NDArray[np.uint8]
@@ -32,7 +32,7 @@ def draw_grids(
     """PNG of each of several grids on one lattice, cut below the ceiling at the same height and seen from the corner
     of the first one's camera; none if all are empty.
 
-    origin: (3,) lower corner of voxel (0, 0, 0), metres.  up: (3,) towards the ceiling.
+    origin: (3,) lower corner of voxel (0, 0, 0), meters.  up: (3,) towards the ceiling.
     Raises DependencyError (no off-screen rendering).
     """
     drawn = np.any([grid.labels > 0 for grid in grids.values()], axis=0)

@@ -38,9 +38,9 @@ _MARGIN, _SWATCH, _GAP, _MORE = 16, 22, 20, 130  # pixels: left edge, box before
 
 
 def write_map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: bool = False) -> None:
-    """Draw the map coloured by "rgb", "class" or "height", with the camera's way, as PNG.
+    """Draw the map colored by "rgb", "class" or "height", with the camera's way, as PNG.
 
-    Raises ExportError (empty map, unwritable target, unknown colouring), DependencyError (no off-screen rendering).
+    Raises ExportError (empty map, unwritable target, unknown coloring), DependencyError (no off-screen rendering).
     """
     _refuse_empty(scan_map)
     occupancy = scan_map.occupancy
@@ -57,14 +57,14 @@ def write_map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrit
     elif by == "height":
         colors = color_by_height(occupancy, scan_map.up)
     else:
-        raise ExportError(f"A map can be coloured by rgb, class or height, not by '{by}'.")
+        raise ExportError(f"A map can be colored by rgb, class or height, not by '{by}'.")
     _write(_drawn(scan_map, colors, [], _title(scan_map), legend), Path(path), overwrite)
 
 
 def write_query_picture(
     scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False
 ) -> None:
-    """Draw the map pale with what each word matched in a strong colour, boxed; PNG. Raises as ``write_map_picture``."""
+    """Draw the map pale with what each word matched in a strong color, boxed; PNG. Raises as ``write_map_picture``."""
     _write(draw_query(scan_map, results), Path(path), overwrite)
 
 

@@ -29,7 +29,7 @@ def write_render_picture(
     capture: Path,
     metric: bool = True,
 ) -> None:
-    """Write a PNG with a row for each view, which comes with its frame's number. metric: whether lengths are metres.
+    """Write a PNG with a row for each view, which comes with its frame's number. metric: whether lengths are meters.
     Raises OSError."""
     rows = [_row(gaussians, frame, view, rasterizer, metric) for frame, view in views]
     width = len(_COLUMNS) * (_WIDTH + _GAP) + _GAP

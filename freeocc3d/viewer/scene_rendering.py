@@ -1,4 +1,4 @@
-"""What pictures are made of: coloured faces, a camera's way, boxes; rendered off-screen from two sides with PyVista."""
+"""What pictures are made of: colored faces, a camera's way, boxes; rendered off-screen from two sides with PyVista."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _BOX_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """What is drawn, turned so that z is up: quads with a colour each, lines, boxes."""
+    """What is drawn, turned so that z is up: quads with a color each, lines, boxes."""
 
     vertices: NDArray[np.float64]  # (4 F, 3)
     quads: NDArray[np.int32]
     colors: NDArray[np.uint8]  # (F, 3)
     path: NDArray[np.float64]  # (P, 3) the camera's way
-    boxes: tuple[tuple[NDArray[np.float64], tuple[int, int, int]], ...] = ()  # (8, 3) corners and a colour
+    boxes: tuple[tuple[NDArray[np.float64], tuple[int, int, int]], ...] = ()  # (8, 3) corners and a color
 
 
 def turn_upright(up: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -55,14 +55,14 @@ def turn_lengthwise(R: NDArray[np.float64], points: NDArray[np.floating]) -> NDA
 
 
 def choose_cut_height(height: NDArray[np.floating], voxel_size: float) -> float:
-    """Up to which height voxels are drawn, of (V,) heights of voxel centres: not too near to the ceiling."""
+    """Up to which height voxels are drawn, of (V,) heights of voxel centers: not too near to the ceiling."""
     low, high = np.percentile(height, (1, 99))
     return float(low + CUT * (high - low) + 0.5 * voxel_size)
 
 
 def shade_faces(vertices: NDArray[np.float64], colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(F, 3) colours of faces, (4 F, 3) vertices with z up, under a light from each direction that never moves: faces
-    of a cube are told apart, and colours stay what they are."""
+    """(F, 3) colors of faces, (4 F, 3) vertices with z up, under a light from each direction that never moves: faces
+    of a cube are told apart, and colors stay what they are."""
     corners = vertices.reshape(-1, 4, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -37,7 +37,7 @@ def write_path_picture(
     metric: bool = True,
 ) -> None:
     """Write a PNG. submaps: the mapped one first, whose world the Gaussians and (3,) ``up`` are in.  metric: whether
-    lengths are metres. Raises OSError."""
+    lengths are meters. Raises OSError."""
     unit = "m" if metric else "units"
     picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
     apart = list(submaps[1:])
@@ -91,7 +91,7 @@ def _draw(
     middle = 0.5 * (low + high)
 
     def pixel(flat: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(N, 2) metres to pixels; y points up in the plan and down in the picture."""
+        """(N, 2) meters to pixels; y points up in the plan and down in the picture."""
         center = np.array((x0 + 0.5 * width, y0 + 0.5 * height))
         return np.asarray(center + (flat - middle) * (scale, -scale))
 
@@ -139,14 +139,14 @@ def _plan(
 def _ruler(picture: NDArray[np.uint8], box: tuple[int, int, int, int], scale: float, unit: str) -> None:
     """A length, at the lower left of the box."""
     x0, y0, _, height = box
-    metres = max((m for m in _RULERS_M if m * scale < 220), default=_RULERS_M[0])
+    meters = max((m for m in _RULERS_M if m * scale < 220), default=_RULERS_M[0])
     y, x = y0 + height - 12, x0 + 16
-    cv2.line(picture, (x, y), (x + round(metres * scale), y), _TEXT, 2, cv2.LINE_AA)
-    _put(picture, f"{metres:g} {unit.removesuffix('s') if metres == 1 else unit}", (x, y - 8), 0.5)
+    cv2.line(picture, (x, y), (x + round(meters * scale), y), _TEXT, 2, cv2.LINE_AA)
+    _put(picture, f"{meters:g} {unit.removesuffix('s') if meters == 1 else unit}", (x, y - 8), 0.5)
 
 
 def _legend(picture: NDArray[np.uint8], submaps: Sequence[Submap], trajectory: Trajectory) -> None:
-    """What the colours mean, with their numbers."""
+    """What the colors mean, with their numbers."""
     held = sum(int(s.held.sum()) for s in submaps)
     wrong = sum(int((~s.held).sum()) for s in submaps)
     counts = {name: int((trajectory.status == name).sum()) for name in ("relocalised", "interpolated", "lost", "apart")}

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from embodiedocc_packages import CORNER, SHAPE, centres, one_sentence, package, write_package
+from embodiedocc_packages import CORNER, SHAPE, centers, one_sentence, package, write_package
 
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.evaluation.embodiedocc import (
@@ -23,7 +23,7 @@ from freeocc3d.evaluation.embodiedocc import (
 def test_a_global_package_is_read(tmp_path: Path, protocol: int, dtype: Any) -> None:
     mask = np.ones(SHAPE, bool)
     mask[2, 3, 1] = False
-    content = package(global_pts=centres().astype(dtype), global_mask=mask)
+    content = package(global_pts=centers().astype(dtype), global_mask=mask)
     truth = load_global_package(write_package(tmp_path / "scene.pkl", content, protocol))
     expected = content["global_labels"]  # whatever the global mask says
     assert truth.labels.dtype == np.uint8
@@ -54,7 +54,7 @@ def test_flat_arrays_and_plain_lists_give_the_same(tmp_path: Path) -> None:
 def test_a_grid_of_one_layer_has_a_voxel_size(tmp_path: Path) -> None:
     shape = (5, 1, 1)
     content = package(
-        scene_dim=shape, global_labels=np.zeros(shape, int), global_mask=np.ones(shape), global_pts=centres(shape)
+        scene_dim=shape, global_labels=np.zeros(shape, int), global_mask=np.ones(shape), global_pts=centers(shape)
     )
     truth = load_global_package(write_package(tmp_path / "a.pkl", content))
     np.testing.assert_allclose(truth.origin, CORNER, atol=1e-9)
@@ -65,7 +65,7 @@ def test_a_grid_of_one_layer_has_a_voxel_size(tmp_path: Path) -> None:
 
 def test_the_size_of_a_long_float32_grid_does_not_drift(tmp_path: Path) -> None:
     shape = (220, 2, 2)
-    points = (centres(shape) + 500.0).astype(np.float32)
+    points = (centers(shape) + 500.0).astype(np.float32)
     content = package(
         scene_dim=shape, global_labels=np.zeros(shape, int), global_mask=np.ones(shape), global_pts=points
     )
@@ -75,7 +75,7 @@ def test_the_size_of_a_long_float32_grid_does_not_drift(tmp_path: Path) -> None:
 
 
 def bent(axis: int) -> np.ndarray:
-    points = centres()
+    points = centers()
     points[1, 1, 1, axis] += 0.04
     return points
 
@@ -83,19 +83,19 @@ def bent(axis: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"global_pts": centres() * (1, 1, 1.25)}, "centres of cubes.*z 0.1 m"),
-        ({"global_pts": centres() * (1.02, 1, 1)}, "centres of cubes"),
-        ({"global_pts": centres()[..., [1, 0, 2]]}, "along x, y and z"),
-        ({"global_pts": centres()[::-1]}, "along x, y and z"),
-        ({"global_pts": centres() * 0}, "along x, y and z|centres of cubes"),
-        ({"global_pts": centres().transpose(2, 1, 0, 3).reshape(-1, 3)}, "along x, y and z"),
+        ({"global_pts": centers() * (1, 1, 1.25)}, "centers of cubes.*z 0.1 m"),
+        ({"global_pts": centers() * (1.02, 1, 1)}, "centers of cubes"),
+        ({"global_pts": centers()[..., [1, 0, 2]]}, "along x, y and z"),
+        ({"global_pts": centers()[::-1]}, "along x, y and z"),
+        ({"global_pts": centers() * 0}, "along x, y and z|centers of cubes"),
+        ({"global_pts": centers().transpose(2, 1, 0, 3).reshape(-1, 3)}, "along x, y and z"),
         ({"global_pts": bent(0)}, "not a regular grid"),
         ({"global_pts": bent(2)}, "not a regular grid"),
-        ({"global_pts": centres() * np.nan}, "must be finite"),
-        ({"global_pts": centres() + np.inf}, "must be finite"),
-        ({"global_pts": centres() * 1e307}, "must be finite"),
-        ({"global_pts": centres().astype(int)}, r"must be points \(3, 4, 2, 3\)"),
-        ({"global_pts": centres((3, 4, 3))}, r"must be points \(3, 4, 2, 3\)"),
+        ({"global_pts": centers() * np.nan}, "must be finite"),
+        ({"global_pts": centers() + np.inf}, "must be finite"),
+        ({"global_pts": centers() * 1e307}, "must be finite"),
+        ({"global_pts": centers().astype(int)}, r"must be points \(3, 4, 2, 3\)"),
+        ({"global_pts": centers((3, 4, 3))}, r"must be points \(3, 4, 2, 3\)"),
         ({"global_pts": None}, "has no 'global_pts'; it holds scene_dim, global_labels"),
         ({"global_mask": None, "global_labels": None, "a\n\x1b[2J" * 99: 1}, "has no 'global_labels'"),
         ({"global_pts": [1, 2]}, "must be an array, got a list"),

@@ -177,7 +177,7 @@ def test_votes_do_not_depend_on_the_order_of_frames_or_on_merging(monkeypatch: p
             frame, T = capture[index], capture.pose(index)
             assert T is not None
             votes.add(frame, T, capture.labels(index))
-        results.append(votes.labelled())
+        results.append(votes.labeled())
     np.testing.assert_array_equal(results[0][0], results[1][0])
     np.testing.assert_array_equal(results[0][1], results[1][1])
 

@@ -82,20 +82,20 @@ def test_a_word_that_is_not_understood_leaves_nothing(tmp_path) -> None:
 @pytest.mark.parametrize("size", [0.04, 0.08])
 @pytest.mark.parametrize("cost", [100, 70])
 def test_distances_from_a_disc_and_from_beyond_the_plan(size, cost) -> None:
-    shape, centre, radius, metres = (60, 45), (20.2, 30.7), 6.3, 0.5
+    shape, center, radius, meters = (60, 45), (20.2, 30.7), 6.3, 0.5
     x, y = np.indices((80, 60)) - 10  # the disc is cut off by the plan's upper edge, y = 45
-    disc = np.argwhere(np.hypot(x - centre[0], y - centre[1] - 9) <= radius) - 10
-    found = compute_cost_map(disc, shape, size, Avoided("disc", metres, cost))
+    disc = np.argwhere(np.hypot(x - center[0], y - center[1] - 9) <= radius) - 10
+    found = compute_cost_map(disc, shape, size, Avoided("disc", meters, cost))
     i, j = np.indices(shape)
     distance = size * np.sqrt(((np.stack((i, j), -1)[:, :, None] - disc) ** 2).sum(axis=-1).min(axis=-1))
     if cost == 100:
-        np.testing.assert_array_equal(found, np.where(distance <= metres, 100, 0))
+        np.testing.assert_array_equal(found, np.where(distance <= meters, 100, 0))
     else:
-        np.testing.assert_allclose(found, cost * np.clip(1 - distance / metres, 0, 1), atol=0.5 + 1e-9)
+        np.testing.assert_allclose(found, cost * np.clip(1 - distance / meters, 0, 1), atol=0.5 + 1e-9)
     # The disc itself, of which cells are a sample: off by no more than a cell.
-    analytic = size * (np.hypot(i - centre[0], j - centre[1] - 9) - radius)
-    assert (found[analytic < metres - size] > 0).all() if cost == 100 else found.max() == cost
-    assert not found[analytic > metres + size].any()
+    analytic = size * (np.hypot(i - center[0], j - center[1] - 9) - radius)
+    assert (found[analytic < meters - size] > 0).all() if cost == 100 else found.max() == cost
+    assert not found[analytic > meters + size].any()
 
 
 def test_a_layer_is_where_the_plan_is_whatever_the_lattice(tmp_path) -> None:

@@ -15,7 +15,7 @@ SHAPE = (3, 4, 2)
 CORNER = np.array([-1.04, 2.0, 0.16])
 
 
-def centres(shape: tuple[int, int, int] = SHAPE, voxel: float = 0.08) -> np.ndarray:
+def centers(shape: tuple[int, int, int] = SHAPE, voxel: float = 0.08) -> np.ndarray:
     return CORNER + (np.moveaxis(np.indices(shape), 0, -1) + 0.5) * voxel
 
 
@@ -24,7 +24,7 @@ def package(**changes: Any) -> dict[str, Any]:
     labels = (np.arange(24).reshape(SHAPE) % 12).astype(np.int64)
     labels[0, 0, 0] = 255
     whole = {
-        "scene_dim": np.array(SHAPE), "global_labels": labels, "global_pts": centres(),
+        "scene_dim": np.array(SHAPE), "global_labels": labels, "global_pts": centers(),
         "global_mask": np.ones(SHAPE, bool), "valid_img_paths": ["/data1/posed_images/scene0000_00/00007.jpg"],
     } | changes  # fmt: skip
     return {key: value for key, value in whole.items() if value is not None}

@@ -76,15 +76,15 @@ def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path, monkeyp
         answer_page.write_query_page(room, results, tmp_path / "q.html")
     answer_page.write_query_page(room, results, tmp_path / "q.html", overwrite=True)
     assert (tmp_path / "q.html").read_text(encoding="utf-8") == text
-    assert "Metres in the map" in text
+    assert "Meters in the map" in text
     unknown = structs.replace(room.manifest, scale=MapScale(metric=False, by="none"))
     monkeypatch.setattr(room, "manifest", unknown)
     answer_page.write_query_page(room, results, tmp_path / "q.html", overwrite=True)
     text = (tmp_path / "q.html").read_text(encoding="utf-8")
-    assert "lengths are not metres" in text
+    assert "lengths are not meters" in text
     assert " l</td>" not in text
     assert " units³</td>" in text
-    assert "litre" not in text
+    assert "liter" not in text
     assert "nowhere" not in text
 
 

@@ -92,7 +92,7 @@ def test_by_class_and_height(tmp_path) -> None:
     map_pictures.write_map_picture(room, tmp_path / "height.png", by="height")
     assert shown(tmp_path / "height.png", (68, 1, 84), 40) > 10_000  # the floor has viridis' darkest color
     with pytest.raises(ExportError, match="rgb, class or height"):
-        map_pictures.write_map_picture(room, tmp_path / "x.png", by="colour")
+        map_pictures.write_map_picture(room, tmp_path / "x.png", by="color")
 
 
 def test_a_query_picture_shows_matches_strongly_and_nothing_else(tmp_path) -> None:
