@@ -1,1 +1,1 @@
-"""LAYER 4: Gaussians to sparse voxel blocks with a probability and a language feature per voxel."""
+"""LAYER 4: turns Gaussians into sparse voxel blocks with a probability and a language feature per voxel."""

@@ -1,4 +1,4 @@
-"""Layer 4 as a whole: anchored Gaussians and depth images in, classified voxels with features out."""
+"""Layer 4 as a whole: turns anchored Gaussians and depth images into classified voxels with features."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def build_occupancy(
     progress: Callable[[int], None] = lambda done: None,
     least_scale: float = 0.0,
 ) -> Occupancy:
-    """The occupancy map of N Gaussians with features (N, D) and of depth images.
+    """Returns the occupancy map of N Gaussians with features (N, D) and of depth images.
 
-    origin: (3,) lower corner of voxel (0, 0, 0); the world's origin by default.  blocks: only the blocks (0, 0, 0) …
-    blocks - 1 are made, and all of them; those that anything touches by default.  progress: called with the number of
-    frames looked at.  least_scale: meters that Gaussians are widened to, should they be finer than the lattice shows.
+    origin: (3,) lower corner of voxel (0, 0, 0); the world's origin by default.  blocks: the map has exactly the blocks
+    (0, 0, 0) … blocks - 1; by default it has the blocks that something touches.  progress: takes the number of frames
+    done.  least_scale: meters; finer Gaussians are widened to this scale.
     """
     origin = np.zeros(3) if origin is None else np.asarray(origin, np.float64)
     size = splatting.voxel_size
@@ -56,7 +56,7 @@ def build_blocks(
     splatting: splat.Options,
     carving: carve.Options,
 ) -> Occupancy:
-    """The occupancy of some blocks, given by their ascending packed keys, among them all of the bins'."""
+    """Returns the occupancy of some blocks. packed: their ascending keys, which include all keys of the bins."""
     free, hits = evidence.at(packed)
     probability = np.zeros((len(packed), BLOCK**3), np.float32)
     splatted = np.searchsorted(packed, bins.packed)
@@ -88,8 +88,8 @@ def classify(
     splatting: splat.Options,
     carving: carve.Options,
 ) -> NDArray[np.uint8]:
-    """State of each voxel: occupied by alpha unless the log-odds of the depth images contradict it, free where they saw
-    through, else unknown. Unknown is never taken for free."""
+    """Returns the state of each voxel: occupied where alpha reaches the threshold and the log-odds of the depth images
+    do not contradict it, else free where enough images saw through, else unknown. Unknown never counts as free."""
     contradicted = carve.compute_log_odds(free, hits, carving) <= -splatting.contradiction
     occupied = (probability >= splatting.threshold) & ~contradicted
     state = np.where(free >= carving.min_free, FREE, UNKNOWN).astype(np.uint8)
@@ -98,6 +98,6 @@ def classify(
 
 
 def normalize_rows(features: NDArray[np.float32]) -> NDArray[np.float16]:
-    """(V, D) rows to unit length; zero rows, of which nothing is known, stay zero."""
+    """Returns (V, D) rows scaled to unit length. Zero rows mean "nothing known" and stay zero."""
     norms = np.linalg.norm(features, axis=1, keepdims=True)
     return (features / np.where(norms > 1e-6, norms, 1.0)).astype(np.float16)

@@ -1,4 +1,4 @@
-"""Free and unknown: what each depth image saw through, where it ended, and what it says nothing about."""
+"""Free and unknown space: counts the depth images that see through each voxel and those that end in it."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ..settings.stages import CarvingOptions as Options
 from .voxel_blocks import find_blocks_along_rays
 
 _NARROW = 64
-"""Of the image's width: where no depth is measured within one such part of a pixel, the pixel is amid a wide patch, and
-not in a hole along the edge of a thing."""
+"""Divides the image's width. A pixel without any depth within this part of the width lies in a wide empty patch, not in
+a small hole along the edge of a thing."""
 
 
 def compute_log_odds(free: NDArray[np.uint16], hits: NDArray[np.uint16], options: Options) -> NDArray[np.float32]:
-    """Log-odds of occupancy that depth images alone give, by the numbers that saw through and ended in each voxel: the
-    inverse sensor model says ``hit`` within half a voxel and the depth's uncertainty, which grows with its square, of
-    what is measured, ``-miss`` in front of that with a margin, and nothing behind.
+    """Returns the log-odds of occupancy from depth images alone. free, hits: how many saw through and ended in a voxel.
 
+    The inverse sensor model adds ``hit`` near the measured depth: within half a voxel plus the depth's uncertainty,
+    which grows with the square of the depth. It adds ``-miss`` in front of that, past a margin, and nothing behind.
     Source: A. Hornung et al., OctoMap, Autonomous Robots 34(3), 2013, eq. 2.
     """
     return np.float32(options.hit) * hits - np.float32(options.miss) * free
@@ -33,14 +33,14 @@ def compute_log_odds(free: NDArray[np.uint16], hits: NDArray[np.uint16], options
 class DepthEvidence:
     """Counts, for every voxel, the depth images that saw through it and those that ended in it.
 
-    A voxel's center and the four points half a voxel beside it (along the image's axes) are looked up in the depth
-    image: it is seen through only if none of the five shows anything in front of its back, so that a chair's leg that
-    fills a quarter of a voxel is not seen through beside the leg.
+    The test looks up five points in the depth image: a voxel's center and the four points half a voxel away from it
+    along the image's axes. The image sees through the voxel only if none of the five shows anything in front of the
+    voxel's back. So a chair leg that fills a quarter of a voxel keeps the voxel from being free.
 
-    A frame counts in the blocks that the rays of its pixels pass through, whatever other frames do: the counts do not
-    depend on the order of frames, and a frame can be taken out again. 4 bytes a voxel, in blocks that were looked into.
+    A frame counts in the blocks that the rays of its pixels pass through, whatever other frames do. So the counts do
+    not depend on the order of frames, and a frame can be removed again. A voxel of a visited block takes 4 bytes.
 
-    within: ascending packed keys of the only blocks that are of interest; all by default.
+    within: ascending packed keys of the only blocks to count in; all by default.
     """
 
     def __init__(
@@ -55,8 +55,8 @@ class DepthEvidence:
         self.options = options
         self.within = within
         self.packed = np.zeros(0, np.int64)
-        """(B,) ascending packed keys of the blocks that were looked into."""
-        self._row = np.zeros(0, np.int64)  # of each of them in the counts, which have room for more
+        """(B,) ascending packed keys of the blocks that some frame looked into."""
+        self._row = np.zeros(0, np.int64)  # each block's row in the counts, which have spare rows
         self._free = np.zeros((0, BLOCK**3), np.uint16)
         self._hits = np.zeros((0, BLOCK**3), np.uint16)
 
@@ -71,7 +71,7 @@ class DepthEvidence:
         return self._hits[self._row]
 
     def add(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Count one depth image. Returns the packed keys of the blocks that it looks into."""
+        """Counts one depth image. Returns the packed keys of the blocks that it looks into."""
         frame = self._told(frame)
         packed = self.visible_blocks(frame, T_world_cam)
         self._make_room(np.setdiff1d(packed, self.packed, assume_unique=True))
@@ -79,16 +79,16 @@ class DepthEvidence:
         return packed
 
     def remove(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Take back a depth image that was added at this pose. Returns the packed keys of the blocks that it looked
-        into; they stay, with counts that may be zero."""
+        """Takes back a depth image that was added at this pose. Returns the packed keys of the blocks that it looked
+        into. These blocks stay; their counts may be zero."""
         frame = self._told(frame)
         packed = self.visible_blocks(frame, T_world_cam)
         self._count(packed, frame, T_world_cam, -1)
         return packed
 
     def visible_blocks(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Ascending packed keys of the blocks between the camera and what its depth image shows, and just behind it
-        (or of all those of interest). Rays are no farther apart than half a block at the greatest depth."""
+        """Returns the ascending packed keys of the blocks from the camera to just behind the measured depth, or those
+        of ``within``. At the greatest depth, rays are no farther apart than half a block."""
         if self.within is not None:
             return self.within
         camera = frame.intrinsics
@@ -107,7 +107,7 @@ class DepthEvidence:
         return find_blocks_along_rays(points, T_world_cam[:3, 3], self.origin, self.voxel_size)
 
     def _told(self, frame: Frame) -> Frame:
-        """The frame with the depth of pixels amid a wide patch of none at minus ``no_return``: nothing up to there."""
+        """Returns the frame with depth ``-no_return`` for pixels in a wide empty patch: space is free up to there."""
         if not self.options.no_return:
             return frame
         from scipy import ndimage
@@ -118,7 +118,7 @@ class DepthEvidence:
         return replace(frame, depth_m=depth)
 
     def at(self, packed: NDArray[np.int64]) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-        """(B, 512) free and hits of some blocks, zeros where nothing looked."""
+        """Returns the (B, 512) counts free and hits of some blocks; zeros where no frame looked."""
         free, hits = (np.zeros((len(packed), BLOCK**3), np.uint16) for _ in range(2))
         known = np.isin(packed, self.packed)
         rows = self._row[np.searchsorted(self.packed, packed[known])]
@@ -150,7 +150,7 @@ class DepthEvidence:
             np.float32(self.voxel_size),
             np.float32(self.options.margin * self.voxel_size),
             np.float32(3 * self.options.noise),
-            np.uint16(change % 65536),  # adding 65535 takes one away
+            np.uint16(change % 65536),  # adding 65535 subtracts one
             self._free,
             self._hits,
         )
@@ -160,7 +160,7 @@ class DepthEvidence:
 def _count(
     keys: NDArray[np.int32],
     rows: NDArray[np.int64],
-    R: NDArray[np.float32],  # voxels to meters in the camera's frame
+    R: NDArray[np.float32],  # from voxels to meters in the camera's frame
     t: NDArray[np.float32],
     camera: NDArray[np.float32],
     depth_m: NDArray[np.float32],
@@ -210,7 +210,7 @@ def _count(
 
 @njit(cache=True)
 def _beyond(depth_m: NDArray[np.float32], row: int, column: int, z: np.float32) -> bool:
-    """Whether nothing in front of depth z is measured at a pixel (outside the image nothing is)."""
+    """Whether a pixel has no measured depth in front of z. A pixel outside of the image has none."""
     if row < 0 or column < 0 or row >= depth_m.shape[0] or column >= depth_m.shape[1]:
         return True
     depth = depth_m[row, column]

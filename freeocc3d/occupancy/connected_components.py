@@ -1,4 +1,4 @@
-"""Which voxels hang together. Imports little, for queries of small maps start with it."""
+"""Connected components of voxels. The module imports little, so that queries of small maps start fast."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from ..language import word_matching
 
 
 def label_components(voxels: NDArray[np.int32], edges: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
-    """(V,) component number of each of (V, 3) distinct voxels; voxels that share a face, edge or corner are connected.
+    """Returns the (V,) component number of each of (V, 3) distinct voxels. Voxels that share a face, edge or corner are
+    connected. The function never allocates the dense box.
 
-    edges: (V,) powers of two that divide their voxel's lower corner; 1 by default. The dense box is never made.
+    edges: (V,) edge lengths, powers of two that divide their voxel's lower corner; 1 by default.
     """
     n = len(voxels)
     if n == 0:
@@ -41,7 +42,7 @@ def label_components(voxels: NDArray[np.int32], edges: NDArray[np.int32] | None 
 def _touching_larger(
     voxels: NDArray[np.int32], rows: NDArray[np.int64], size: int, rows_larger: NDArray[np.int64], larger: int
 ) -> NDArray[np.int64]:
-    """(2, P) pairs of rows of voxels of one size that touch voxels of a larger one."""
+    """Returns (2, P) pairs of rows: voxels of one size, and voxels of a larger size that they touch."""
     keys = pack_voxels(voxels[rows_larger] // larger)
     order = np.argsort(keys)
     ascending, pairs = keys[order], [np.zeros((2, 0), np.int64)]
@@ -53,10 +54,10 @@ def _touching_larger(
 
 
 def _touching(voxels: NDArray[np.int32]) -> NDArray[np.int64]:
-    """(2, P) pairs of rows of (V, 3) distinct voxels of one size that touch.
+    """Returns (2, P) pairs of rows of touching voxels among (V, 3) distinct voxels of one size.
 
-    Among sorted keys, a voxel's three neighbors in a column along k are successive, so that one search serves each of
-    the four columns that hold half of the 26 neighbors but for the one above.
+    In sorted keys, a voxel's three neighbors in a column along k are successive. Half of the 26 neighbors are the voxel
+    above and four such columns. So one search per column finds them.
     """
     n = len(voxels)
     keys = pack_voxels(voxels)

@@ -1,4 +1,4 @@
-"""Gaussians sorted into the voxel blocks that their neighborhoods touch; ``splat`` has the equations."""
+"""Sorts Gaussians into the voxel blocks that their neighborhoods touch; ``splat`` has the equations."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from .voxel_blocks import find_touched_blocks, unite_keys
 
 PROBABILISTIC, POISSON, INTEGRATED, RELEASED = range(4)
 MODES = {"probabilistic": PROBABILISTIC, "poisson": POISSON, "integrated": INTEGRATED, "released": RELEASED}
-"""Names of the modes of projection, and their numbers in compiled code."""
+"""Names of the projection modes, and their numbers in compiled code."""
 
 SMALLEST_SCALE_M = 1e-5
-"""Least standard deviation, meters, that is not yet flat: its inverse square stays within float32."""
+"""Least standard deviation, meters: its inverse square still fits into float32."""
 
 LEAST_OPACITY = 1e-6
-"""Opacity whose logarithm a weight has at least: a Gaussian that is never seen has next to no say."""
+"""Least opacity in the logarithm of a weight: a Gaussian that no image shows has almost no weight."""
 
 
 @dataclass(frozen=True)
 class Bins:
-    """Gaussians sorted into the voxel blocks that their neighborhoods touch.
+    """Gaussians, sorted into the voxel blocks that their neighborhoods touch.
 
     packed: (B,) ascending packed block keys.  start: (B + 1,) and gaussian: (P,) list block b's Gaussians as
-    ``gaussian[start[b]:start[b + 1]]``.  means: (N, 3) float32 in voxels, relative to the lattice's origin. form: (N,
+    ``gaussian[start[b]:start[b + 1]]``.  means: (N, 3) float32 in voxels, relative to the lattice's origin.  form: (N,
     6) float32 upper triangle of a matrix: Sigma^-1 in voxels^-2; integrated: Sigma in voxels^2; released: Sigma in
-    meters^2, times what turns voxels into meters twice.  lo, hi: (N, 3) int32 first and last voxel of the
-    neighborhood's box.  opacities: (N,) float32.  share: (N,) float32, what phi is multiplied by.  log_weight: (N,)
-    float32 log of the part of w_k that is the same at all voxels, up to a common constant.  mode, squared_cutoff: of
-    the projection.  device: where they run.
+    meters^2, times the squared voxel size in meters.  lo, hi: (N, 3) int32 first and last voxel of the neighborhood's
+    box.  opacities: (N,) float32.  share: (N,) float32 factor of phi.  log_weight: (N,) float32 logarithm of the part
+    of w_k that is the same at all voxels, up to a common constant.  mode, squared_cutoff: of the projection.  device:
+    where the projection runs.
     """
 
     packed: NDArray[np.int64]
@@ -54,7 +54,7 @@ class Bins:
     device: str
 
     def only(self, packed: NDArray[np.int64]) -> Bins:
-        """Those of the blocks whose packed keys are among the given."""
+        """Returns the blocks whose packed keys are in ``packed``."""
         rows = np.flatnonzero(np.isin(self.packed, packed))
         count = np.diff(self.start)[rows]
         start = np.concatenate(([0], np.cumsum(count)))
@@ -73,7 +73,7 @@ def prepare_gaussians(
     cutoff: float,
     mode: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]]:
-    """Means, forms, logarithms of weights, first and last voxels, as in ``Bins``; lo > hi if no voxel is near."""
+    """Returns means, forms, logarithms of weights, first and last voxels as in ``Bins``; lo > hi if no voxel is near."""
     n = len(world)
     means, form = np.empty((n, 3), np.float32), np.empty((n, 6), np.float32)
     log_weight = np.empty(n, np.float32)
@@ -112,7 +112,7 @@ def prepare_gaussians(
             reach = cutoff * math.sqrt((a[0] * s0) ** 2 + (a[1] * s1) ** 2 + (a[2] * s2) ** 2)
             if mode == RELEASED:
                 lo[g, i], hi[g, i] = math.floor(mean) - dilation, math.floor(mean) + dilation
-            elif mode == INTEGRATED:  # any part of the voxel
+            elif mode == INTEGRATED:  # some part of the voxel
                 lo[g, i], hi[g, i] = math.floor(mean - reach), math.floor(mean + reach)
             else:  # its center
                 lo[g, i], hi[g, i] = math.ceil(mean - reach - 0.5), math.floor(mean + reach - 0.5)
@@ -122,9 +122,9 @@ def prepare_gaussians(
 def sort_by_block(
     lo: NDArray[np.int32], hi: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-    """Counting sort of the (Gaussian, block) pairs: the blocks' packed keys, where each block's Gaussians start, and
-    the Gaussians. Each thread sorts a part of the Gaussians; the parts keep their order, so that the result is the
-    same with any number of threads."""
+    """Sorts the (Gaussian, block) pairs by counting. Returns the blocks' packed keys, the start of each block's
+    Gaussians, and the Gaussians. Each thread sorts a part of the Gaussians. The parts keep their order, so the result
+    does not depend on the number of threads."""
     bounds = np.linspace(0, len(lo), count_threads() + 1).astype(int)
     parts = [slice(first, end) for first, end in pairwise(bounds)]
     with ThreadPoolExecutor(len(parts)) as threads:
@@ -132,7 +132,7 @@ def sort_by_block(
         table, rows = build_table(packed, len(packed))
         count = np.stack(list(threads.map(lambda part: _count(table, rows, lo[part], hi[part], len(packed)), parts)))
         start = np.concatenate(([0], np.cumsum(count.sum(axis=0))))
-        place = start[:-1] + np.cumsum(count, axis=0) - count  # where each part's share of each block begins
+        place = start[:-1] + np.cumsum(count, axis=0) - count  # start of each part's share of each block
         gaussian = np.empty(start[-1], np.int32)
         list(
             threads.map(
@@ -146,7 +146,7 @@ def sort_by_block(
 def _count(
     table: NDArray[np.int64], rows: NDArray[np.int32], lo: NDArray[np.int32], hi: NDArray[np.int32], blocks: int
 ) -> NDArray[np.int64]:
-    """(B,) Gaussians of this part in each block."""
+    """Returns the (B,) number of this part's Gaussians in each block."""
     count = np.zeros(blocks, np.int64)
     for g in range(len(lo)):
         if lo[g, 0] > hi[g, 0] or lo[g, 1] > hi[g, 1] or lo[g, 2] > hi[g, 2]:
@@ -168,7 +168,7 @@ def _place(
     place: NDArray[np.int64],
     gaussian: NDArray[np.int32],
 ) -> None:
-    """Write this part's Gaussians, numbered from ``first``, at ``place`` (B,), which is used up."""
+    """Writes this part's Gaussians, numbered from ``first``, at ``place`` (B,), and advances ``place``."""
     for g in range(len(lo)):
         if lo[g, 0] > hi[g, 0] or lo[g, 1] > hi[g, 1] or lo[g, 2] > hi[g, 2]:
             continue

@@ -4,9 +4,9 @@ With the axes ordered so that the last has the smallest conditional variance, th
 
     int_x N(x) int_y N(y | x) [Phi((z1 - m(x, y)) / s) - Phi((z0 - m(x, y)) / s)] dy dx,
 
-the innermost integral in closed form, the other two by Gauss-Legendre nodes over the part of the voxel that lies within
-5 standard deviations, the finer the thinner the Gaussian. Along the lattice's axes the three integrals separate and all
-are closed.
+The innermost integral has a closed form. Gauss-Legendre nodes give the other two, over the part of the voxel that lies
+within 5 standard deviations; a thinner Gaussian gets finer nodes. A Gaussian along the lattice's axes has three
+separate integrals, all in closed form.
 
 Source of the ordering and of the sequential conditioning: A. Genz, Numerical Computation of Multivariate Normal
 Probabilities, J. Comput. Graph. Statist. 1(2), 1992.
@@ -40,7 +40,7 @@ def integrate_boxes(
     k1: int,
     out: NDArray[np.float64],
 ) -> None:
-    """Write the mass within voxels [i0, i1) x [j0, j1) x [k0, k1) of block ``key`` to ``out`` (8, 8, 8).
+    """Writes the mass within voxels [i0, i1) x [j0, j1) x [k0, k1) of block ``key`` to ``out`` (8, 8, 8).
 
     mean: (3,) and covariance: (6,) xx, xy, xz, yy, yz, zz of the Gaussian, in voxels.
     """
@@ -71,7 +71,7 @@ def integrate_boxes(
                 for k in range(k0, k1):
                     out[i, j, k] = along[0, i] * along[1, j] * along[2, k]
         return
-    # Conditional variances given the other two axes are the inverses of the precision's diagonal: order by them.
+    # The variance of an axis, given the other two, is the inverse of its entry on the precision's diagonal.
     order = np.argsort(
         np.array(
             (
@@ -100,7 +100,7 @@ def _integrated(
     residual = S[y, z] - slope_yx * S[x, z]
     slope_zx, slope_zy = S[x, z] / S[x, x], residual / (sy * sy)
     sz = math.sqrt(max(S[z, z] - slope_zx * S[x, z] - slope_zy * residual, 1e-12))
-    # Panels so narrow that neither the density nor what stands inside changes by more than some deviations across one.
+    # Panels are narrow: across one, the density and the inner integral move by a few deviations at most.
     panels_x = _panels(abs(slope_zx) / sz + abs(slope_yx) / sy + min(1 / sx, 2 * _FAR))
     panels_y = _panels(abs(slope_zy) / sz + min(1 / sy, 2 * _FAR))
     below, at = np.empty(BLOCK), np.empty(3, np.int64)
@@ -134,11 +134,11 @@ def _integrated(
 
 @njit(cache=True)
 def _panels(deviations: float) -> int:
-    """Pieces of a voxel's edge, along which the integrand moves by so many of its deviations."""
+    """Returns the number of pieces of a voxel's edge. deviations: how far the integrand moves along the edge."""
     return min(math.ceil(deviations / 5), _MOST_PANELS)
 
 
 @njit(cache=True)
 def _phi(x: float) -> float:
-    """Standard normal distribution function."""
+    """The standard normal distribution function."""
     return 0.5 * math.erfc(-x * math.sqrt(0.5))

@@ -1,4 +1,4 @@
-"""The frame that robots plan in: z up, the floor at z = 0, the walls along x and y."""
+"""Finds the frame that robots plan in: z up, the floor at z = 0, the walls along x and y."""
 
 from __future__ import annotations
 
@@ -12,22 +12,25 @@ from .up_direction import estimate_up
 
 _SAMPLES = 20_000
 _NEIGHBORS = 24
-_FLAT = 0.3  # thickness of flat surroundings over their width
-_LEVEL = np.cos(np.deg2rad(20.0))  # a normal within this of up belongs to a level surface
-_UPRIGHT = np.sin(np.deg2rad(15.0))  # … and below this to a wall
+_FLAT = 0.3  # greatest thickness of flat surroundings, as a share of their width
+_LEVEL = np.cos(np.deg2rad(20.0))  # a normal within this angle of up belongs to a level surface
+_UPRIGHT = np.sin(np.deg2rad(15.0))  # … and a normal below this to a wall
 _BIN = 0.02  # meters
-_FLOOR_SHARE = 0.25  # of the largest level surface below the cameras: less is not a floor
-_BAND = (0.08, 0.05, 0.03)  # meters around the floor within which it is fitted, in turn
+_FLOOR_SHARE = 0.25  # of the largest level surface below the cameras: a smaller surface is not a floor
+_BAND = (0.08, 0.05, 0.03)  # meters around the floor: points within them fit the plane, band after band
 _LARGEST_TURN = np.deg2rad(3.0)
-_EXTENT = 0.5  # meters: standard deviation of a floor's points along its narrow side; a smaller one says no tilt
+_EXTENT = (
+    0.5  # meters: least standard deviation of a floor's points along its narrow side; a narrower floor shows no tilt
+)
 
 
 def estimate_gravity_frame(T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> NDArray[np.float64]:
-    """(4, 4) rigid ``T_gravity_map``: z up, z = 0 on the floor, x along the walls in the direction that is nearest to
-    where the first camera looked, x = y = 0 below that camera.
+    """Returns the (4, 4) rigid ``T_gravity_map``: z up, z = 0 on the floor, x = y = 0 below the first camera, x along
+    the walls in the direction nearest to that camera's view.
 
-    T_map_cam: (K, 4, 4) poses of the keyframes. The floor is the lowest of the large level surfaces below the cameras;
-    without one, z = 0 is the level of the lowest surface points. Without walls, x is where the first camera looked.
+    T_map_cam: (K, 4, 4) poses of the keyframes. The floor is the lowest of the large level surfaces below the cameras.
+    Without such a surface, z = 0 is the level of the lowest surface points. Without walls, x is the first camera's view
+    direction.
     """
     if len(T_map_cam) == 0:
         T_map_cam = np.eye(4)[None]
@@ -50,7 +53,7 @@ def estimate_gravity_frame(T_map_cam: NDArray[np.float64], gaussians: Gaussians)
 
 
 def is_floor_seen(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> bool:
-    """Whether z = 0 of ``estimate_gravity_frame`` is a floor, and not just the lowest that there is."""
+    """Whether z = 0 of ``estimate_gravity_frame`` is a floor, and not just the level of the lowest points."""
     points, normals = _planes(gaussians.means)
     up = T_gravity_map[2, :3]
     level = (points @ up + T_gravity_map[2, 3])[np.abs(normals @ up) > _LEVEL]
@@ -62,8 +65,8 @@ def is_floor_seen(T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.floa
 def compute_first_camera_frame(
     T_gravity_map: NDArray[np.float64], T_map_cam: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(4, 4) rigid ``T_first_map``: z up, the origin at the center of the camera ``T_map_cam`` (4, 4), x where it
-    looked, as robots take the place that they start from."""
+    """Returns the (4, 4) rigid ``T_first_map``: z up, the origin at the center of the camera ``T_map_cam`` (4, 4), x
+    along its view. Robots use the same convention for their start."""
     T_gravity_cam = T_gravity_map @ T_map_cam
     x = _heading(np.array((0.0, 0.0, 1.0)), T_gravity_cam[:3, 2], -T_gravity_cam[:3, 1])
     T_gravity_first = np.eye(4)
@@ -73,8 +76,8 @@ def compute_first_camera_frame(
 
 
 def estimate_floor_height(heights: NDArray[np.float64], camera_height: float) -> float | None:
-    """The height of the floor from (N,) heights of points on level surfaces: of the peaks of their histogram below the
-    cameras, the lowest that has a quarter of the largest one's points; None without points there."""
+    """Returns the height of the floor from the (N,) heights of points on level surfaces. It is the lowest peak of their
+    histogram below the cameras with at least a quarter of the largest peak's points. None without points there."""
     below = heights[heights < camera_height - 0.2]
     if not len(below):
         return None
@@ -87,8 +90,9 @@ def estimate_floor_height(heights: NDArray[np.float64], camera_height: float) ->
 
 
 def _fitted(up: NDArray[np.float64], height: float, level: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Up and the floor's height after a least-squares plane through the points near the floor, in ever narrower bands;
-    up as it is where these points do not spread over both directions or would turn it by more than 3 degrees."""
+    """Returns up and the floor's height from a least-squares plane through the points near the floor, in ever narrower
+    bands. Up stays as it is where the points do not spread in both directions or would turn it by more than 3 degrees.
+    """
     normal = up
     for band in _BAND:
         near = level[np.abs(level @ normal - height) < band]
@@ -106,8 +110,8 @@ def _fitted(up: NDArray[np.float64], height: float, level: NDArray[np.float64]) 
 def _along_walls(
     up: NDArray[np.float64], forward: NDArray[np.float64], above: NDArray[np.float64], normals: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(3,) level unit vector along or across the walls: where the walls' normals, folded into a quarter turn, pile up
-    most; of the four directions, the one nearest to ``forward``."""
+    """Returns the (3,) level unit vector along the walls that is nearest to ``forward``. It comes from the peak of the
+    walls' normals, folded into a quarter turn."""
     x = _heading(up, forward, above)
     walls = normals[np.abs(normals @ up) < _UPRIGHT]
     if not len(walls):
@@ -122,16 +126,16 @@ def _along_walls(
 
 
 def _heading(up: NDArray[np.float64], forward: NDArray[np.float64], above: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3,) level unit vector where a camera looks; of one that looks straight down or up, where its image's top or
-    bottom edge is."""
+    """Returns the (3,) level unit vector along a camera's view. If the camera looks straight down or up, it points to
+    the top or bottom edge of its image."""
     looks = forward if abs(forward @ up) < 0.95 else above * -np.sign(forward @ up)
     flat = looks - (looks @ up) * up
     return np.asarray(flat / np.linalg.norm(flat))
 
 
 def _planes(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(P, 3) some of the points, evenly spread over storage, that lie on something flat, and the (P, 3) normals of
-    planes through their neighbors. Gaussians have none of their own: by default they are spheres."""
+    """Returns (P, 3) points that lie on something flat, from a sample spread evenly over storage, and the (P, 3)
+    normals of planes through their neighbors. Gaussians have no normals: by default they are spheres."""
     if len(means) < _NEIGHBORS:
         return np.zeros((0, 3)), np.zeros((0, 3))
     points = means[:: max(1, len(means) // _SAMPLES)].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Layer 4 kept current while keyframes come, go and move: only the blocks that one touches are made again."""
+"""Keeps layer 4 current while keyframes come, go and move: it rebuilds only the blocks that they touch."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class _Kept:
 class IncrementalOccupancy:
     """The occupancy of a set of keyframes, each with the Gaussians that are anchored to it.
 
-    ``update()`` gives, to the last bit, what ``build_occupancy`` gives for the same set with Gaussians in the order of
-    the keyframes' numbers, but for blocks that say nothing, which are left out. It makes the blocks again that the
-    keyframes added, removed and moved since the last time touch; others are copied.
+    ``update()`` returns, to the last bit, what ``build_occupancy`` returns for the same set with the Gaussians in the
+    order of the keyframes' numbers, but without blocks of which nothing is known. It rebuilds the blocks that the
+    keyframes touch which were added, removed or moved since the last update, and copies the others.
     """
 
     def __init__(
@@ -38,9 +38,11 @@ class IncrementalOccupancy:
         self.splatting, self.carving = splatting, carving
         self.evidence = carve.DepthEvidence(np.zeros(3) if origin is None else origin, splatting.voxel_size, carving)
         self.stale = np.zeros(0, np.int64)
-        """Packed keys of the blocks that the next update makes again."""
+        """Packed keys of the blocks that the next update rebuilds."""
         self._keyframes: dict[int, _Kept] = {}
-        self._none: tuple[Gaussians, NDArray[np.float16]] | None = None  # none of them, and features of their kind
+        self._none: tuple[Gaussians, NDArray[np.float16]] | None = (
+            None  # no Gaussians, and no features of the same size
+        )
         self._now: Occupancy | None = None
 
     def add(
@@ -51,27 +53,27 @@ class IncrementalOccupancy:
         gaussians: Gaussians,
         features: NDArray[np.float16],
     ) -> None:
-        """Take a keyframe, under a number of its own, with its N Gaussians and their features (N, D)."""
+        """Adds a keyframe under its own number, with its N Gaussians and their features (N, D)."""
         if number in self._keyframes:
-            raise ValueError(f"keyframe {number} is there already")
+            raise ValueError(f"keyframe {number} was already added")
         touched = splat.bin_gaussians(gaussians, self.evidence.origin, self.splatting).packed
         self._keyframes[number] = _Kept(gaussians, features, T_world_cam, touched)
         self._none = gaussians[:0], features[:0]
         self.stale = unite_keys(self.stale, touched, self.evidence.add(frame, T_world_cam))
 
     def remove(self, number: int, frame: Frame) -> None:
-        """Take a keyframe out again; ``frame`` is what was added. Raises KeyError for a number that is not there."""
+        """Removes a keyframe; ``frame`` is the frame that was added. Raises KeyError for an unknown number."""
         kept = self._keyframes.pop(number)
         self.stale = unite_keys(self.stale, kept.touched, self.evidence.remove(frame, kept.T_world_cam))
 
     def move(self, number: int, frame: Frame, T_world_cam: NDArray[np.float64], gaussians: Gaussians) -> None:
-        """Put a keyframe elsewhere, and its Gaussians, as ``anchors.reanchor`` moved them."""
+        """Moves a keyframe to another pose. gaussians: its Gaussians after ``anchors.reanchor`` moved them."""
         features = self._keyframes[number].features
         self.remove(number, frame)
         self.add(number, frame, T_world_cam, gaussians, features)
 
     def update(self) -> Occupancy:
-        """The occupancy of what is there now. Raises ValueError before the first keyframe."""
+        """Returns the occupancy of the current keyframes. Raises ValueError before the first keyframe."""
         stale = self.stale
         reaching = [
             self._keyframes[number]
@@ -79,7 +81,7 @@ class IncrementalOccupancy:
             if np.isin(self._keyframes[number].touched, stale, assume_unique=True).any()
         ]
         if self._none is None:  # nothing was ever added
-            raise ValueError("an occupancy map begins with a keyframe")
+            raise ValueError("add a keyframe before the first update")
         gaussians = Gaussians.concatenated([self._none[0], *(kept.gaussians for kept in reaching)])
         features = np.concatenate([self._none[1], *(kept.features for kept in reaching)])
         bins = splat.bin_gaussians(gaussians, self.evidence.origin, self.splatting).only(stale)
@@ -90,7 +92,8 @@ class IncrementalOccupancy:
 
 
 def _merged(old: Occupancy | None, new: Occupancy) -> Occupancy:
-    """The new blocks in place of the old ones of the same keys, those that say nothing left out, keys ascending."""
+    """Returns the new blocks in place of the old ones of the same keys, without blocks of which nothing is known; keys
+    ascend."""
     parts = [new] if old is None else [select_blocks(old, ~np.isin(pack_voxels(old.keys), pack_voxels(new.keys))), new]
     parts = [select_blocks(part, mask_known_blocks(part)) for part in parts]
     packed = np.concatenate([pack_voxels(part.keys) for part in parts])

@@ -1,4 +1,4 @@
-"""Maps of several voxel sizes: put together from maps of one size each, and brought to one size."""
+"""Maps of several voxel sizes: combines maps of one size each, and brings a map to one size."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ PER_BLOCK = "keys", "probability", "free", "hits", "state"
 """Arrays of an ``Occupancy`` with a row for each block."""
 
 _OCTANTS = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1)
-"""(8, 3) places of the halves of a block."""
+"""(8, 3) places of the eight parts of a block."""
 
 
 def subdivide_keys(keys: NDArray[np.integer]) -> NDArray[np.int32]:
-    """(8 B, 3) keys of the blocks of the next level that cover (B, 3) blocks, eight after another."""
+    """Returns the (8 B, 3) keys of the next level's blocks that cover (B, 3) blocks, eight in a row for each."""
     return np.asarray((2 * keys[:, None] + _OCTANTS).reshape(-1, 3), np.int32)
 
 
 def combine_levels(parts: Sequence[Occupancy]) -> Occupancy:
-    """One map of parts whose blocks do not cover each other, part n being of voxels of 1 / 2^n of the first one's."""
+    """Returns one map of all parts. Blocks must not overlap; part n has 1 / 2^n of the first part's voxel size."""
     first = parts[0]
     return first.replace(
         levels=np.concatenate([np.full(len(part.keys), level, np.uint8) for level, part in enumerate(parts)]),
@@ -35,7 +35,7 @@ def combine_levels(parts: Sequence[Occupancy]) -> Occupancy:
 
 
 def select_blocks(occupancy: Occupancy, chosen: NDArray[np.bool_]) -> Occupancy:
-    """Some of the blocks, given by a mask (B,)."""
+    """Returns the blocks of a mask (B,)."""
     kept = chosen[np.nonzero(occupancy.state == OCCUPIED)[0]]
     return occupancy.replace(
         features=occupancy.features[kept],
@@ -46,22 +46,22 @@ def select_blocks(occupancy: Occupancy, chosen: NDArray[np.bool_]) -> Occupancy:
 
 
 def mask_known_blocks(occupancy: Occupancy) -> NDArray[np.bool_]:
-    """(B,) whether anything of each block is known."""
+    """Returns (B,) whether a block has a known voxel."""
     known = (occupancy.probability > 0) | (occupancy.free > 0) | (occupancy.hits > 0)
     return np.asarray(known.any(axis=1))
 
 
 def make_uniform(occupancy: Occupancy, level: int = 0) -> Occupancy:
-    """The map with voxels of one size, ``voxel_size / 2^level``.
+    """Returns the map with voxels of one size, ``voxel_size / 2^level``.
 
-    Larger voxels are cut, each part saying what the whole says. Smaller ones are put together: a voxel is occupied if
-    any of its eight parts is, else unknown if any is, else free; it has the highest probability, the most evidence, and
-    the mean color and feature of its occupied parts. Features are decoded.
+    Larger voxels are cut; each part has the values of the whole. Eight smaller voxels are merged into one. It is
+    occupied if any part is, else unknown if any part is, else free. It has the highest probability, the most evidence,
+    and the mean color and feature of its occupied parts. Features are decoded.
     """
     current = occupancy
     if not (current.levels != level).any():
         return current.replace(voxel_size=occupancy.voxel_size / 2**level, levels=np.zeros_like(current.levels))
-    rows = np.full(current.state.shape, -1, np.int64)  # of each occupied voxel in features and colors
+    rows = np.full(current.state.shape, -1, np.int64)  # each occupied voxel's row in features and colors
     rows[current.state == OCCUPIED] = np.arange(np.count_nonzero(current.state == OCCUPIED))
     arrays = {name: getattr(current, name) for name in PER_BLOCK if name != "keys"} | {"rows": rows}
     keys, levels = current.keys, current.levels.astype(int)
@@ -94,7 +94,7 @@ def make_uniform(occupancy: Occupancy, level: int = 0) -> Occupancy:
 
 
 def _cut(blocks: NDArray[np.generic]) -> NDArray[np.generic]:
-    """(B, 512) values of blocks to (8 B, 512) of the blocks of the next level, in the order of ``subdivide_keys``."""
+    """Returns the next level's (8 B, 512) values for (B, 512) values, in the order of ``subdivide_keys``."""
     half = BLOCK // 2
     parts = blocks.reshape(-1, 2, half, 2, half, 2, half).transpose(0, 1, 3, 5, 2, 4, 6).reshape(-1, half, half, half)
     for axis in (1, 2, 3):
@@ -108,14 +108,14 @@ def _joined(
     features: NDArray[np.float16],
     colors: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int32], dict[str, NDArray[np.generic]], NDArray[np.float16], NDArray[np.uint8]]:
-    """Blocks put together to those of the level before: their keys and arrays, and features and colors with rows
-    added for the new voxels. Where a block's sibling is not there, nothing is known."""
+    """Merges blocks into blocks of the level before. Returns their keys and arrays, and features and colors with added
+    rows for the new voxels. Where a sibling of a block is missing, nothing is known."""
     parents, row = np.unique(pack_voxels(keys >> 1), return_inverse=True)
     octant = (keys & 1) @ np.array((4, 2, 1))
     half = BLOCK // 2
 
     def gathered(name: str, missing: int) -> NDArray[np.generic]:
-        """(B', 8, 64, 8): for each half of each parent, its 4 x 4 x 4 voxels' eight parts."""
+        """Returns (B', 8, 64, 8): for each eighth of each parent, the eight parts of its 4 x 4 x 4 voxels."""
         values = arrays[name]
         parts = values.reshape(-1, half, 2, half, 2, half, 2).transpose(0, 1, 3, 5, 2, 4, 6).reshape(-1, half**3, 8)
         out = np.full((len(parents), 8, half**3, 8), missing, values.dtype)
@@ -123,7 +123,7 @@ def _joined(
         return out
 
     def placed(values: NDArray[np.generic]) -> NDArray[np.generic]:
-        """(B', 8, 64) values of voxels to (B', 512) in storage order."""
+        """Returns (B', 8, 64) values of voxels as (B', 512) in storage order."""
         grid = values.reshape(-1, 2, 2, 2, half, half, half).transpose(0, 1, 4, 2, 5, 3, 6)
         return np.asarray(grid.reshape(-1, BLOCK**3))
 

@@ -1,4 +1,4 @@
-"""The same voxels on another lattice, turned and shifted against the first."""
+"""Moves voxels to another lattice, which is turned and shifted against the first."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _LOCAL = np.stack(np.unravel_index(np.arange(BLOCK**3), (BLOCK,) * 3), axis=1)
 def resample_occupancy(
     occupancy: Occupancy, T_new_old: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> tuple[Occupancy, NDArray[np.int64]]:
-    """A map of one voxel size on the lattice of the same size in another frame: its voxels without features, and for
-    each occupied one the row of the old map's occupied voxel that it stands for.
+    """Returns a map of one voxel size on a lattice of the same size in another frame, without features, and for each
+    occupied voxel the row of the old occupied voxel that it stands for.
 
-    T_new_old: (4, 4), rigid.  origin: (3,) lower corner of the new voxel (0, 0, 0), in the new frame. A voxel takes the
-    state of the old one that holds its center. One that holds an old occupied voxel's center is occupied as well, so
-    that no surface gets holes: thin things are found where they were, and never lost.
+    T_new_old: (4, 4), rigid.  origin: (3,) lower corner of the new voxel (0, 0, 0), in the new frame. A new voxel takes
+    the state of the old voxel that holds its center. A new voxel that holds the center of an old occupied voxel is
+    occupied too, so that surfaces get no holes and thin things are not lost.
     """
     T_old_new = invert(T_new_old)
     size, packed = occupancy.voxel_size, pack_voxels(occupancy.keys)
@@ -36,7 +36,9 @@ def resample_occupancy(
     states = np.full((len(keys), BLOCK**3), UNKNOWN, np.uint8)
     probability = np.zeros((len(keys), BLOCK**3), np.float32)
     rows = np.full((len(keys), BLOCK**3), -1, np.int32)
-    corners = transform(T_old_new, origin + keys * BLOCK * size) - occupancy.origin  # of new blocks, on the old lattice
+    corners = (
+        transform(T_old_new, origin + keys * BLOCK * size) - occupancy.origin
+    )  # of the new blocks, on the old lattice
     offsets = (_LOCAL + 0.5) @ T_old_new[:3, :3].T
     for start in range(0, len(keys), _BLOCKS_AT_ONCE):
         part = slice(start, start + _BLOCKS_AT_ONCE)
@@ -77,7 +79,7 @@ def resample_occupancy(
 
 
 def _covering(occupancy: Occupancy, T_new_old: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.int32]:
-    """(B', 3) keys, in packed order, of the new lattice's blocks that a block of the old one may reach into."""
+    """Returns the (B', 3) keys, in packed order, of the new blocks that an old block may reach into."""
     edge = BLOCK * occupancy.voxel_size
     R, t = T_new_old[:3, :3], T_new_old[:3, 3]
     center = (occupancy.origin + (occupancy.keys + 0.5) * edge) @ R.T + t - origin

@@ -6,26 +6,26 @@ Every mode is a product over the neighboring Gaussians H(x) of a voxel with cent
 
 with phi_k(x) = exp(-1/2 (x - mu_k)^T Sigma_k^-1 (x - mu_k)), Sigma_k = R(r_k) diag(s_k^2) R(r_k)^T, and
 
-    probabilistic   c_k = phi_k(x): the paper's, opacity is not part of it                                     (A)
+    probabilistic   c_k = phi_k(x): the paper's; opacity plays no part                                         (A)
     poisson         c_k = 1 - exp(-o_k phi_k(x)), so that alpha = 1 - exp(-sum_k o_k phi_k(x))
     integrated      c_k = the mass of N(mu_k, Sigma_k) within V(x)
-    released        as poisson, with Sigma_k (m^2) where Sigma_k^-1 belongs: the paper's code as it seems to run. phi is
-                    1 in all of H(x), in effect a dilation by it; for comparison.
+    released        as poisson, with Sigma_k (m^2) in place of Sigma_k^-1: what the paper's code seems to compute. phi
+                    is 1 in all of H(x), which amounts to a dilation by H(x); for comparison.
 
 and the features of the voxel are posterior means,
 
     p(G_k | x) = w_k(x) / sum_j w_j(x),  w_k = N(x; mu_k, Sigma_k) o_k  (integrated: c_k o_k, released: o_k phi_k)   (C)
     f(x)       = sum_k p(G_k | x) f_k                                                                          (D)
 
-H(x) is all k with a Mahalanobis distance of x to G_k of at most the cutoff; what that leaves out is a c_k of less than
-exp(-cutoff^2 / 2) each, 0.011 at the default of 3. Integrated: all whose bounding box at the cutoff touches V(x); what
-that leaves out is less than 6 Phi(-cutoff) of a Gaussian's mass, 0.008. Released: all whose voxel is, along each axis,
-at most ceil(cutoff s_max / voxel) voxels away.
+H(x) holds every k whose Mahalanobis distance to x does not exceed the cutoff. Each c_k that this omits is less than
+exp(-cutoff^2 / 2), 0.011 at the default of 3. Integrated: every k whose bounding box at the cutoff touches V(x). This
+omits less than 6 Phi(-cutoff) of a Gaussian's mass, 0.008. Released: every k whose voxel is, along each axis, no more
+than ceil(cutoff s_max / voxel) voxels away.
 
-Gaussians that are finer than the lattice can show would fall between the voxels' centers. A deviation s_ki below a
-given s_min becomes s_min, and phi_k is multiplied by (prod_i s_ki / max(s_ki, s_min))^(2/3), the areas' ratio, so that
-what a surface of Gaussians adds up to stays as it is. Such a limit is Mip-Splatting's (Z. Yu et al., CVPR 2024, Sec.
-5.1); that its weight goes with the area is due to occupancy, whose Gaussians stand side by side on surfaces.
+Gaussians that are finer than the lattice would fall between the voxels' centers. So a deviation s_ki below a given
+s_min becomes s_min. phi_k is multiplied by the ratio of the areas, (prod_i s_ki / max(s_ki, s_min))^(2/3), so that the
+sum over a surface of Gaussians stays the same. The limit comes from Mip-Splatting (Z. Yu et al., CVPR 2024, Sec. 5.1).
+The weight follows the area because the Gaussians of occupancy lie next to each other on surfaces.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from .gaussian_bins import INTEGRATED, MODES, POISSON, PROBABILISTIC, RELEASED, 
 
 
 def check(options: Options) -> None:
-    """Raises ConfigError or DependencyError if Gaussians cannot be projected on the device that is asked for."""
+    """Raises ConfigError or DependencyError if the chosen device cannot project Gaussians."""
     if options.device != "cpu":
         from . import splat_torch
 
@@ -54,9 +54,9 @@ def bin_gaussians(
     shape: tuple[int, int, int] | None = None,
     least_scale: float = 0.0,
 ) -> Bins:
-    """Sort Gaussians into blocks of the lattice whose voxel (0, 0, 0) has its lower corner at ``origin``.
+    """Sorts Gaussians into blocks of the lattice whose voxel (0, 0, 0) has its lower corner at ``origin``.
 
-    shape: only the voxels (0, 0, 0) … shape - 1 are evaluated, however far a Gaussian reaches; all by default.
+    shape: limits the evaluation to the voxels (0, 0, 0) … shape - 1; all by default.
     least_scale: s_min, meters.
     """
     check(options)
@@ -79,8 +79,8 @@ def bin_gaussians(
 def widen_scales(
     scales: NDArray[np.float32], least_scale: float, options: Options
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(N, 3) deviations of at least s_min, meters, and the (N,) shares that the phi are multiplied by. A mass within
-    a voxel needs no such thing, nor does what is dilated."""
+    """Returns (N, 3) deviations of s_min or more, meters, and the (N,) factors of phi. The modes integrated and
+    released need neither."""
     if least_scale == 0 or MODES[options.projection] not in (PROBABILISTIC, POISSON):
         return scales, np.ones(len(scales), np.float32)
     wide = np.maximum(scales, np.float32(least_scale))
@@ -88,7 +88,7 @@ def widen_scales(
 
 
 def compute_probability(bins: Bins, keys: NDArray[np.int32]) -> NDArray[np.float32]:
-    """(B, 512) alpha at every voxel of the bins' blocks, whose (B, 3) keys are given: equations (A) and (B)."""
+    """Returns the (B, 512) alpha of the voxels of the bins' blocks: equations (A), (B). keys: (B, 3) of the blocks."""
     if bins.device != "cpu":
         from . import splat_torch
 
@@ -104,10 +104,10 @@ def compute_probability(bins: Bins, keys: NDArray[np.int32]) -> NDArray[np.float
 def compute_posterior_mean(
     bins: Bins, keys: NDArray[np.int32], slots: NDArray[np.int32], values: NDArray[np.floating]
 ) -> NDArray[np.float32]:
-    """(V, D) posterior expectation of per-Gaussian values (N, D) at some voxels: equations (C) and (D).
+    """Returns the (V, D) posterior means of per-Gaussian values (N, D) at chosen voxels: equations (C) and (D).
 
-    slots: (B, 512) row of the output for each voxel of the bins' blocks, -1 for voxels that are not asked for. A voxel
-    without a neighboring Gaussian gets zeros. values: float16 ones are taken as they are, without a copy of all.
+    slots: (B, 512) row of the output for each voxel of the bins' blocks, -1 for the other voxels. A voxel without a
+    neighboring Gaussian gets zeros.  values: float16 values are used without a float32 copy of the whole.
     """
     rows = int(slots.max(initial=-1)) + 1
     if bins.device != "cpu":

@@ -1,4 +1,4 @@
-"""The projection of binned Gaussians onto voxels, compiled, a block on each thread; ``splat`` has the equations."""
+"""Projects binned Gaussians onto voxels, compiled, one block per thread; ``splat`` has the equations."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def splat_mass(
 def _window(
     key: NDArray[np.int32], lo: NDArray[np.int32], hi: NDArray[np.int32]
 ) -> tuple[int, int, int, int, int, int]:
-    """First voxel, and the one after the last, of a Gaussian's neighborhood within a block."""
+    """Returns the first voxel of a Gaussian's neighborhood within a block, and the voxel after the last."""
     x0, y0, z0 = key[0] * BLOCK, key[1] * BLOCK, key[2] * BLOCK
     return (
         max(lo[0] - x0, 0), max(lo[1] - y0, 0), max(lo[2] - z0, 0),
@@ -94,7 +94,7 @@ def _window(
 
 
 def _load(values: NDArray[np.generic], g: int, bits: NDArray[np.int32], row: NDArray[np.float32]) -> None:
-    """Row g of the values as float32. bits: the memory of ``row``."""
+    """Loads row g of the values as float32 into ``row``. bits: the memory of ``row``."""
 
 
 @overload(_load)
@@ -133,7 +133,7 @@ def splat_posterior_mean(
         total, mass = np.zeros(BLOCK**3, np.float32), np.empty((BLOCK, BLOCK, BLOCK))
         bits = np.empty(dimension, np.int32)
         own = bits.view(np.float32)
-        # Densities of thin and of wide Gaussians differ by orders of magnitude: the block's largest is the unit.
+        # Densities of thin and wide Gaussians differ by orders of magnitude: the unit is the block's largest.
         unit = np.float32(-np.inf)
         for pair in range(start[b], start[b + 1]):
             unit = max(unit, log_weight[gaussian[pair]])

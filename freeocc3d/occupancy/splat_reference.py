@@ -1,4 +1,4 @@
-"""The projection written out in plain NumPy and SciPy, every pair evaluated: what ``splat`` is tested against."""
+"""The projection in plain NumPy and SciPy, which evaluates every pair: the reference for tests of ``splat``."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from .splat import Options
 def compute_contributions_reference(
     gaussians: Gaussians, points: NDArray[np.float64], options: Options, least_scale: float = 0.0
 ) -> NDArray[np.float64]:
-    """(P, N) c_k at voxels whose centers are the (P, 3) world points; cutoff included, except for "released", whose
-    neighborhood is a box of the lattice: there it is all space. least_scale: s_min, which those two do without."""
+    """Returns the (P, N) c_k at voxels. points: (P, 3) centers of the voxels in the world.  least_scale: s_min, which
+    "integrated" and "released" ignore. The cutoff applies, except for "released": there the neighborhood is all space.
+    """
     if options.projection == "integrated":
         return _masses(gaussians, points, options)
     o = gaussians.opacities.astype(np.float64)
@@ -35,7 +36,7 @@ def compute_contributions_reference(
 def compute_probability_reference(
     gaussians: Gaussians, points: NDArray[np.float64], options: Options, least_scale: float = 0.0
 ) -> NDArray[np.float64]:
-    """(P,) alpha of voxels, given by their centers: equation (B)."""
+    """Returns the (P,) alpha of voxels at their centers: equation (B)."""
     return np.asarray(
         1.0 - np.prod(1.0 - compute_contributions_reference(gaussians, points, options, least_scale), axis=1)
     )
@@ -44,7 +45,7 @@ def compute_probability_reference(
 def compute_posterior_mean_reference(
     gaussians: Gaussians, points: NDArray[np.float64], values: NDArray[np.floating], options: Options
 ) -> NDArray[np.float64]:
-    """(P, D) posterior expectation of values (N, D) at voxels, given by their centers: equations (C) and (D)."""
+    """Returns the (P, D) posterior means of values (N, D) at the centers of voxels: equations (C) and (D)."""
     o = gaussians.opacities.astype(np.float64)
     if options.projection == "integrated":
         weight = compute_contributions_reference(gaussians, points, options) * o
@@ -67,8 +68,8 @@ def _squared_distances(gaussians: Gaussians, points: NDArray[np.float64]) -> NDA
 
 
 def _masses(gaussians: Gaussians, points: NDArray[np.float64], options: Options) -> NDArray[np.float64]:
-    """(P, N) mass of each Gaussian in the voxel around each point, by SciPy's quadrature; 0 where the voxel does not
-    touch the Gaussian's bounding box at the cutoff."""
+    """Returns the (P, N) mass of each Gaussian in the voxel around each point, by SciPy's quadrature; 0 where the voxel
+    does not touch the Gaussian's bounding box at the cutoff."""
     from scipy.stats import multivariate_normal
 
     half = 0.5 * options.voxel_size

@@ -1,6 +1,7 @@
-"""The projection in torch, for a GPU: all pairs of a Gaussian and a voxel of its neighborhood, summed by voxel.
+"""The projection in torch, for a GPU: sums over all pairs of a Gaussian and a voxel of its neighborhood.
 
-Products become sums of logarithms, in an order that the device chooses: equal to ``splat`` to rounding.
+Products become sums of logarithms, in an order that the device chooses. So results equal those of ``splat`` up to
+rounding.
 """
 
 from __future__ import annotations
@@ -17,21 +18,21 @@ from ..core.types import BLOCK
 from ..core.voxel_keys import pack_index, pack_voxels
 from .gaussian_bins import Bins
 
-_PAIRS = 1 << 24  # worked on at once: 60 bytes each
+_PAIRS = 1 << 24  # per step: 60 bytes each
 
 
 def check_device(device: str) -> None:
-    """Raises ConfigError or DependencyError for a device that torch does not have."""
+    """Raises ConfigError or DependencyError for a device that torch cannot use."""
     try:
         kind = torch.device(device).type
     except RuntimeError as error:
         raise ConfigError(f"'device' must be cpu or cuda:0, got '{device}'.") from error
     if kind == "cuda" and not torch.cuda.is_available():
-        raise DependencyError(f"occupancy.device={device} needs a GPU and a torch that uses it; there is none here.")
+        raise DependencyError(f"occupancy.device={device} needs a GPU and a torch build that uses it, but torch finds no GPU.")
 
 
 def compute_probability_torch(bins: Bins, keys: NDArray[np.int32], poisson: bool) -> NDArray[np.float32]:
-    """As ``splat.compute_probability``."""
+    """Does what ``splat.compute_probability`` does."""
     device = torch.device(bins.device)
     logarithms = torch.zeros(len(keys) * BLOCK**3, dtype=torch.float32, device=device)
     opacities, share = (torch.from_numpy(array).to(device) for array in (bins.opacities, bins.share))
@@ -45,12 +46,12 @@ def compute_probability_torch(bins: Bins, keys: NDArray[np.int32], poisson: bool
 def compute_posterior_mean_torch(
     bins: Bins, keys: NDArray[np.int32], slots: NDArray[np.int32], values: NDArray[np.floating], rows: int
 ) -> NDArray[np.float32]:
-    """As ``splat.compute_posterior_mean``."""
+    """Does what ``splat.compute_posterior_mean`` does."""
     device = torch.device(bins.device)
     row_of_voxel = torch.from_numpy(slots.reshape(-1).astype(np.int64)).to(device)
     log_weight = torch.from_numpy(bins.log_weight).to(device)
     own = torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
-    largest = torch.full((rows,), -torch.inf, device=device)  # of each voxel: the unit of its weights
+    largest = torch.full((rows,), -torch.inf, device=device)  # each voxel's unit of weights
     for gaussian, voxel, squared in _pairs(bins, keys, device):
         row = row_of_voxel[voxel]
         kept = row >= 0
@@ -71,7 +72,7 @@ def compute_posterior_mean_torch(
 def _pairs(
     bins: Bins, keys: NDArray[np.int32], device: torch.device, at_once: int = _PAIRS
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Gaussian, voxel (row of its block * 512 + local index) and squared distance of the pairs within the cutoff."""
+    """Yields Gaussian, voxel (block's row * 512 + local index) and squared distance of the pairs within the cutoff."""
     packed = pack_voxels(keys)
     order = np.argsort(packed)
     sorted_keys = torch.from_numpy(packed[order]).to(device)

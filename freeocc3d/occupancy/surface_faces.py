@@ -12,10 +12,10 @@ from ..core.voxel_keys import contains, pack_voxels
 def find_exposed_faces(
     occupancy: Occupancy, chosen: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64]]:
-    """The faces between occupied voxels and all others: (4 F, 3) vertices in meters, (F, 4) quads that index them,
-    counter-clockwise seen from outside, and (F,) the occupied voxel's row that each face belongs to.
+    """Returns the faces between occupied voxels and all others: (4 F, 3) vertices in meters, (F, 4) quads that index
+    them, counter-clockwise from outside, and the (F,) row of the occupied voxel of each face.
 
-    chosen: (V,) the occupied voxels to draw, as if there were no others; all by default.
+    chosen: (V,) the occupied voxels to draw, as if no others existed; all by default.
     """
     voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
     chosen_rows = np.arange(len(voxels)) if chosen is None else np.flatnonzero(chosen)
@@ -27,10 +27,10 @@ def find_exposed_faces(
 def build_faces(
     voxels: NDArray[np.integer], edges: NDArray[np.integer] | None = None
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-    """The faces of voxels as ``find_exposed_faces``, but with (4 F, 3) corners on the lattice.
+    """Returns the faces of voxels as ``find_exposed_faces`` does, but with (4 F, 3) corners on the lattice.
 
-    voxels: (V, 3) lower corners, |i| < 2^20.  edges: (V,) powers of two that divide them; 1 by default. A face whose
-    neighbor is cut into smaller voxels is drawn, whichever of them are there.
+    voxels: (V, 3) lower corners, |i| < 2^20.  edges: (V,) powers of two that divide the corners; 1 by default. A face
+    toward smaller voxels is always drawn, whichever of them exist.
     """
     edges = np.ones(len(voxels), np.int32) if edges is None else edges
     sizes = np.unique(edges)
@@ -43,7 +43,7 @@ def build_faces(
                 neighbor = voxels[own].astype(np.int64)
                 neighbor[:, axis] += size * (2 * side - 1)
                 hidden = np.zeros(len(own), bool)
-                for other in sizes[sizes >= size]:  # the neighbor, or a larger voxel that holds it
+                for other in sizes[sizes >= size]:  # the neighbor itself, or a larger voxel that holds it
                     hidden |= contains(ascending[other], pack_voxels(neighbor // other))
                 exposed = own[~hidden]
                 b, c = (axis + 1) % 3, (axis + 2) % 3

@@ -1,4 +1,4 @@
-"""Which way is up, from how people hold cameras and from floors, tables and ceilings."""
+"""Estimates which way is up, from how people hold cameras and from floors, tables and ceilings."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from numpy.typing import NDArray
 _SAMPLES = 20_000
 _BIN = 0.05  # meters
 _SIDEWAYS = 0.4
-"""By how much more of its length the mean of the cameras' x axes has to keep than that of their y axes before a camera
-counts as held sideways: one that nods from floor to ceiling without turning keeps 0.36 more."""
+"""A camera counts as held sideways if the mean of its x axes is longer than that of its y axes by this much. A camera
+that nods from floor to ceiling without turning has a difference of 0.36."""
 
 
 def estimate_up(T_world_cam: NDArray[np.float64], points_world: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(3,) unit vector that points up in the world, from (K, 4, 4) poses and (N, 3) surface points.
+    """Returns the (3,) unit vector that points up in the world, from (K, 4, 4) poses and (N, 3) surface points.
 
-    Cameras are pitched freely but hardly rolled, so that their x axes are level: up is the direction in which these
-    axes vary least, and on the side of -y. Where a camera was held sideways all the time and nothing said so, its y
-    axes are level, and it looked rather down than up. Up is then turned, by 10 degrees at the most, to where the
-    heights of the surface points pile up most, as those of level surfaces do.
+    People pitch cameras freely but hardly roll them, so the x axes are level. Up is the direction in which these axes
+    vary least, on the side of -y. If a person held the camera sideways all the time and no metadata says so, the y axes
+    are level; the sign then follows from the fact that cameras look down more than up. At last, up turns by up to 10
+    degrees to where the heights of the surface points have the sharpest histogram, as on level surfaces.
     """
     if len(T_world_cam) == 0:
         return np.array((0.0, -1.0, 0.0))
     level_axes, mean_up = _held(T_world_cam)
     mean_up /= max(float(np.linalg.norm(mean_up)), 1e-9)
-    # The mean upward axis, weakly, decides where all cameras look the same way.
+    # Where all cameras look the same way, the mean upward axis decides: it has a small weight.
     spread = level_axes.T @ level_axes / len(level_axes) + 0.05 * (np.eye(3) - np.outer(mean_up, mean_up))
     up = np.linalg.eigh(spread)[1][:, 0]
     up = up if up @ mean_up >= 0 else -up
@@ -36,8 +36,8 @@ def estimate_up(T_world_cam: NDArray[np.float64], points_world: NDArray[np.float
 
 
 def turn_back(T_world_cam: NDArray[np.float64], quarters: NDArray[np.integer]) -> NDArray[np.float64]:
-    """(K, 4, 4) poses of the same cameras as they were held, whose images are turned counter-clockwise by (K,) quarter
-    turns (``Capture.turned``)."""
+    """Returns the (K, 4, 4) poses of the cameras as people held them. quarters: (K,) counter-clockwise quarter turns
+    that the images were turned by (``Capture.turned``)."""
     cos, sin = np.array((1, 0, -1, 0))[quarters % 4], np.array((0, -1, 0, 1))[quarters % 4]
     T_cam_held = np.tile(np.eye(4), (len(T_world_cam), 1, 1))
     T_cam_held[:, :2, :2] = np.stack((cos, -sin, sin, cos), axis=-1).reshape(-1, 2, 2)
@@ -45,8 +45,8 @@ def turn_back(T_world_cam: NDArray[np.float64], quarters: NDArray[np.integer]) -
 
 
 def _held(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(K, 3) the cameras' axes that are level, and (3,) the mean of those that point up: of people who turn around, the
-    axis that stays what it is."""
+    """Returns the (K, 3) level axes of the cameras, and the (3,) mean of the axes that point up: when people turn
+    around, this axis stays the same."""
     x_axes, y_axes, forward = (T_world_cam[:, :3, axis] for axis in range(3))
     top, side = -y_axes.mean(axis=0), x_axes.mean(axis=0)
     if float(np.linalg.norm(side)) < float(np.linalg.norm(top)) + _SIDEWAYS:
@@ -55,8 +55,8 @@ def _held(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 
 def _most_level(up: NDArray[np.float64], points: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-    """The direction within ``reach`` of ``up``, on a 11 x 11 grid of tilts, along which heights pile up most: where the
-    sum of the squared counts of their histogram is greatest."""
+    """Returns the direction within ``reach`` of ``up``, on an 11 x 11 grid of tilts, with the sharpest histogram of
+    heights: the greatest sum of squared counts."""
     if len(points) == 0:
         return up
     a = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])

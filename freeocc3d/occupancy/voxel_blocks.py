@@ -1,4 +1,4 @@
-"""Sparse blocks of 8 x 8 x 8 voxels: which exist, and where a block is found."""
+"""Sparse blocks of 8 x 8 x 8 voxels: finds the blocks that rays and boxes touch."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..core.types import BLOCK
 
 
 def unite_keys(*packed: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Ascending unique packed keys of all arguments."""
+    """Returns the ascending unique packed keys of all arguments."""
     return np.unique(np.concatenate(packed)) if packed else np.zeros(0, np.int64)
 
 
@@ -23,7 +23,7 @@ def find_blocks_along_rays(
     origin: NDArray[np.float64],
     voxel_size: float,
 ) -> NDArray[np.int64]:
-    """Ascending packed keys of all blocks that the segments from a camera's center to (P, 3) points pass through."""
+    """Returns the ascending packed keys of all blocks on the segments from a camera's center to (P, 3) points."""
     edge = BLOCK * voxel_size
     ends = (np.asarray(points_world, np.float64) - origin) / edge
     return np.sort(_walked((np.asarray(center_world, np.float64) - origin) / edge, ends))
@@ -31,11 +31,11 @@ def find_blocks_along_rays(
 
 @njit(cache=True, nogil=True)
 def find_touched_blocks(lo: NDArray[np.int32], hi: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Distinct packed keys of the blocks that boxes of voxels, (N, 3) first and last index, touch; empty boxes
-    (lo > hi) touch none."""
+    """Returns the distinct packed keys of the blocks that boxes of voxels touch. lo, hi: (N, 3) first and last index;
+    an empty box (lo > hi) touches no block."""
     table = np.full(1024, -1, np.int64)
     count = 0
-    last = np.int64(-1)  # neighbors in memory are mostly neighbors in space
+    last = np.int64(-1)  # Gaussians that are close in memory are mostly close in space
     for g in range(len(lo)):
         if lo[g, 0] > hi[g, 0] or lo[g, 1] > hi[g, 1] or lo[g, 2] > hi[g, 2]:
             continue
@@ -51,7 +51,7 @@ def find_touched_blocks(lo: NDArray[np.int32], hi: NDArray[np.int32]) -> NDArray
 
 @njit(cache=True, nogil=True)
 def _walked(start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Distinct packed keys of the unit cells on the segments from one point to (P, 3) others.
+    """Returns the distinct packed keys of the unit cells on the segments from one point to (P, 3) others.
 
     Source: J. Amanatides, A. Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, Eurographics 1987.
     """
