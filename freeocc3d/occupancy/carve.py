@@ -72,7 +72,7 @@ class DepthEvidence:
 
     def add(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
         """Counts one depth image. Returns the packed keys of the blocks that it looks into."""
-        frame = self._told(frame)
+        frame = self._mark_empty(frame)
         packed = self.visible_blocks(frame, T_world_cam)
         self._make_room(np.setdiff1d(packed, self.packed, assume_unique=True))
         self._count(packed, frame, T_world_cam, 1)
@@ -81,7 +81,7 @@ class DepthEvidence:
     def remove(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> NDArray[np.int64]:
         """Takes back a depth image that was added at this pose. Returns the packed keys of the blocks that it looked
         into. These blocks stay; their counts may be zero."""
-        frame = self._told(frame)
+        frame = self._mark_empty(frame)
         packed = self.visible_blocks(frame, T_world_cam)
         self._count(packed, frame, T_world_cam, -1)
         return packed
@@ -106,7 +106,7 @@ class DepthEvidence:
         points = transform(T_world_cam, back_project(pixels, z.astype(np.float32), camera).astype(np.float64))
         return find_blocks_along_rays(points, T_world_cam[:3, 3], self.origin, self.voxel_size)
 
-    def _told(self, frame: Frame) -> Frame:
+    def _mark_empty(self, frame: Frame) -> Frame:
         """Returns the frame with depth ``-no_return`` for pixels in a wide empty patch: space is free up to there."""
         if not self.options.no_return:
             return frame

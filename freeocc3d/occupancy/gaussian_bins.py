@@ -73,7 +73,7 @@ def prepare_gaussians(
     cutoff: float,
     mode: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]]:
-    """Returns means, forms, logarithms of weights, first and last voxels as in ``Bins``; lo > hi if no voxel is near."""
+    """Returns means, forms, logarithms of weights, first and last voxels as in ``Bins``; lo > hi for an empty box."""
     n = len(world)
     means, form = np.empty((n, 3), np.float32), np.empty((n, 6), np.float32)
     log_weight = np.empty(n, np.float32)

@@ -28,7 +28,7 @@ def check_device(device: str) -> None:
     except RuntimeError as error:
         raise ConfigError(f"'device' must be cpu or cuda:0, got '{device}'.") from error
     if kind == "cuda" and not torch.cuda.is_available():
-        raise DependencyError(f"occupancy.device={device} needs a GPU and a torch build that uses it, but torch finds no GPU.")
+        raise DependencyError(f"occupancy.device={device} needs a GPU and a torch build for it; torch finds none.")
 
 
 def compute_probability_torch(bins: Bins, keys: NDArray[np.int32], poisson: bool) -> NDArray[np.float32]:

@@ -1,1 +1,1 @@
-"""Asking a map: words, classes, pictures; regions, and conditions on where they are."""
+"""Answers questions to a map: words, classes and pictures, with conditions on where the regions are."""

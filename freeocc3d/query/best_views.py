@@ -1,4 +1,4 @@
-"""Which keyframes show a region best, and where in their images it is."""
+"""Finds the keyframes that show a region best, and where in their images it is."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ..storage.keyframes import Keyframes
 from .regions import Region
 
 MOST = 3
-"""Keyframes of a region that are found."""
+"""Most keyframes to return for a region."""
 
 
 @dataclass(frozen=True)
 class RegionView:
     """A keyframe that shows a region.
 
-    frame: index of the keyframe's frame in the capture.  box: x0, y0, x1, y1, pixels of its image around the voxels
-    that it shows, the last ones included.  visible: 0…1, share of the region's voxels that it shows.
+    frame: index of the keyframe's frame in the capture.  box: x0, y0, x1, y1, pixels of its image around the visible
+    voxels, with the last pixels included.  visible: 0…1, share of the region's voxels that it shows.
     """
 
     frame: int
@@ -33,11 +33,11 @@ class RegionView:
 def best_views(
     occupancy: Occupancy, trajectory: Trajectory, keyframes: Keyframes, regions: Sequence[Region], most: int = MOST
 ) -> list[list[RegionView]]:
-    """For each region, at most ``most`` keyframes that show a part of it: those that show most voxels, to a tenth
-    of what the best one shows, and of these the ones in whose images it is largest.
+    """Returns, for each region, up to ``most`` keyframes that show a part of it. Keyframes that show more voxels come
+    first. Counts within the same tenth of the best count are equal; then the larger box in the image comes first.
 
-    A keyframe shows a voxel whose center falls on a pixel with a depth that differs from the center's by no more than
-    the voxel's edge. Raises MapError for a broken keyframe.
+    A keyframe shows a voxel if the voxel's center falls on a pixel and the pixel's depth differs from the center's by
+    no more than the voxel's edge. Raises MapError for a broken keyframe.
     """
     voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
     centers = [occupancy.centers(voxels[region.rows], edges[region.rows]) for region in regions]
@@ -66,14 +66,14 @@ def best_views(
 
 
 def _box(pixels: NDArray[np.float64], half: NDArray[np.float64], width: int, height: int) -> tuple[int, int, int, int]:
-    """Pixels around (P, 2) voxels' centers that reach (P, 2) pixels to each side, within the image."""
+    """Returns the box of pixels around (P, 2) voxel centers, ``half`` (P, 2) pixels to each side, within the image."""
     x0, y0 = np.maximum(np.floor((pixels - half).min(axis=0) + 0.5), 0).astype(int).tolist()
     x1, y1 = np.minimum(np.floor((pixels + half).max(axis=0) + 0.5), (width - 1, height - 1)).astype(int).tolist()
     return x0, y0, x1, y1
 
 
 def _best(views: list[RegionView]) -> list[RegionView]:
-    """The views, best first."""
+    """Returns the views, best first."""
     most = max((view.visible for view in views), default=1.0)
 
     def worth(view: RegionView) -> tuple[float, int]:

@@ -1,4 +1,4 @@
-"""Asking by class: exactly the voxels of which a name of the map's vocabulary is the nearest one."""
+"""Asks by class: finds the voxels whose nearest name in the map's vocabulary is the class."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..core.types import Occupancy
 from ..language import word_matching
 from ..language.encoders.base import TextEncoder
 from ..settings.registry import nearest
-from .word_query import Options, QueryResult, found_regions, nearest_word, similarity
+from .word_query import Options, QueryResult, find_regions, nearest_word, similarity
 
 
 def query_classes(
@@ -23,17 +23,16 @@ def query_classes(
     options: Options | None = None,
     up: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 1.0),
 ) -> list[QueryResult]:
-    """The voxels of classes, in whose regions nothing is left out for its score or size.
+    """Returns the regions of classes. No voxel is left out for its score, and no region for its size.
 
-    vocabulary: names of which each voxel has the one that is nearest by plain cosine.  options: of these ``top_k`` and
-    ``narrow`` count.  A region's confidence is the mean softmax probability of the name against the
-    vocabulary's others.
-    Raises FreeOccError for a name that the vocabulary does not hold, naming the nearest.
+    vocabulary: the map's names; a voxel has the class of the nearest name by plain cosine.  options: only ``top_k`` and
+    ``narrow`` apply.  A region's confidence is the mean softmax probability of the name against the other names.
+    Raises FreeOccError for a name that the vocabulary does not hold; the message gives the nearest name.
     """
     number = {name.lower(): k for k, name in reversed(list(enumerate(vocabulary)))}
     for name in names:
         if not vocabulary:
-            raise FreeOccError("The map has no vocabulary of classes: ask for words.")
+            raise FreeOccError("The map has no vocabulary of classes: ask for words instead.")
         if name.lower() not in number:
             raise FreeOccError(f"The map has no class '{name}'{nearest(name.lower(), number)}: --classes lists them.")
     text = text_encoder.encode_words(list(vocabulary))
@@ -50,7 +49,7 @@ def query_classes(
         )
         scores = np.zeros(len(of_voxel), np.float32)
         scores[rows] = every[:, k]
-        regions = found_regions(occupancy, rows, scores[rows], confidence, -1.0, options, up, name)
+        regions = find_regions(occupancy, rows, scores[rows], confidence, -1.0, options, up, name)
         note = "" if regions else f"'{vocabulary[k]}' is the best class of no voxel in this map."
         results.append(QueryResult(name, vocabulary[k], note, regions, scores))
     return results

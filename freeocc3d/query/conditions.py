@@ -1,4 +1,5 @@
-"""Where regions have to be: in a box, near or on what another word finds. Imports little, to start fast."""
+"""Conditions on the place of regions: in a box, or near or on what another word finds. The module imports little, to
+start fast."""
 
 from __future__ import annotations
 
@@ -17,8 +18,8 @@ from .regions import Region
 from .word_query import QueryResult
 
 PICKS = ("largest", "highest", "lowest", "best")
-_ON_GAP = -0.5, 1.5  # voxels: a lattice that is not level rounds surfaces either way
-_LOWEST = 1.0  # voxels: what reaches so near to a region's lowest point is its underside
+_ON_GAP = -0.5, 1.5  # voxels: a tilted lattice rounds surfaces up or down
+_LOWEST = 1.0  # voxels above a region's lowest point that belong to its underside
 _OVERLAP = 1.0 - 1e-6
 
 _Condition = tuple[Callable[[Region], bool], str]
@@ -26,15 +27,16 @@ _Condition = tuple[Callable[[Region], bool], str]
 
 @dataclass(frozen=True)
 class Where:
-    """Conditions that regions have to meet, all of them.
+    """Conditions on regions. A region must meet all of them.
 
     within: x0, y0, z0, x1, y1, z1, map frame, meters: the centroid lies in this box.
-    near, near_m: between some voxel of the region and one that the word matches is a gap of at most near_m meters.
-    on: some voxel of the region's underside stands over one that the word matches: they overlap as seen from above, and
-    the vertical gap between them is at most 1.5 voxels (of the map's largest). The underside are the voxels that reach
-    no more than a voxel higher with their lower face than the lowest does.
-    pick: of those that are left only the "largest" (volume), "highest", "lowest" (centroid) or "best" (score).
-    Regions of ``near`` and ``on`` that share a voxel with a region are that region itself, and do not count.
+    near, near_m: the gap between some voxel of the region and some voxel that the word matches is no more than near_m
+    meters.
+    on: some voxel of the region's underside stands over a voxel that the word matches: they overlap as seen from above,
+    and the vertical gap is no more than 1.5 of the map's largest voxels. The underside holds the voxels whose lower
+    face is no more than one voxel above the region's lowest face.
+    pick: keeps only the "largest" (volume), "highest", "lowest" (centroid) or "best" (score) of the remaining regions.
+    A region that ``near`` or ``on`` finds does not count for a region that shares a voxel with it: they are the same.
     """
 
     within: tuple[float, float, float, float, float, float] | None = None
@@ -48,8 +50,8 @@ class Where:
             len(self.within) == 6 and np.isfinite(self.within).all() and np.less(self.within[:3], self.within[3:]).all()
         ):
             raise ConfigError(
-                "'within' has a lower and an upper corner, x0 y0 z0 x1 y1 z1 in meters, each of the first three less "
-                f"than its counterpart; got {' '.join(f'{value:g}' for value in self.within)}."
+                "'within' takes a lower and an upper corner, x0 y0 z0 x1 y1 z1 in meters, with x0 < x1, y0 < y1 and "
+                f"z0 < z1; got {' '.join(f'{value:g}' for value in self.within)}."
             )
         if not 0 <= self.near_m < np.inf:
             raise ConfigError(f"'near' takes a distance of 0 meters or more, got {self.near_m:g}.")
@@ -58,12 +60,12 @@ class Where:
 
     @property
     def words(self) -> list[str]:
-        """The words that have to be looked for besides those that are asked."""
+        """The words that the conditions need answers for, in addition to the words of the question."""
         return [word for word in (self.near, self.on) if word is not None]
 
 
 def near_word(text: str) -> tuple[str, float]:
-    """Word and meters of "WORD" or "WORD:METERS". Raises ConfigError."""
+    """Reads word and meters from "WORD" or "WORD:METERS". Raises ConfigError."""
     word, separator, distance = text.rpartition(":")
     if not separator:
         return text, Where.near_m
@@ -81,7 +83,7 @@ def only_where(
     where: Where,
     top_k: int,
 ) -> list[QueryResult]:
-    """The results with those regions that meet the conditions, at most ``top_k`` each.
+    """Returns the results with only the regions that meet the conditions, up to ``top_k`` for each.
 
     up: (3,) unit vector, map frame.  references: the answers to ``where.words``. Raises MapError for a box outside of
     the map.
@@ -100,7 +102,7 @@ def only_where(
             regions = [region for region in regions if kept(region)]
         if result.regions and not regions:
             count = f"{len(result.regions)} region{'s' if len(result.regions) > 1 else ''}"
-            note = f"Of {count} that '{result.understood}' matches none is {' and '.join(told)}."
+            note = f"'{result.understood}' matches {count}, but none is {' and '.join(told)}."
         narrowed.append(replace(result, regions=_picked(regions, where.pick, up)[:top_k], note=note))
     return narrowed
 
@@ -108,7 +110,7 @@ def only_where(
 def _conditions(
     there: _Space, where: Where, by_word: dict[str, QueryResult]
 ) -> list[tuple[Callable[[Region], bool], str]]:
-    """For each condition: whether a region meets it, and its words for a note."""
+    """Returns, for each condition, a test of a region and the words for a note."""
     conditions: list[tuple[Callable[[Region], bool], str]] = []
     if where.within is not None:
         low, high = np.array(where.within).reshape(2, 3)
@@ -133,7 +135,7 @@ def _absent(reference: QueryResult) -> str:
 
 
 def _picked(regions: list[Region], pick: str | None, up: NDArray[np.float64]) -> list[Region]:
-    """The region that is asked for, or all."""
+    """Returns the picked region alone, or all regions without a pick."""
     if pick is None or not regions:
         return regions
     values = {
@@ -146,18 +148,18 @@ def _picked(regions: list[Region], pick: str | None, up: NDArray[np.float64]) ->
 
 
 class _Space:
-    """The occupied voxels, seen as solid cubes."""
+    """The occupied voxels as solid cubes."""
 
     def __init__(self, occupancy: Occupancy, up: NDArray[np.float64]):
         self.occupancy = occupancy
         self.voxels, self.edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
-        first = np.eye(3)[np.argmin(np.abs(up))]  # the axis of the lattice that is most nearly level
+        first = np.eye(3)[np.argmin(np.abs(up))]  # the most nearly level axis of the lattice
         first = first - (first @ up) * up
         first /= np.linalg.norm(first)
         self.R_level_map = np.stack((first, np.cross(up, first), up))
 
     def refuse_outside(self, within: Sequence[float]) -> None:
-        """Raises MapError unless the box has a part in common with the one around all occupied voxels."""
+        """Raises MapError if the box does not overlap the box around all occupied voxels."""
         if not len(self.voxels):
             return
         size, origin = self.occupancy.finest, self.occupancy.origin
@@ -165,18 +167,18 @@ class _Space:
         high = origin + (self.voxels + self.edges[:, None]).max(axis=0) * size
         if (np.array(within[:3]) > high).any() or (np.array(within[3:]) < low).any():
             spans = f"{' '.join(f'{v:.2f}' for v in low)} to {' '.join(f'{v:.2f}' for v in high)}"
-            raise MapError(f"The box lies outside of the map, which reaches from {spans} m.")
+            raise MapError(f"The box of 'within' lies outside of the map, which reaches from {spans} m.")
 
     def near(self, region: Region, references: _References, distance: float) -> bool:
-        """Whether the gap between any two voxels is at most so many meters."""
-        # The nearest points of two cubes of a lattice are found among the lattice's points in both.
+        """Whether the gap between some voxel of each is no more than ``distance`` meters."""
+        # For two cubes of a lattice, some pair of their lattice points is as near as the cubes are.
         reach = distance / self.occupancy.finest * (1 + 1e-9) + 1e-9
         tree = references.tree(references.shared(region))
         gaps = tree.query(self.lattice_points(region.rows), distance_upper_bound=reach)[0]
         return bool(np.isfinite(gaps).any())
 
     def on(self, region: Region, references: _References) -> bool:
-        """Whether any voxel of the underside stands over a voxel of the others; see ``Where``."""
+        """Whether some voxel of the underside stands over a voxel of the references; see ``Where``."""
         size = self.occupancy.voxel_size
         mine, edges = self._level(region.rows)
         bottom = mine[:, 2] - edges / 2
@@ -186,7 +188,7 @@ class _Space:
         for edge in np.unique(edges[under]):
             for their_edge in np.unique(their_edges):
                 reach = (edge + their_edge) / 2
-                scale = 1.0, 1.0, reach / half  # so that all three conditions are one distance
+                scale = 1.0, 1.0, reach / half  # makes one distance of all three conditions
                 above = (mine[under & (edges == edge)] - (0.0, 0.0, reach + middle)) * scale
                 below = theirs[their_edges == their_edge] * scale
                 below = below[((below > above.min(axis=0) - reach) & (below < above.max(axis=0) + reach)).all(axis=1)]
@@ -197,7 +199,7 @@ class _Space:
 
     @functools.cached_property
     def _every_level(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(V, 3) centers in a frame with z up, and (V,) edges, meters."""
+        """Returns (V, 3) centers in a frame with z up, and (V,) edges, meters."""
         centers = self.occupancy.centers(self.voxels, self.edges)
         return centers @ self.R_level_map.T, np.asarray(self.edges * self.occupancy.finest, np.float64)
 
@@ -206,7 +208,7 @@ class _Space:
         return centers[rows], edges[rows]
 
     def lattice_points(self, rows: NDArray[np.int64]) -> NDArray[np.int32]:
-        """(P, 3) distinct points of the finest lattice in and on voxels."""
+        """Returns the (P, 3) distinct points of the finest lattice in and on voxels."""
         points = [np.zeros((0, 3), np.int32)]
         for edge in np.unique(self.edges[rows]).tolist():
             steps = np.indices((edge + 1,) * 3, np.int32).reshape(3, -1).T
@@ -217,23 +219,23 @@ class _Space:
 
 
 class _References:
-    """The regions of a word that others are compared with."""
+    """The regions of a word that a condition names."""
 
     def __init__(self, there: _Space, regions: Sequence[Region]):
         self._regions = regions
         self._owner = np.full(len(there.voxels), -1, np.int64)
         for number, region in enumerate(regions):
             self._owner[region.rows] = number
-        self.apart = functools.lru_cache(maxsize=2)(self._rows_apart)
+        self.apart = functools.lru_cache(maxsize=2)(self._rows_of_others)
         self.tree = functools.lru_cache(maxsize=2)(lambda shared: _tree(there.lattice_points(self.apart(shared))))
 
     def shared(self, region: Region) -> tuple[int, ...]:
-        """Numbers of those that share a voxel with the region, mostly none."""
+        """Returns the numbers of the references that share a voxel with the region; mostly there are none."""
         own = np.unique(self._owner[region.rows])
         return tuple(own[own >= 0].tolist())
 
-    def _rows_apart(self, shared: tuple[int, ...]) -> NDArray[np.int64]:
-        """Rows of the voxels of all others."""
+    def _rows_of_others(self, shared: tuple[int, ...]) -> NDArray[np.int64]:
+        """Returns the rows of the voxels of all other references."""
         others = (region.rows for number, region in enumerate(self._regions) if number not in shared)
         return np.concatenate([np.zeros(0, np.int64), *others])
 

@@ -1,4 +1,4 @@
-"""Asking by picture: where the map looks like a part of an image. Imports little, to start fast."""
+"""Asks by picture: finds where the map looks like a part of an image. The module imports little, to start fast."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from ..core.errors import FreeOccError
 from ..core.types import Frame, Intrinsics, Occupancy
 from ..language.feature_codec import Features, compute_cosines, mask_known
 from ..storage.saved_map import SavedMap
-from .word_query import Options, QueryResult, found_regions
+from .word_query import Options, QueryResult, find_regions
 
 if TYPE_CHECKING:
     from ..language.encoders.base import Encoder
 
 _ALIKE = 0.5
-"""Cosine, to the mean of the map, from which something is as a picture shows it."""
+"""Least cosine of a match, with the map's mean subtracted from both features."""
 
 Box = tuple[int, int, int, int]
 
 
 def picture_encoder(scan_map: SavedMap) -> Encoder:
-    """The encoder of a map, to look at a picture.
+    """Returns the map's encoder, to encode a picture.
 
-    Raises FreeOccError for one that takes more than a picture, or that cannot be loaded again.
+    Raises FreeOccError if the encoder needs more than a picture, or cannot be loaded again.
     """
     if scan_map.encoder_needs_capture:
         raise FreeOccError(
             f"The map's encoder '{scan_map.manifest.encoder.name}' reads more of the capture than its pictures, so it "
-            "cannot look at a picture: ask for words."
+            "cannot encode a single picture: ask for words instead."
         )
     return scan_map.encoder
 
@@ -40,10 +40,10 @@ def picture_encoder(scan_map: SavedMap) -> Encoder:
 def patch_feature(
     encoder: Encoder, image: str | Path | NDArray[np.uint8], box: Box | None = None
 ) -> NDArray[np.float32]:
-    """(D,) unit mean of an encoder's features over a part of an image, each as sure as the encoder is of it.
+    """Returns the (D,) unit mean of an encoder's features over a part of an image, weighted by the encoder's certainty.
 
-    image: a file, or (H, W, 3) uint8 RGB.  box: x0, y0, x1, y1, pixels, the last ones included; the whole image by
-    default. The encoder sees the whole image. Raises FreeOccError: not an image, a box outside of it, nothing to say.
+    image: a file, or (H, W, 3) uint8 RGB.  box: x0, y0, x1, y1, pixels, with the last ones included; the whole image by
+    default. The encoder sees the whole image. Raises FreeOccError: not an image, a box outside of it, no features.
     """
     rgb = image if isinstance(image, np.ndarray) else _read(Path(image))
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or not rgb.size:
@@ -52,7 +52,7 @@ def patch_feature(
     x0, y0, x1, y1 = box or (0, 0, width - 1, height - 1)
     if not (0 <= x0 <= x1 < width and 0 <= y0 <= y1 < height):
         raise FreeOccError(
-            f"The box {x0} {y0} {x1} {y1} does not lie in the picture, whose pixels go from 0 0 to {width - 1} "
+            f"The box {x0} {y0} {x1} {y1} does not lie in the picture. Its pixels go from 0 0 to {width - 1} "
             f"{height - 1}: give x0 y0 x1 y1 with x0 <= x1 and y0 <= y1."
         )
     camera = Intrinsics(width, height, float(width), float(width), (width - 1) / 2, (height - 1) / 2)
@@ -62,7 +62,7 @@ def patch_feature(
     mean = inside.reshape(-1, features.shape[2]).sum(axis=0)
     length = float(np.linalg.norm(mean))
     if not np.isfinite(length) or length == 0:
-        raise FreeOccError("The map's encoder has nothing to say of this part of the picture: choose another.")
+        raise FreeOccError("The map's encoder finds no feature in this part of the picture: choose another part.")
     return np.asarray(mean / length, np.float32)
 
 
@@ -73,25 +73,26 @@ def query_feature(
     options: Options | None = None,
     up: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 1.0),
 ) -> QueryResult:
-    """Where the map's features are as a given one, (D,) of unit length.
+    """Finds where the map's features are like a given feature, (D,) of unit length.
 
-    A voxel's score is the cosine of what sets both apart from the map's mean feature, m: (f - m)^T (q - m) over the
-    lengths, for features of images have much in common with each other, whatever they show. There are no contrast
-    words: a region's confidence is the mean score of its voxels. Raises FreeOccError for a length of another encoder.
+    A voxel's score is the cosine after the map's mean feature m is subtracted from both features: (f - m)^T (q - m)
+    over the lengths. The reason is that features of images are much alike, whatever the images show. There are no
+    contrast words: a region's confidence is the mean score of its voxels. Raises FreeOccError if the feature's length
+    is that of another encoder.
     """
     options = options or Options()
     if options.scores != "cosine":
-        raise FreeOccError("A picture is compared by cosines: leave --scores to words.")
+        raise FreeOccError("A picture is compared by cosines: use --scores with words only.")
     features = occupancy.features
     if len(features) and features.shape[1] != len(feature):
         raise FreeOccError(
-            f"The map's features have {features.shape[1]} dimensions, those of pictures {len(feature)}: make the map "
-            "again with this version."
+            f"The map's features have {features.shape[1]} dimensions, those of pictures {len(feature)}: reconstruct "
+            "the map with this version."
         )
     scores = _apart_from_mean(features, feature)
     threshold = _ALIKE if options.threshold is None else options.threshold
     rows = np.flatnonzero(scores >= min(options.grow * threshold, threshold)) if len(scores) else np.zeros(0, np.int64)
-    regions = found_regions(occupancy, rows, scores[rows], scores[rows], threshold, options, up, name)
+    regions = find_regions(occupancy, rows, scores[rows], scores[rows], threshold, options, up, name)
     note = ""
     if not len(scores):
         note = "The map has no occupied voxels."
@@ -101,7 +102,7 @@ def query_feature(
 
 
 def _apart_from_mean(features: Features, feature: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(V,) cosines of unit features and one, all less their mean; 0 where nothing is known."""
+    """Returns the (V,) cosines of unit features and one feature, with the mean subtracted; 0 where nothing is known."""
     says = mask_known(features)
     if not says.any():
         return np.zeros(len(features), np.float32)
@@ -115,7 +116,7 @@ def _apart_from_mean(features: Features, feature: NDArray[np.float32]) -> NDArra
 
 
 def _mean(features: Features, says: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """(D,) mean of the features of which something is known."""
+    """Returns the (D,) mean of the known features."""
     total, at_once = np.zeros(features.shape[1]), 1 << 14
     for start in range(0, len(features), at_once):
         total += np.asarray(features[start : start + at_once]).astype(np.float32).sum(axis=0)
@@ -131,5 +132,5 @@ def _read(path: Path) -> NDArray[np.uint8]:
         raise FreeOccError(f"Cannot read the picture {path}: {error.strerror}.") from error
     image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if image is None:
-        raise FreeOccError(f"{path} is not a picture that can be read: give a PNG or JPEG file.")
+        raise FreeOccError(f"{path} is not a readable picture: give a PNG or JPEG file.")
     return np.asarray(image[..., ::-1])

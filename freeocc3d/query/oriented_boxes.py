@@ -1,4 +1,4 @@
-"""Where regions are: boxes that are turned as the things are. Imports little, to start fast."""
+"""Oriented bounding boxes of regions. The module imports little, to start fast."""
 
 from __future__ import annotations
 
@@ -13,15 +13,18 @@ from ..core.types import Occupancy
 from .regions import Region
 
 _CORNERS = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1)
-_SAME_AREA, _SAME_EDGE = 1.0 + 1e-6, 1.0 + 1e-3  # a lattice that is hardly tilted makes no square longer one way
+_SAME_AREA, _SAME_EDGE = (
+    1.0 + 1e-6,
+    1.0 + 1e-3,
+)  # rounding in a slightly tilted lattice must not make a square longer one way
 
 
 @dataclass(frozen=True)
 class OrientedBox:
-    """An upright box: its z points up, its x along its longer level edge.
+    """An upright oriented bounding box: its z points up, its x along its longer level edge.
 
     extent: (3,) meters along its own x, y, z.  yaw: radians in (-pi/2, pi/2], from the gravity frame's x to the box's.
-    T_map_box: (4, 4) rigid, from the box's frame, whose origin is the box's center, to the map's.
+    T_map_box: (4, 4) rigid, from the box's frame to the map's; the box's center is its origin.
     """
 
     extent: NDArray[np.float64]
@@ -32,7 +35,7 @@ class OrientedBox:
 def oriented_boxes(
     occupancy: Occupancy, regions: Sequence[Region], T_gravity_map: NDArray[np.float64]
 ) -> list[OrientedBox]:
-    """The upright box of least level area around each region's voxels, faces included.
+    """Returns the upright box with the least level area around each region's voxels, faces included.
 
     T_gravity_map: (4, 4) rigid, to a frame with z up.
     """
@@ -46,11 +49,10 @@ def oriented_boxes(
 
 
 def _box_around(corners: NDArray[np.float64], T_gravity_map: NDArray[np.float64]) -> OrientedBox:
-    """The box around (N, 3) points in the gravity frame.
+    """Returns the box around (N, 3) points in the gravity frame.
 
-    The least rectangle around a convex outline has a side along one
-    of the outline's. Source: H. Freeman, R. Shapira, Determining the Minimum-Area Encasing Rectangle for an Arbitrary
-    Closed Curve, CACM 1975.
+    The least rectangle around a convex outline has a side along a side of the outline. Source: H. Freeman, R. Shapira,
+    Determining the Minimum-Area Encasing Rectangle for an Arbitrary Closed Curve, CACM 1975.
     """
     from scipy.spatial import ConvexHull
 
@@ -63,7 +65,7 @@ def _box_around(corners: NDArray[np.float64], T_gravity_map: NDArray[np.float64]
     across = np.stack((-np.sin(turns), np.cos(turns)), axis=1) @ outline.T
     area = np.ptp(along, axis=1) * np.ptp(across, axis=1)
     least = np.flatnonzero(area <= area.min() * _SAME_AREA)
-    best = least[np.argmin(np.abs(turns[least]))]  # of equal ones the one that is turned least
+    best = least[np.argmin(np.abs(turns[least]))]  # of equal boxes, the one turned least
     spans = np.array([(line.min(), line.max()) for line in (along[best], across[best])])
     yaw, extent, middle = float(turns[best]), np.ptp(spans, axis=1), spans.mean(axis=1)
     center = middle @ np.array(((np.cos(yaw), np.sin(yaw)), (-np.sin(yaw), np.cos(yaw))))

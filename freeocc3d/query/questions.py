@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of a map, in any combination.
+    """A question to a map; all parts may be combined.
 
     words: words or phrases.  negative: words for what these do not mean.  classes: names of the map's vocabulary.
-    image: a picture, and image_box: x0, y0, x1, y1, its pixels that count, the last included.
+    image: a picture.  image_box: x0, y0, x1, y1, the pixels of the picture that count, with the last included.
     where: conditions on the places of regions.  options: fields of ``word_query.Options``.
     """
 
@@ -33,8 +33,8 @@ class Question:
 
 
 def ask(scan_map: Map, question: Question) -> list[QueryResult]:
-    """One answer for each word, then for each class, then for the picture. Raises FreeOccError, as the map's ``query``
-    methods do."""
+    """Returns one answer for each word, then for each class, then for the picture. Raises FreeOccError as the map's
+    ``query`` methods do."""
     about: dict[str, Any] = {"where": question.where, **question.options}
     results: list[QueryResult] = []
     if question.words:

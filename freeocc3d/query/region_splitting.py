@@ -1,14 +1,13 @@
-"""Things that touch, told apart: a region is cut where it narrows, seen from above, to a voxel or two.
+"""Separates things that touch: cuts a region where it narrows, seen from above, to a voxel or two.
 
-What stands on a floor stands beside other things, and voxels that are too coarse to show a gap join them by a neck. A
-region's footprint has at each cell the distance to its rim, times how well the word fits there. Two maxima belong to
-two things if every way from one to the other goes through a neck, lower than a share of the lower one. In a convex
-footprint the distance to the rim is a concave function, so that it has one maximum, and no such thing is ever cut; nor
-are legs and other thin ends, for they get nowhere wider than they are where they begin.
+Coarse voxels close the gap between things that stand next to each other, and join them by a neck. Each cell of a
+region's footprint has a height: the distance to the rim, times how well the word fits there. Two maxima belong to two
+things if every path between them passes a neck that is lower than a share of the lower maximum. In a convex footprint
+the distance to the rim is concave and has one maximum, so a convex thing is never cut. Legs and other thin ends are not
+cut either, because nowhere are they wider than at their start.
 
-Source of the rule: persistence-based clustering, F. Chazal et al., Persistence-Based Clustering in Riemannian
-Manifolds, J. ACM 2013; of distances as what is cut: S. Beucher, C. Lantuéjoul, Use of Watersheds in Contour Detection,
-1979.
+Sources: the rule is persistence-based clustering, F. Chazal et al., Persistence-Based Clustering in Riemannian
+Manifolds, J. ACM 2013; distances as heights: S. Beucher, C. Lantuéjoul, Use of Watersheds in Contour Detection, 1979.
 """
 
 from __future__ import annotations
@@ -21,21 +20,22 @@ from numpy.typing import NDArray
 from ..core.types import Occupancy
 
 _WIDE = 2.0
-"""Cells that a thing reaches to either side of its middle at least, by which it is told from ragged rims."""
+"""Least number of cells from a thing's middle to its sides; ragged rims have less."""
 _NECK = 1.5
-"""Cells that a neck reaches to either side at most: a door between two rooms is none."""
+"""Greatest number of cells from a neck's middle to its sides: a door between two rooms is not a neck."""
 _STEP = 2**0.125
-"""From one level to the next lower one: that much of a ratio may be missed."""
+"""Ratio of one level to the next lower one: the error of a neck's height."""
 _SMALL_HOLE = 0.25
-"""Of a footprint: what stands on a table hides a part of it; the inside of a room is none of its walls."""
-_LEAST_VOXELS = 40  # two things that are wide enough
+"""Share of a footprint up to which holes are filled: things on a table hide a part of it, but the inside of a room does
+not belong to its walls."""
+_LEAST_VOXELS = 40  # enough for two things of the least width
 _LEAST_SCORE = 1e-3
-_MOST_CELLS = 1 << 24  # of a footprint; a region that spreads farther stays whole
+_MOST_CELLS = 1 << 24  # of a footprint; a larger region stays whole
 _TOUCHING = np.ones((3, 3), int)
 _QUARTERS = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) / 2 - 0.25
 
 
-def told_apart(
+def cut_necks(
     occupancy: Occupancy,
     rows: NDArray[np.int64],
     component: NDArray[np.int32],
@@ -43,10 +43,10 @@ def told_apart(
     up: NDArray[np.float64],
     narrow: float,
 ) -> NDArray[np.int32]:
-    """(n,) numbers of parts of the components, of voxels given by (n,) rows.
+    """Returns the (n,) part number of each voxel, after components are cut at their necks.
 
-    scores: (n,) of the word.  up: (3,) unit vector, map frame.  narrow: a neck's share of the width of the
-    narrower of the things beside it, at most; 0 cuts nothing.
+    rows: (n,) rows of occupied voxels.  component: (n,) their components.  scores: (n,) of the word.  up: (3,) unit
+    vector, map frame.  narrow: greatest width of a neck, as a share of the narrower thing's width; 0 cuts nothing.
     """
     part = component.astype(np.int32)
     large = np.flatnonzero(np.bincount(component) >= _LEAST_VOXELS) if narrow > 0 and len(component) else ()
@@ -54,7 +54,7 @@ def told_apart(
     for c in large:
         own = np.flatnonzero(component == c)
         cell, footprint = _footprint(occupancy, rows[own], np.maximum(scores[own], _LEAST_SCORE), up)
-        things = None if footprint is None else parts_of(footprint, narrow)
+        things = None if footprint is None else split_footprint(footprint, narrow)
         if things is not None:
             part[own] = number + things[tuple(cell.T)]
             number += int(things.max()) + 1
@@ -64,17 +64,17 @@ def told_apart(
 def _footprint(
     occupancy: Occupancy, rows: NDArray[np.int64], scores: NDArray[np.float32], up: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32] | None]:
-    """(n, 2) cell of each voxel seen from above, and (X, Y) best score in each cell, 0 outside, None for too many
-    cells. A cell is as large as the largest of the voxels."""
-    order = np.argsort(scores, kind="stable")  # of what falls into one cell the last is kept
+    """Returns the (n, 2) cell of each voxel seen from above, and the (X, Y) best score in each cell: 0 outside, None
+    for too many cells. A cell is as large as the largest voxel."""
+    order = np.argsort(scores, kind="stable")  # in each cell the last score, the best, stays
     edges = occupancy.occupied_edges()[rows[order]]
-    first = np.eye(3)[np.argmin(np.abs(up))]  # the axis of the lattice that is most nearly level
+    first = np.eye(3)[np.argmin(np.abs(up))]  # the most nearly level axis of the lattice
     first = first - (first @ up) * up
     first /= np.linalg.norm(first)
     level = np.stack((first, np.cross(up, first)), axis=1) / edges.max()
     middle = (occupancy.occupied_voxels()[rows[order]] + 0.5 * edges[:, None]) @ level
-    middle += 0.5 - middle[0] + 1e-6  # a level lattice's centers come to lie in the cells' middles
-    offsets = np.unique((_QUARTERS @ level).round(2), axis=0)  # half of them where the lattice is about level
+    middle += 0.5 - middle[0] + 1e-6  # puts a level lattice's centers in the middles of the cells
+    offsets = np.unique((_QUARTERS @ level).round(2), axis=0)  # half as many for a nearly level lattice
     low = np.floor(middle.min(axis=0) - 1)
     shape = (np.floor(middle.max(axis=0) + 1) - low + 1).astype(np.int64)
     cells = np.empty((len(rows), 2), np.int64)
@@ -89,26 +89,26 @@ def _footprint(
     return cells, footprint
 
 
-def parts_of(footprint: NDArray[np.float32], narrow: float) -> NDArray[np.int32] | None:
-    """(X, Y) number of the thing that each cell of a footprint belongs to, or the nearest; None for a single one.
+def split_footprint(footprint: NDArray[np.float32], narrow: float) -> NDArray[np.int32] | None:
+    """Returns the (X, Y) number of each cell's thing, or of the nearest thing; None if there is only one thing.
 
-    footprint: (X, Y) scores, positive in the region, 0 outside; holes that are small beside it count as filled.
+    footprint: (X, Y) scores, positive in the region, 0 outside; small holes count as filled.
     """
     height = _height(footprint)
     if height.max() < _WIDE:
         return None
     from scipy import ndimage
 
-    # what a neck separates lies apart already where everything is higher than a neck
+    # cells above the height of a neck already form separate basins on either side of each neck
     basin = ndimage.label(height > _NECK, _TOUCHING)[0].ravel()
     above = np.flatnonzero(basin)
     above = above[np.argsort(height.flat[above], kind="stable")]
     top = np.zeros(basin.max() + 1, np.int64)
-    top[basin[above]] = above  # of each basin the last is kept, which is its highest cell
+    top[basin[above]] = above  # the last cell of each basin, its highest, stays
     peaks = top[1:][height.flat[top[1:]] >= _WIDE]
     if len(peaks) < 2:
         return None
-    owner = np.full(height.size, -1)  # the peak around which a cell lies, if none shares its basin
+    owner = np.full(height.size, -1)  # each cell's peak, if it is the only peak of its basin
     lowest = narrow * float(height.flat[peaks].min())
     levels = _NECK * _STEP ** -np.arange(max(np.ceil(np.log(_NECK / lowest) / np.log(_STEP)), 0))
     for level in (np.nextafter(_NECK, np.inf), *levels, min(lowest, _NECK)):
@@ -128,13 +128,13 @@ def parts_of(footprint: NDArray[np.float32], narrow: float) -> NDArray[np.int32]
 
 
 def _height(footprint: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(X, Y) half of a width, in cells, times the score over the best."""
+    """Returns the (X, Y) heights: distance to the rim in cells, times score / best score."""
     from scipy import ndimage
 
     seen = footprint > 0
     hole, _ = ndimage.label(ndimage.binary_fill_holes(seen) & ~seen)
     small = np.bincount(hole.ravel()) <= _SMALL_HOLE * np.count_nonzero(seen)
-    small[0] = False  # what is no hole
+    small[0] = False  # label 0 is no hole
     solid = seen | small[hole]
     fits = np.where(seen, footprint / footprint.max(), 1.0)
     to_rim = ndimage.distance_transform_edt(np.pad(solid, 1))[1:-1, 1:-1]
@@ -144,7 +144,7 @@ def _height(footprint: NDArray[np.float32]) -> NDArray[np.float64]:
 def _persistent(
     peaks: NDArray[np.int64], basin: NDArray[np.int32], height: NDArray[np.float64], level: float, narrow: float
 ) -> NDArray[np.int64]:
-    """The peaks that are still things of their own at a level: the highest of their basin, or high above it."""
+    """Returns the peaks that stay separate things at a level: the highest of their basin, or high above the level."""
     peaks = peaks[np.argsort(-height[peaks], kind="stable")]
     first = np.unique(basin[peaks], return_index=True)[1]
     kept = level <= np.minimum(narrow * height[peaks], _NECK)

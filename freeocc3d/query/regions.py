@@ -1,4 +1,4 @@
-"""Regions: matching voxels that hang together, with what is said of them. Imports little, to start fast."""
+"""Regions: connected matching voxels, with their scores and places. The module imports little, to start fast."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from numpy.typing import NDArray
 from ..core.types import Occupancy
 
 _PATCH, _FEW = 4, 50
-"""Voxels of the least patch of a surface, two by two; of how much larger a share what is smaller has to be."""
+"""Voxels of the smallest patch of a surface, two by two; a smaller region needs a share this much larger."""
 _BESIDE_M = 0.5
 _MOST_COMPARED = 4_000_000
 _DOUBT_M3 = 0.001
-"""Volume of non-matching matter that is added to each region when it is scored: a speck of a voxel or two does not
-outrank a large object, and the size of the voxels has no part in it."""
+"""Non-matching volume that the score adds to each region. So a speck of a voxel or two does not outrank a large object,
+whatever the voxel size."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A connected set of matching voxels, or one of the things that it holds.
+    """A connected set of matching voxels, or one of the things in it.
 
-    score: 0…1, by which regions are ranked: the mean score of its voxels times V / (V + 1 liter), V being its volume,
-    as if a liter that does not match belonged to it. A voxel's is its cosine with the word over the one that a perfect
-    example reaches, so that 1 is a large thing all of whose voxels say the word and no other. It says how well the word
-    fits, and compares within an encoder.
-    confidence: 0…1, how probable the word is beside what else the voxels could be: the mean, by volume, of their
-    softmax probabilities of the word against the contrast words, at the encoder's temperature (for a picture, which has
-    no contrast words, the mean score). A region may fit badly (low score) and still be nothing else (high confidence).
+    score: 0…1, ranks the regions and says how well the word fits. It is the mean score of the voxels times V / (V + 1
+    liter) for a volume V, as if the region had one more liter that does not match. A voxel's score is its cosine with
+    the word over the cosine of a perfect example. So 1 is a large thing with perfect voxels only. Scores compare within
+    one encoder.
+    confidence: 0…1, how probable the word is against the other things that the voxels could be. It is the mean, by
+    volume, of the voxels' softmax probabilities against the contrast words, at the encoder's temperature. A picture has
+    no contrast words: its confidence is the mean score. A region may fit badly (low score) and still be nothing else
+    (high confidence).
     centroid: (3,) mean of the voxels' centers, map frame, meters.
     box_min, box_max: (3,) corners of the axis-aligned box around the voxels, faces included, meters.  rows: (n,) rows
-    of ``Occupancy.occupied_voxels()``.  label: the word that it was found by.
+    of ``Occupancy.occupied_voxels()``.  label: the word that found it.
     """
 
     score: float
@@ -60,12 +61,12 @@ def best_regions(
     top_k: int,
     label: str = "",
 ) -> list[Region]:
-    """The at most ``top_k`` best regions, best first, among matching voxels.
+    """Returns up to ``top_k`` regions of the matching voxels, best first.
 
-    rows: (n,) rows of occupied voxels, component: (n,) the region of each, of numbers that need not be successive,
-    scores, confidence: (n,). Regions of fewer than ``min_voxels`` voxels are left out, unless all are, those of less
-    than ``min_share`` of the largest one's volume, and, of what is no patch of a surface, those of less than 50 times
-    this share of the volume of a region nearby.
+    rows: (n,) rows of occupied voxels.  component: (n,) region numbers, which may have gaps.  scores, confidence: (n,).
+    The result leaves out regions of fewer than ``min_voxels`` voxels, unless all are so small. It leaves out regions of
+    less than ``min_share`` of the largest region's volume. Of regions smaller than a patch of a surface, it leaves out
+    those of less than 50 times this share of the volume of a region nearby.
     """
     if len(rows) == 0:
         return []
@@ -113,8 +114,8 @@ def _specks(
     volume: NDArray[np.number],
     share: float,
 ) -> NDArray[np.int64]:
-    """Regions of a few voxels whose box lies within half a meter of that of a region which they are less than ``share``
-    of: a chair's feet are no chairs, and a cup in the middle of a room is no part of the carpet."""
+    """Returns the regions of a few voxels that have less than ``share`` of the volume of a region within half a meter,
+    from box to box: a chair's feet are no chairs, and a cup in the middle of a room is no part of the carpet."""
     few, things = np.flatnonzero((size > 0) & (size < _PATCH)), np.flatnonzero(size >= _PATCH)
     if not len(few) or not len(things):
         return few[:0]

@@ -1,6 +1,7 @@
-"""A map that answers: words, classes, pictures, and where the regions are that it finds. Imports little, to start fast.
+"""A map that answers questions: words, classes and pictures, and the places of the regions. The module imports little,
+to start fast.
 
-Lengths are meters and coordinates the map's frame throughout, unless ``SavedMap.metric`` says otherwise.
+All lengths are meters, unless ``SavedMap.metric`` says otherwise. All coordinates are in the map's frame.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ if TYPE_CHECKING:
 
 
 class Map(SavedMap):
-    """A saved map. ``query("red cup")`` asks it; its parts are properties that are read when first used."""
+    """A saved map. ``query("red cup")`` asks it. Its parts are properties, which it reads at first use."""
 
     def query(self, word: str, **options: Any) -> QueryResult:
-        """Where ``word`` is: regions with score, box, centroid and volume. ``options``: fields of
+        """Finds ``word``: returns regions with score, box, centroid and volume. ``options``: fields of
         ``query.word_query.Options``."""
         return self.query_words([word], **options)[0]
 
@@ -41,13 +42,14 @@ class Map(SavedMap):
         where: Where | None = None,
         **options: Any,
     ) -> list[QueryResult]:
-        """``query`` for several words. contrast: words for what else is there, besides the encoder's own.  negative:
-        words for what is not meant.  where: conditions on the regions' places; see ``query.conditions.Where``."""
+        """``query`` for several words. contrast: words for other things in the scan, added to the encoder's own.
+        negative: words for what is not meant.  where: conditions on the places of regions; see
+        ``query.conditions.Where``."""
         return self._placed(lambda asked: self._words(words, asked, contrast, negative), where, options)
 
     def query_classes(self, names: list[str], where: Where | None = None, **options: Any) -> list[QueryResult]:
-        """The voxels whose nearest name of ``vocabulary`` is each of these; see ``query.class_query``. Of the options
-        ``top_k`` and ``narrow`` count."""
+        """Finds the voxels whose nearest name in ``vocabulary`` is each of these; see ``query.class_query``. Of the
+        options, only ``top_k`` and ``narrow`` apply."""
         from .class_query import query_classes
 
         ask = functools.partial(query_classes, self.occupancy, self.text_encoder, self.vocabulary, names, up=self.up)
@@ -60,8 +62,8 @@ class Map(SavedMap):
         where: Where | None = None,
         **options: Any,
     ) -> QueryResult:
-        """Where it looks as in a picture, a file or (H, W, 3) RGB, or in a box x0 y0 x1 y1 of its pixels; see
-        ``query.image_query``."""
+        """Finds where the map looks like a picture, a file or (H, W, 3) RGB, or like a box x0 y0 x1 y1 of its pixels;
+        see ``query.image_query``."""
         from . import image_query
 
         feature = image_query.patch_feature(image_query.picture_encoder(self), image, box)
@@ -72,11 +74,11 @@ class Map(SavedMap):
         return found[0]
 
     def labels(self) -> NDArray[np.uint8]:
-        """(V,) class of each occupied voxel: 0 = nothing known, k = ``vocabulary[k - 1]``."""
+        """Returns the (V,) class of each occupied voxel: 0 = nothing known, k = ``vocabulary[k - 1]``."""
         return self._class_labels
 
     def box_of(self, region: Region) -> OrientedBox:
-        """The upright box of least level area around a region, turned as the region is."""
+        """Returns the oriented bounding box of a region: upright, with the least level area."""
         return self.boxes_of([region])[0]
 
     def boxes_of(self, regions: Sequence[Region]) -> list[OrientedBox]:
@@ -88,7 +90,7 @@ class Map(SavedMap):
         return oriented_boxes(self.occupancy, regions, self.T_gravity_map)
 
     def views_of(self, region: Region) -> list[RegionView]:
-        """The up to three keyframes that show a region best, with the pixel box in each; see ``query.best_views``."""
+        """Returns up to three keyframes that show a region best, with a pixel box in each; see ``query.best_views``."""
         return self.views_of_each([region])[0]
 
     def views_of_each(self, regions: Sequence[Region]) -> list[list[RegionView]]:
@@ -100,8 +102,8 @@ class Map(SavedMap):
         return best_views(self.occupancy, self.trajectory, self.keyframes, regions)
 
     def stand_of(self, region: Region) -> NDArray[np.float64] | None:
-        """(3,) the nearest place on the floor, map frame, where a robot could stand and see a region; see
-        ``query.standing_places``. None where there is none, or where lengths are not meters, for a robot has a size."""
+        """Returns the (3,) nearest place on the floor, map frame, where a robot can stand and see a region; see
+        ``query.standing_places``. None if there is no such place, or if lengths are not meters: a robot has a size."""
         return self.stands_of([region])[0]
 
     def stands_of(self, regions: Sequence[Region]) -> list[NDArray[np.float64] | None]:
@@ -127,7 +129,7 @@ class Map(SavedMap):
     def _placed(
         self, ask: Callable[[Options], list[QueryResult]], where: Where | None, options: dict[str, Any]
     ) -> list[QueryResult]:
-        """What a question finds, in the places that are asked for."""
+        """Returns the results with only the regions that meet the conditions."""
         checked = typed_options.build(word_query.Options, options)
         if where is None:
             return ask(checked)
@@ -139,8 +141,8 @@ class Map(SavedMap):
 
 
 def load_map(path: str | Path) -> Map:
-    """Open a map folder: the manifest is read, and every file that it lists must be there and have its size.
+    """Opens a map folder: reads the manifest, and checks that every listed file exists and has its size.
 
-    Raises MapError: no such folder, not a map, from a newer version, a missing or damaged file.
+    Raises MapError: no such folder, not a map, a map of a newer version, a missing or damaged file.
     """
     return Map.open(path)

@@ -1,4 +1,4 @@
-"""Where a robot could stand on the floor and see a region."""
+"""Finds places where a robot can stand on the floor and see a region."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ..occupancy.resampling import resample_occupancy
 from .regions import Region
 
 _MOST_CELLS = 1 << 29
-_DRIVEN_OVER = 0.1  # meters above the floor up to which nothing is an obstacle
-_MIN_FREE = 0.5  # share of a column's voxels that were seen through
-_HALF_DIAGONAL = 0.5**0.5  # cells: no part of an obstacle's cell is nearer than its center by more
-_SAMPLES = 16  # of a region's voxels that are looked at
-_SEEN = 0.25  # share of these that have to be seen
-_AT_ONCE = 256  # places that are tried together
+_DRIVEN_OVER = 0.1  # meters above the floor: nothing lower is an obstacle
+_MIN_FREE = 0.5  # least share of a column's voxels that images saw through
+_HALF_DIAGONAL = 0.5**0.5  # cells: greatest distance from an obstacle cell's center to its parts
+_SAMPLES = 16  # number of a region's voxels to test
+_SEEN = 0.25  # least share of these that the robot must see
+_AT_ONCE = 256  # number of places to test together
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class Robot:
 def standing_places(
     occupancy: Occupancy, T_gravity_map: NDArray[np.float64], regions: Sequence[Region], robot: Robot | None = None
 ) -> list[NDArray[np.float64] | None]:
-    """For each region the place on the floor, (3,) map frame, that is nearest to its voxels as seen from above, where
-    the robot has room and sees a quarter of the region at least; None where there is no such place.
+    """Returns, for each region, the (3,) nearest place on the floor, map frame, where the robot has room and sees a
+    quarter of the region or more. Nearest means to the region's voxels, as seen from above. None if there is no place.
 
-    T_gravity_map: (4, 4) rigid, to the frame with z up and the floor at z = 0. There is room where, within the radius,
-    nothing is occupied from 10 cm above the floor up to the height and half of it or more is known to be free, and the
-    floor is known in the middle. A voxel is seen if no occupied voxel that is not the region's lies between its center
-    and the robot's top. Raises MapError for a map that is too large.
+    T_gravity_map: (4, 4) rigid, to the frame with z up and the floor at z = 0. The robot has room if, within its
+    radius, no voxel is occupied from 10 cm above the floor up to its height, half of these voxels or more are known to
+    be free, and the floor is known in the middle. The robot sees a voxel if no occupied voxel outside of the region
+    lies between the voxel's center and the robot's top. Raises MapError for a map that is too large.
     """
     robot = robot or Robot()
     plain = occupancy.replace(features=np.zeros((len(occupancy.colors), 0), np.float16))
@@ -73,7 +73,7 @@ def standing_places(
 
 
 class _Cells:
-    """The states of all voxels of a level map's known box."""
+    """The states of all voxels in the known box of a level map."""
 
     def __init__(self, level: Occupancy):
         self.size = level.voxel_size
@@ -82,19 +82,22 @@ class _Cells:
         self.corner = known.min(axis=0).astype(np.int64)
         shape = known.max(axis=0) - self.corner + 1
         if shape.prod() > _MOST_CELLS:
-            raise MapError(f"Standing places cannot be sought in {shape.prod():.3g} voxels: map with larger ones.")
+            raise MapError(
+                f"A map of {shape.prod():.3g} voxels is too large for standing places: reconstruct it with larger "
+                "voxels."
+            )
         self.origin = level.origin + self.corner * self.size
         self.state = np.full(shape, UNKNOWN, np.uint8)
         for state, at in voxels.items():
             self.state[tuple((at - self.corner).T)] = state
 
     def with_room(self, robot: Robot) -> NDArray[np.float64]:
-        """(P, 2) x, y where the robot has room to stand."""
+        """Returns the (P, 2) places x, y where the robot has room to stand."""
         heights = self.origin[2] + (np.arange(self.state.shape[2]) + 0.5) * self.size
         body = self.state[:, :, (heights >= _DRIVEN_OVER) & (heights <= robot.height)]
         layers = max(1, int((robot.height - _DRIVEN_OVER) / self.size))
         room = ~(body == OCCUPIED).any(axis=2) & ((body == FREE).sum(axis=2) >= _MIN_FREE * layers)
-        to_obstacle = ndimage.distance_transform_edt(np.pad(room, 1))[1:-1, 1:-1]  # of the cells' centers
+        to_obstacle = ndimage.distance_transform_edt(np.pad(room, 1))[1:-1, 1:-1]  # between the cells' centers
         floor = (self.state[:, :, np.abs(heights) < 1.25 * self.size] == OCCUPIED).any(axis=2)
         cells = np.argwhere(floor & ((to_obstacle - _HALF_DIAGONAL) * self.size >= robot.radius))
         return np.asarray(self.origin[:2] + (cells + 0.5) * self.size)
@@ -102,7 +105,7 @@ class _Cells:
     def nearest(
         self, places: NDArray[np.float64], targets: NDArray[np.float64], own: NDArray[np.int32], eye: float
     ) -> NDArray[np.float64] | None:
-        """(2,) the nearest of the places to the targets, (N, 3) centers of a region, that sees them."""
+        """Returns the (2,) place that sees the targets and is nearest to them. targets: (N, 3) centers of a region."""
         distance = KDTree(targets[:, :2]).query(places)[0] if len(places) else np.zeros(0)
         order = np.argsort(distance, kind="stable")
         some = targets[np.unique(np.linspace(0, len(targets) - 1, _SAMPLES).astype(np.int64))]
@@ -119,12 +122,12 @@ class _Cells:
     def _open(
         self, blocks: NDArray[np.bool_], eyes: NDArray[np.float64], targets: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """(E, N) whether nothing that blocks lies between each of (E, 3) eyes and each of (N, 3) targets, looked up at
-        steps of half a voxel."""
+        """Returns (E, N) whether the line from each of (E, 3) eyes to each of (N, 3) targets is free, at steps of half
+        a voxel."""
         way = targets - eyes[:, None]
         steps = max(1, int(np.ceil(np.linalg.norm(way, axis=-1).max() / (0.5 * self.size))))
         blocked = np.zeros(way.shape[:2], bool)
-        for share in np.arange(steps) / steps:  # the eye's own cell too, which may be above the map
+        for share in np.arange(steps) / steps:  # tests the eye's own cell too; it may be above the map
             at = np.floor((eyes[:, None] + share * way - self.origin) / self.size).astype(np.int64)
             inside = ((at >= 0) & (at < blocks.shape)).all(axis=-1)
             blocked[inside] |= blocks[tuple(at[inside].T)]

@@ -1,10 +1,11 @@
-"""Words to voxels to regions: what ``freeocc3d query`` and ``Map.query`` do. Imports little, to start fast.
+"""Finds the voxels and regions of words: what ``freeocc3d query`` and ``Map.query`` do. The module imports little, to
+start fast.
 
 A voxel's score for a word is the paper's s(x, c) = f(x)^T t_c, the cosine of its feature and the word's, over the
-cosine that the word allows (see ``TextFeatures.attainable``), or that in relation to other words (``matching``). It
-matches when the score reaches the threshold and no contrast word (what the voxel could be instead) is nearer to it:
-similarities alone do not tell "is" from "is a little like". Voxels that hang together with these and fit nearly as well
-match, too. Matching voxels that touch form a region.
+cosine that the word allows (see ``TextFeatures.attainable``). It may also be relative to other words
+(``word_matching``). A voxel matches if its score reaches the threshold and no contrast word (what the voxel could be
+instead) is nearer to it: similarities alone do not separate "is" from "is a little like". Voxels that are connected to
+these and fit nearly as well also match. Matching voxels that touch form a region.
 """
 
 from __future__ import annotations
@@ -24,48 +25,49 @@ from ..language.feature_codec import Features, compute_cosines, mask_known
 from ..occupancy.connected_components import label_components
 from ..settings.option_types import Cosine, PositiveInt, PositiveShare, Share
 from ..settings.typed_options import TypedOptions, nearest
-from .region_splitting import told_apart
+from .region_splitting import cut_necks
 from .regions import Region, best_regions
 
 if TYPE_CHECKING:
     from ..language.encoders.base import TextEncoder, TextFeatures
 
 _LONGEST_WORD = 200
-_MISSPELT = 0.75  # of difflib's ratio: "soffa" is, "canoe" for "camera" is not
+_MISSPELT = 0.75  # least ratio of difflib: "soffa" is a misspelling, "canoe" for "camera" is not
 _EVEN = 0.5  # a probability
-_ROWS = 16384  # voxels worked on at once, so that float32 copies of all features never exist
-_MANY_ROWS = 1 << 18  # by compiled code, whose threads are worth starting for many only
+_ROWS = 16384  # voxels per step: float32 copies of all features never exist
+_MANY_ROWS = 1 << 18  # voxels per step of compiled code: its threads are worth their start only for many
 
 
 class Options(TypedOptions, frozen=True):
-    """What counts as a match, and which regions are reported."""
+    """What counts as a match, and which regions the answer holds."""
 
     scores: Literal["cosine", "softmax", "relevancy"] = "cosine"
-    """What a score is: "cosine" (over the cosine that the word allows), "softmax" (the word's probability against the
-    contrast words) or "relevancy" (the least against each of some phrases that fit anything, as in LERF)."""
+    """Kind of score: "cosine" (over the cosine that the word allows), "softmax" (the word's probability against the
+    contrast words) or "relevancy" (the least probability against each of some phrases that fit anything, as in LERF).
+    """
     threshold: Cosine | None = None
-    """Least score of a matching voxel, -1…1; null = the encoder's own for cosines, 0.5 for probabilities."""
+    """Least score of a matching voxel, -1…1; null = the encoder's own value for cosines, 0.5 for probabilities."""
     grow: PositiveShare = 0.8
-    """A region goes on over voxels that touch it down to this share of the threshold; 1 = it does not."""
+    """A region grows over connected voxels that reach this share of the threshold; 1 = no growth."""
     top_k: PositiveInt = 20
-    """The most regions that are reported for a word."""
+    """Greatest number of regions for a word."""
     min_voxels: PositiveInt = 2
-    """Smaller regions are left out, unless all are smaller."""
+    """Least number of voxels of a region. Smaller regions are left out, unless all are smaller."""
     min_share: Share = 0.001
-    """Regions of less than this share of the volume of the word's largest one are left out, and those of one to three
-    voxels within half a meter of one that they are less than 50 times the share of: specks by a thing. 0 = none."""
+    """Least volume of a region, as a share of the word's largest region. A region of one to three voxels within half a
+    meter of another region is a speck: it needs 50 times this share of that region's volume. 0 = keep all."""
     narrow: Share = 0.5
-    """Things that touch are told apart where their region, seen from above, narrows to less than this share of the
-    narrower one, and to four voxels or less; 0 = regions stay whole."""
+    """Cut a region into things where, seen from above, it narrows to less than this share of the narrower thing's width
+    and to four voxels or less; 0 = regions stay whole."""
 
 
 @dataclass(frozen=True)
 class QueryResult:
     """The answer to one word.
 
-    understood: the part of the word that was used.  note: one sentence if nothing matched, or only a part of the word
-    was understood; else empty.  regions: best score first.  scores: (V,) score of every occupied voxel, 0 where nothing
-    is known of it.
+    understood: the part of the word that the encoder understands.  note: one sentence if nothing matched, or if only a
+    part of the word was understood; else empty.  regions: best score first.  scores: (V,) score of every occupied
+    voxel, 0 where nothing is known.
     """
 
     word: str
@@ -89,18 +91,18 @@ def query(
     negative: Sequence[str] = (),
     up: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 1.0),
 ) -> list[QueryResult]:
-    """Ask for several words; one that nothing matches gives no regions.
+    """Asks for several words. A word that nothing matches has no regions.
 
-    contrast: words for what else is there, besides those that the encoder names itself.  negative: words for what is
-    not meant: a voxel whose plain cosine with one of them is higher than with the word does not match, though the word
-    should include it, as "table" includes a coffee table.  up: (3,) unit vector, map frame.
-    Raises FreeOccError for an empty, endless or excluded word or a negative one without a meaning, MapError if the
-    map's features are not the encoder's.
+    contrast: words for other things in the scan, added to the encoder's own.  negative: words for what is not meant. A
+    voxel whose plain cosine with one of them is higher than with the word does not match, even if the word includes
+    it, as "table" includes a coffee table.  up: (3,) unit vector, map frame.
+    Raises FreeOccError for an empty, too long or excluded word, or a negative word that is not understood; MapError if
+    the map's features are not those of the encoder.
     """
     options = options or Options()
     for word in (*words, *negative):
         if not word.strip():
-            raise FreeOccError("An empty word cannot be looked for: give at least one word.")
+            raise FreeOccError("A word is empty: give a word or a phrase.")
         if len(word) > _LONGEST_WORD:
             raise FreeOccError(f"'{word[:30]}…' has {len(word)} characters; a query may have up to {_LONGEST_WORD}.")
     text = text_encoder.encode_words(words)
@@ -115,7 +117,7 @@ def query(
     if len(features) and features.shape[1] != text.features.shape[1]:
         raise MapError(
             f"The map's features have {features.shape[1]} dimensions, its encoder's words "
-            f"{text.features.shape[1]}: make the map again with this version."
+            f"{text.features.shape[1]}: reconstruct the map with this version."
         )
     expressed = others.features.any(axis=1)
     competes = (compute_cosines(text.features, others.features) < text_encoder.same_word) & expressed
@@ -144,13 +146,13 @@ def query(
             meant = compute_cosines(features[rows], text.features[w : w + 1])[:, 0]
             allowed = meant >= compute_cosines(features[rows], excluded.features).max(axis=1)
             rows, confidence = rows[allowed], confidence[allowed]
-        regions = found_regions(occupancy, rows, scores[rows], confidence, threshold, options, up, word)
+        regions = find_regions(occupancy, rows, scores[rows], confidence, threshold, options, up, word)
         note = _note(word, part, text_encoder, scores, threshold, bool(regions))
         results.append(QueryResult(word, part, note, regions, np.ascontiguousarray(scores)))
     return results
 
 
-def found_regions(
+def find_regions(
     occupancy: Occupancy,
     rows: NDArray[np.int64],
     scores: NDArray[np.float32],
@@ -160,21 +162,21 @@ def found_regions(
     up: Sequence[float] | NDArray[np.float64],
     label: str,
 ) -> list[Region]:
-    """The regions of candidates, (n,) rows of occupied voxels with (n,) scores and confidences: what hangs together
-    with a voxel that reaches the threshold, things that touch apart."""
+    """Returns the regions of candidates: their connected components that hold a voxel which reaches the threshold, cut
+    into things. rows: (n,) rows of occupied voxels.  scores, confidence: (n,)."""
     seeds = scores >= threshold
     if not seeds.any():
         return []
     component = label_components(occupancy.occupied_voxels()[rows], occupancy.occupied_edges()[rows])
     kept = word_matching.grow_regions(seeds, component)
     rows, scores, confidence, component = rows[kept], scores[kept], confidence[kept], component[kept]
-    component = told_apart(occupancy, rows, component, scores, np.asarray(up), options.narrow)
+    component = cut_necks(occupancy, rows, component, scores, np.asarray(up), options.narrow)
     least = options.min_voxels, options.min_share
     return best_regions(occupancy, rows, component, scores, confidence, *least, options.top_k, label)
 
 
 def similarity(features: Features, text: TextFeatures) -> NDArray[np.float32]:
-    """(V, W) scores of (V, D) unit features for W words: cosine over attainable cosine, at most 1."""
+    """Returns the (V, W) scores of (V, D) unit features for W words: cosine over attainable cosine, limited to 1."""
     score = compute_cosines(features, text.features)
     if text.attainable is not None:
         score /= text.attainable
@@ -182,9 +184,9 @@ def similarity(features: Features, text: TextFeatures) -> NDArray[np.float32]:
 
 
 def nearest_word(features: Features, text: TextFeatures) -> NDArray[np.int64]:
-    """(V,) which of W words is nearest to each of (V, D) features by plain cosine, -1 where nothing is known.
+    """Returns (V,) which of W words is nearest to each of (V, D) features by plain cosine; -1 where nothing is known.
 
-    Of "table" and "coffee table" the narrower word is nearer to a coffee table, though both fit.
+    Both "table" and "coffee table" fit a coffee table, but the narrower word is nearer to it.
     """
     nearest = np.full(len(features), -1, np.int64)
     for start in range(0, len(features) if len(text.understood) else 0, _ROWS):
@@ -196,7 +198,7 @@ def nearest_word(features: Features, text: TextFeatures) -> NDArray[np.int64]:
 
 
 def _some(text: TextFeatures, words: NDArray[np.bool_]) -> TextFeatures:
-    """Those of the words that a mask (W,) names."""
+    """Returns the words of a mask (W,)."""
     understood = tuple(word for word, chosen in zip(text.understood, words, strict=True) if chosen)
     attainable = None if text.attainable is None else text.attainable[words]
     return type(text)(text.features[words], understood, attainable)
@@ -210,8 +212,8 @@ def _not_beaten(
     competes: NDArray[np.bool_],
     temperature: float,
 ) -> list[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-    """For each of W words, whose cosines (V, W) are given, the rows of its candidates (V, W) at which none of the C
-    other words that compete with it, (W, C), scores higher, and its confidences there."""
+    """Returns, for each of W words, the rows of its candidates where no competing word scores higher, and its
+    confidences there. cosine: (V, W).  candidates: (V, W).  competes: (W, C), which of C other words compete."""
     asked = np.flatnonzero(candidates.any(axis=1))
     found: list[list[tuple[NDArray[np.int64], NDArray[np.float32]]]] = [[] for _ in competes]
     step = _ROWS if len(asked) < word_matching.MANY else _MANY_ROWS
@@ -229,10 +231,10 @@ def _not_beaten(
     ]
 
 
-def _beside(
+def _compare_others(
     features: Features, scores: NDArray[np.float32], others: TextFeatures, temperature: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """``matching.beside`` of other words at all voxels, whose cosines for a word are given."""
+    """Applies ``word_matching.compare_competitors`` at all voxels. scores: (V,) cosines of a word."""
     largest, odds = np.empty(len(scores), np.float32), np.empty(len(scores), np.float32)
     step = _ROWS if len(scores) < word_matching.MANY else _MANY_ROWS
     for start in range(0, len(scores), step):
@@ -245,14 +247,14 @@ def _beside(
 def _probability(
     features: Features, scores: NDArray[np.float32], contrast: TextFeatures, text_encoder: TextEncoder, way: str
 ) -> NDArray[np.float32]:
-    """(V,) softmax or relevancy of a word whose cosines are given; 0 where nothing is known. An encoder that cannot
-    express the phrases that fit anything is asked for its contrast words in their place."""
+    """Returns the (V,) softmax or relevancy of a word; 0 where nothing is known. scores: (V,) cosines of the word. If
+    the encoder cannot express the phrases that fit anything, its contrast words replace them."""
     others = contrast
     if way == "relevancy":
         canonical = text_encoder.encode_words(list(word_matching.CANONICAL))
         expressed = np.asarray(canonical.features.any(axis=1))
         others = _some(canonical, expressed) if expressed.any() else contrast
-    largest, odds = _beside(features, scores, others, text_encoder.temperature)
+    largest, odds = _compare_others(features, scores, others, text_encoder.temperature)
     made = (
         word_matching.compare_with_all(odds)
         if way == "softmax"
@@ -262,7 +264,7 @@ def _probability(
 
 
 def _only_known(word: str, text_encoder: TextEncoder) -> str:
-    """The end of a sentence about a word that is not understood: what may have been meant, and what is known."""
+    """Returns the end of a sentence about a word that is not understood: a near word, and what the encoder knows."""
     meant = nearest(word.lower(), text_encoder.contrast_words(), _MISSPELT)
     return f"{meant}: this map knows only {text_encoder.knows}."
 

@@ -96,11 +96,11 @@ def test_a_note_says_which_condition_nothing_met(room) -> None:
     result = answer(room, "cup", Where(near="wall"))
     assert not result.matched
     assert result.note == (
-        "Of 3 regions that 'cup' matches none is within 0.5 m of 'wall', which nothing in this map matches."
+        "'cup' matches 3 regions, but none is within 0.5 m of 'wall', which nothing in this map matches."
     )
     assert answer(room, "cup", Where(near="unicorn")).note.endswith("'unicorn', which is not understood.")
     both = answer(room, "cup", Where(within=(-9.0, -9.0, -9.0, 9.0, 9.0, 9.0), near="wall")).note
-    assert both.startswith("Of 3 regions that 'cup' matches none is within -9 -9 -9 9 9 9 and within 0.5 m of 'wall'")
+    assert both.startswith("'cup' matches 3 regions, but none is within -9 -9 -9 9 9 9 and within 0.5 m of 'wall'")
     assert "'unicorn' is not understood" in answer(room, "unicorn", Where(on="table")).note
 
 

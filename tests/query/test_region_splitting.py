@@ -11,7 +11,7 @@ from scenes import occupancy_of
 from worded_voxels import WORDS, box, feature, occupancy
 
 from freeocc3d.core.errors import ConfigError
-from freeocc3d.query.region_splitting import parts_of, told_apart
+from freeocc3d.query.region_splitting import cut_necks, split_footprint
 from freeocc3d.query.word_query import Options, query
 
 SHAPE = 60, 60
@@ -27,7 +27,7 @@ def footprint(*rectangles: Rectangle) -> NDArray[np.float32]:
 
 
 def count(made: NDArray[np.float32], narrow: float = 0.5) -> int:
-    parts = parts_of(made, narrow)
+    parts = split_footprint(made, narrow)
     return 1 if parts is None else len(np.unique(parts))
 
 
@@ -42,7 +42,7 @@ def count(made: NDArray[np.float32], narrow: float = 0.5) -> int:
 )
 def test_a_neck_separates_two_things(rectangles: tuple[Rectangle, ...]) -> None:
     made = footprint(*rectangles)
-    parts = parts_of(made, 0.5)
+    parts = split_footprint(made, 0.5)
     assert parts is not None
     first, last = rectangles[0], rectangles[-1]
     of_first, of_last = (np.unique(parts[x0:x1, y0:y1]) for x0, x1, y0, y1 in (first, last))
@@ -171,11 +171,11 @@ def test_what_is_above_is_asked_not_the_lattice(turn: float) -> None:
     order = {tuple(v): n for n, v in enumerate(made.occupied_voxels().tolist())}
     rows = np.array([order[tuple(v)] for v in voxels.tolist()])
     one = np.zeros(len(rows), np.int32)
-    part = told_apart(made, rows, one, np.ones(len(rows), np.float32), up, 0.5)
+    part = cut_necks(made, rows, one, np.ones(len(rows), np.float32), up, 0.5)
     on_left = left[left | neck | right]
     assert len(np.unique(part)) == 2
     assert len(np.unique(part[on_left])) == 1
-    assert len(np.unique(told_apart(made, rows, one, np.ones(len(rows), np.float32), up, 0.0))) == 1
+    assert len(np.unique(cut_necks(made, rows, one, np.ones(len(rows), np.float32), up, 0.0))) == 1
 
 
 def test_a_share_of_a_width_lies_between_0_and_1() -> None:
@@ -189,5 +189,5 @@ def test_what_spreads_too_far_stays_whole_and_no_score_is_too_low() -> None:
     far = made.replace(keys=made.keys * 40)
     rows = np.arange(50)
     for one, up in ((made, (0.0, 0.0, 1.0)), (far, (0.0, 0.0, 1.0))):
-        part = told_apart(one, rows, np.zeros(50, np.int32), np.full(50, -0.5, np.float32), np.array(up), 0.5)
+        part = cut_necks(one, rows, np.zeros(50, np.int32), np.full(50, -0.5, np.float32), np.array(up), 0.5)
         assert len(np.unique(part)) == 1
