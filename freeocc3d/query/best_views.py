@@ -34,7 +34,7 @@ def best_views(
     occupancy: Occupancy, trajectory: Trajectory, keyframes: Keyframes, regions: Sequence[Region], most: int = MOST
 ) -> list[list[RegionView]]:
     """Returns, for each region, up to ``most`` keyframes that show a part of it. Keyframes that show more voxels come
-    first. Counts within the same tenth of the best count are equal; then the larger box in the image comes first.
+    first, with counts rounded to a tenth of the best count; of equal ones, the larger box in its image comes first.
 
     A keyframe shows a voxel if the voxel's center falls on a pixel and the pixel's depth differs from the center's by
     no more than the voxel's edge. Raises MapError for a broken keyframe.

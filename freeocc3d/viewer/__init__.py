@@ -1,1 +1,1 @@
-"""Pictures of maps and queries."""
+"""Draws pictures of maps and queries."""

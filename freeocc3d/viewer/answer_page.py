@@ -1,4 +1,4 @@
-"""An answer as one HTML file that needs nothing beside it: regions, the map with them, and what the camera saw."""
+"""Writes an answer as one self-contained HTML file: regions, the map with them, and what the camera saw."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from .map_pictures import draw_query
 from .palette import HIGHLIGHTS
 
 _CROP = 320, 240
-"""Pixels of a crop, at most."""
-_MARGIN = 0.25  # of a box, that a crop shows around it
+"""Greatest width and height of a crop, pixels."""
+_MARGIN = 0.25  # share of a box that a crop shows on each side of it
 _QUALITY = 85
 
 
 def write_query_page(scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False) -> None:
-    """Write the page; the same answer gives the same page. Where the map cannot be drawn it says so instead.
+    """Writes the page. The same answer gives the same page. If the map cannot be drawn, the page says why.
 
-    Raises ExportError: an empty map, it exists, or cannot be written; MapError for a broken keyframe.
+    Raises ExportError: an empty map, the file exists or cannot be written; MapError for a broken keyframe.
     """
     page = _page(scan_map, results)
     write_whole(Path(path), lambda target: _write_text(target, page), overwrite)
@@ -75,7 +75,7 @@ def _page(scan_map: Map, results: Sequence[QueryResult]) -> str:
 
 
 def _crop(image: NDArray[np.uint8], view: RegionView, color: tuple[int, ...]) -> str:
-    """The box of a view with what is around it, as the source of an <img>."""
+    """Returns the box of a view with its surroundings, as the source of an <img>."""
     height, width = image.shape[:2]
     x0, y0, x1, y1 = view.box
     around_x, around_y = (int(_MARGIN * (high + 1 - low)) + 8 for low, high in ((x0, x1), (y0, y1)))

@@ -1,4 +1,4 @@
-"""Pictures of voxel grids side by side, from above and from a corner, framed alike."""
+"""Draws voxel grids for comparison: from above and from a corner, all with the same view."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from ..occupancy.surface_faces import build_faces
 from .scene_rendering import VIEWS, DrawnScene, choose_cut_height, render_scene, shade_faces, turn_upright
 
 SIZE = 880, 600
-"""Pixels of one view; a picture is two of them, one above the other."""
+"""Width and height of one view, pixels; a picture has two views, one above the other."""
 
 
 @dataclass(frozen=True)
 class LabelGrid:
-    """labels: (X, Y, Z) uint8, 0 is not drawn.  colors: (K, 3) uint8 RGB of label 0, 1, …  path: (P, 3) the camera's
-    way, meters, in the frame that the grid lies in."""
+    """A voxel grid to draw.
+
+    labels: (X, Y, Z) uint8, 0 is not drawn.  colors: (K, 3) uint8 RGB of label 0, 1, …  path: (P, 3) camera path,
+    meters, in the grid's frame.
+    """
 
     labels: NDArray[np.uint8]
     colors: NDArray[np.uint8]
@@ -29,10 +32,10 @@ class LabelGrid:
 def draw_grids(
     grids: Mapping[str, LabelGrid], origin: NDArray[np.float64], voxel_size: float, up: NDArray[np.float64]
 ) -> dict[str, bytes]:
-    """PNG of each of several grids on one lattice, cut below the ceiling at the same height and seen from the corner
-    of the first one's camera; none if all are empty.
+    """Returns a PNG of each grid. All grids lie on one lattice, are cut below the ceiling at the same height, and are
+    seen from the corner of the first grid's camera. Returns none if all are empty.
 
-    origin: (3,) lower corner of voxel (0, 0, 0), meters.  up: (3,) towards the ceiling.
+    origin: (3,) lower corner of voxel (0, 0, 0), meters.  up: (3,) toward the ceiling.
     Raises DependencyError (no off-screen rendering).
     """
     drawn = np.any([grid.labels > 0 for grid in grids.values()], axis=0)

@@ -1,4 +1,4 @@
-"""Pictures of a map, from above and from a corner, drawn off-screen with PyVista."""
+"""Draws pictures of a map, from above and from a corner, off-screen with PyVista."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _MARGIN, _SWATCH, _GAP, _MORE = 16, 22, 20, 130  # pixels: left edge, box before
 
 
 def write_map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrite: bool = False) -> None:
-    """Draw the map colored by "rgb", "class" or "height", with the camera's way, as PNG.
+    """Draws the map colored by "rgb", "class" or "height", with the camera path, as PNG.
 
     Raises ExportError (empty map, unwritable target, unknown coloring), DependencyError (no off-screen rendering).
     """
@@ -64,12 +64,13 @@ def write_map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrit
 def write_query_picture(
     scan_map: Map, results: Sequence[QueryResult], path: str | Path, overwrite: bool = False
 ) -> None:
-    """Draw the map pale with what each word matched in a strong color, boxed; PNG. Raises as ``write_map_picture``."""
+    """Draws the map in pale colors, and the regions of each word in a strong color with boxes, as PNG. Raises as
+    ``write_map_picture`` does."""
     _write(draw_query(scan_map, results), Path(path), overwrite)
 
 
 def draw_query(scan_map: Map, results: Sequence[QueryResult]) -> bytes:
-    """What ``write_query_picture`` writes."""
+    """Returns the PNG that ``write_query_picture`` writes."""
     _refuse_empty(scan_map)
     colors = highlight_regions(scan_map.occupancy.colors, [result.regions for result in results])
     legend = []
@@ -82,7 +83,7 @@ def draw_query(scan_map: Map, results: Sequence[QueryResult]) -> bytes:
 
 
 def _found(result: QueryResult) -> str:
-    """What the legend says of a word: how many regions, and the score of the best."""
+    """Returns the legend's text for a word: the number of regions, and the best score."""
     word = result.word if len(result.word) <= _LONGEST_NAME else result.word[: _LONGEST_NAME - 3] + "..."
     if not result.regions:
         return f"{word}: no match"
@@ -92,12 +93,12 @@ def _found(result: QueryResult) -> str:
 
 def _refuse_empty(scan_map: Map) -> None:
     if len(scan_map.occupancy.colors) == 0:
-        raise ExportError(f"The map {scan_map.path} has no occupied voxel to draw.")
+        raise ExportError(f"The map {scan_map.path} has no occupied voxels to draw.")
 
 
 def _write(png: bytes, path: Path, overwrite: bool) -> None:
     if path.suffix.lower() != ".png":
-        raise ExportError(f"Pictures are written as PNG: name it {path.with_suffix('.png')} in place of {path}.")
+        raise ExportError(f"Pictures are written as PNG: use the name {path.with_suffix('.png')} in place of {path}.")
     write_whole(path, lambda target: _write_bytes(target, png), overwrite)
 
 
@@ -108,7 +109,7 @@ def _drawn(
     title: str,
     legend: list[tuple[str, tuple[int, int, int]]],
 ) -> bytes:
-    """The picture as PNG."""
+    """Returns the picture as PNG."""
     scene = _scene(scan_map, colors, regions)
     width, height = SIZE[0] // 2, SIZE[1] - 2 * _BAR
     views = np.hstack([render_scene(scene, view, (width, height)) for view in VIEWS])
@@ -121,14 +122,17 @@ def _write_bytes(path: Path, data: bytes) -> None:
 
 
 def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region, tuple[int, int, int]]]) -> DrawnScene:
-    """The exposed faces of the voxels below the cut and of the regions that lie mostly above it, turned so that z is up
-    and the walls lie along x and y."""
+    """Returns the exposed faces of the voxels below the cut, and of the regions that lie mostly above it, turned so
+    that z is up and the walls lie along x and y."""
     occupancy = scan_map.occupancy
     centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
     R = turn_lengthwise(scan_map.T_gravity_map[:3, :3], centers)
     height = centers @ R[2]
     kept = height <= choose_cut_height(height, occupancy.voxel_size)
-    for region, _ in regions:  # a lamp that was asked for is drawn; a wall that was asked for does not hide the room
+    for (
+        region,
+        _,
+    ) in regions:  # draws a lamp that a word asks for; such a wall must not hide the room
         if 2 * np.count_nonzero(kept[region.rows]) < len(region.rows):
             kept[region.rows] = True
     vertices, quads, rows = find_exposed_faces(occupancy, kept)
@@ -141,12 +145,12 @@ def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region,
 
 
 def _corners(box: OrientedBox) -> NDArray[np.float64]:
-    """(8, 3) corners, map frame."""
+    """Returns the (8, 3) corners, map frame."""
     return transform(box.T_map_box, (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * box.extent)
 
 
 def _framed(views: NDArray[np.uint8], title: str, legend: list[tuple[str, tuple[int, int, int]]]) -> NDArray[np.uint8]:
-    """The views with the title above and the legend below."""
+    """Returns the views with the title above and the legend below."""
     picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
     picture[_BAR : _BAR + views.shape[0], : views.shape[1]] = views
     _put(picture, title, (16, 36), 0.62)
@@ -163,7 +167,7 @@ def _framed(views: NDArray[np.uint8], title: str, legend: list[tuple[str, tuple[
 
 
 def _placed(widths: list[int]) -> list[tuple[int, int]]:
-    """(row, x) of the legend's entries, as many as its rows hold; the last row keeps room to count those left out."""
+    """Returns (row, x) of the legend's entries that fit. The last row keeps room for "and N more"."""
     places: list[tuple[int, int]] = []
     row, x = 0, _MARGIN
     for width in widths:
@@ -182,7 +186,7 @@ def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: floa
 
 
 def _size(scan_map: Map) -> str:
-    """The edges of the voxels, with their unit."""
+    """Returns the text of the voxel size, with its unit."""
     factor, unit = (100, "cm") if scan_map.metric else (1, "units")
     largest, smallest = factor * scan_map.occupancy.voxel_size, factor * scan_map.occupancy.finest
     return f"{largest:.3g} {unit}" if largest == smallest else f"{largest:.3g} to {smallest:.3g} {unit}"

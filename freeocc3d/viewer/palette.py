@@ -1,4 +1,4 @@
-"""Colors for classes, heights and what a query found."""
+"""Colors for classes, heights and the regions of a query."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..query.regions import Region
 HIGHLIGHTS = np.array(
     [(255, 64, 32), (20, 120, 255), (30, 190, 70), (240, 60, 200), (255, 170, 0), (0, 190, 200)], np.uint8
 )
-"""Strong colors of the words of a query, in turn."""
+"""Strong colors for the words of a query, in turn."""
 
 _KNOWN = {
     "wall": (200, 205, 210), "floor": (150, 125, 100), "ceiling": (225, 225, 215), "window": (150, 200, 235),
@@ -25,13 +25,13 @@ _KNOWN = {
 
 
 def assign_class_colors(names: list[str]) -> NDArray[np.uint8]:
-    """(C + 1, 3) RGB: row 0 is for "nothing known", row k for names[k - 1]. A name has the same color always."""
+    """Returns (C + 1, 3) RGB: row 0 for "nothing known", row k for names[k - 1]. A name always has the same color."""
     rows = [(90, 90, 90), *(_KNOWN.get(name) or _hashed(name) for name in names)]
     return np.array(rows, np.uint8)
 
 
 def highlight_regions(colors: NDArray[np.uint8], words: list[list[Region]]) -> NDArray[np.uint8]:
-    """(V, 3) voxel colors with everything pale and gray but the regions, which take their word's strong color."""
+    """Returns (V, 3) voxel colors: regions in their word's strong color, everything else pale and gray."""
     gray = colors.astype(np.float32).mean(axis=1, keepdims=True)
     pale = 0.25 * colors + 0.35 * gray + 0.4 * 215.0
     out = np.clip(pale, 0, 255).astype(np.uint8)
@@ -42,21 +42,21 @@ def highlight_regions(colors: NDArray[np.uint8], words: list[list[Region]]) -> N
 
 
 def color_by_height(occupancy: Occupancy, up: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """(V, 3) color of each occupied voxel by its height along ``up``, lowest dark blue, highest yellow."""
+    """Returns the (V, 3) color of each occupied voxel by its height along ``up``, from dark blue to yellow."""
     height = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges()) @ up
     return color_by_value((height - height.min()) / max(float(np.ptp(height)), 1e-9))
 
 
 def color_by_value(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """(N, 3) viridis colors of (N,) values in 0…1."""
-    import cv2  # here, for a query's PLY has no use for it and starts sooner without
+    """Returns the (N, 3) viridis colors of (N,) values in 0…1."""
+    import cv2  # not above: a query's PLY does not need it and starts faster without it
 
     level = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(level[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8)
 
 
 def _hashed(name: str) -> tuple[int, int, int]:
-    """A saturated color whose hue, and a little of its lightness, the name decides."""
+    """Returns a saturated color. The name sets its hue, and a little of its lightness."""
     digest = hashlib.sha256(name.encode()).digest()
     hue = digest[0] / 256 * 6
     value = 170 + digest[1] % 70

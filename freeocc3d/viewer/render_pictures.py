@@ -1,4 +1,4 @@
-"""Rendered views beside what was captured: photograph, rendering, the sensor's depth, rendered depth."""
+"""Draws rendered views next to the captured ones: photograph, rendering, the sensor's depth, rendered depth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..gaussians.rendered_views import CapturedView, measure_fidelity, render_ga
 from .scene_rendering import BACKGROUND
 
 SHOWN = 4
-"""Views in the picture, at most."""
+"""Most views in the picture."""
 _WIDTH, _GAP, _BAR, _CAPTION = 400, 8, 56, 30
 _TEXT = (40, 40, 40)
 _COLUMNS = "photograph", "rendered", "measured depth", "rendered depth"
@@ -29,8 +29,8 @@ def write_render_picture(
     capture: Path,
     metric: bool = True,
 ) -> None:
-    """Write a PNG with a row for each view, which comes with its frame's number. metric: whether lengths are meters.
-    Raises OSError."""
+    """Writes a PNG with a row for each view and the number of its frame. metric: whether lengths are meters. Raises
+    OSError."""
     rows = [_row(gaussians, frame, view, rasterizer, metric) for frame, view in views]
     width = len(_COLUMNS) * (_WIDTH + _GAP) + _GAP
     heading = np.full((_BAR, width, 3), BACKGROUND, np.uint8)
@@ -71,7 +71,7 @@ def _row(
 
 
 def _colored(depth_m: NDArray[np.float32], low: float, high: float) -> NDArray[np.uint8]:
-    """(H, W, 3): near is dark blue, far is red; black where there is no depth."""
+    """Returns (H, W, 3) colors: near is dark blue, far is red, no depth is black."""
     scaled = np.clip((depth_m - low) / max(high - low, 1e-6), 0, 1)
     picture = cv2.applyColorMap(np.rint(255 * scaled).astype(np.uint8), cv2.COLORMAP_TURBO)[:, :, ::-1].copy()
     picture[depth_m <= 0] = 0

@@ -1,4 +1,4 @@
-"""What pictures are made of: colored faces, a camera's way, boxes; rendered off-screen from two sides with PyVista."""
+"""Renders colored faces, a camera path and boxes off-screen from two sides with PyVista."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..core.errors import DependencyError
 
 CUT = 0.8
-"""What is higher than this share of the height is left out, so that one looks into the rooms."""
+"""Share of the height that is drawn. What is higher is left out, so that the rooms are open from above."""
 
 BACKGROUND = (250, 250, 250)
 VIEWS = ("above", "corner")
@@ -21,17 +21,17 @@ _BOX_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """What is drawn, turned so that z is up: quads with a color each, lines, boxes."""
+    """The things to draw, turned so that z is up: colored quads, a path, boxes."""
 
     vertices: NDArray[np.float64]  # (4 F, 3)
     quads: NDArray[np.int32]
     colors: NDArray[np.uint8]  # (F, 3)
-    path: NDArray[np.float64]  # (P, 3) the camera's way
+    path: NDArray[np.float64]  # (P, 3) camera path
     boxes: tuple[tuple[NDArray[np.float64], tuple[int, int, int]], ...] = ()  # (8, 3) corners and a color
 
 
 def turn_upright(up: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(3, 3) rotation that takes ``up`` to z and the longer horizontal extent of the (N, 3) points to x."""
+    """Returns the (3, 3) rotation that takes ``up`` to z, and the longer horizontal extent of (N, 3) points to x."""
     z = up / np.linalg.norm(up)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x /= np.linalg.norm(x)
@@ -48,21 +48,21 @@ def turn_upright(up: NDArray[np.float64], points: NDArray[np.floating]) -> NDArr
 
 
 def turn_lengthwise(R: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """A (3, 3) rotation to a frame with z up and walls along x and y, or that and a quarter turn, so that (N, 3) points
-    reach farther along x than along y."""
+    """Returns R, a (3, 3) rotation to a frame with z up and walls along x and y, with a quarter turn if the (N, 3)
+    points would otherwise reach farther along y than along x."""
     x, y = np.ptp(points @ R[:2].T, axis=0)
     return R if x >= y else np.array(((0, 1, 0), (-1, 0, 0), (0, 0, 1.0))) @ R
 
 
 def choose_cut_height(height: NDArray[np.floating], voxel_size: float) -> float:
-    """Up to which height voxels are drawn, of (V,) heights of voxel centers: not too near to the ceiling."""
+    """Returns the height up to which voxels are drawn, from (V,) heights of voxel centers: well below the ceiling."""
     low, high = np.percentile(height, (1, 99))
     return float(low + CUT * (high - low) + 0.5 * voxel_size)
 
 
 def shade_faces(vertices: NDArray[np.float64], colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(F, 3) colors of faces, (4 F, 3) vertices with z up, under a light from each direction that never moves: faces
-    of a cube are told apart, and colors stay what they are."""
+    """Returns the (F, 3) colors of faces, (4 F, 3) vertices with z up, under fixed lights, one from each direction. So
+    the faces of a cube differ, and colors stay true."""
     corners = vertices.reshape(-1, 4, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -73,19 +73,19 @@ def shade_faces(vertices: NDArray[np.float64], colors: NDArray[np.uint8]) -> NDA
 def render_scene(
     scene: DrawnScene, view: str, size: tuple[int, int], framed: DrawnScene | None = None
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB of one of ``VIEWS``. size: (W, H) pixels.
+    """Returns the (H, W, 3) RGB of one of ``VIEWS``. size: (W, H) pixels.
 
-    framed: the scene that fills the view, by default this one: pictures that are to be compared are framed alike.
-    Raises DependencyError (no off-screen rendering).
+    framed: the scene that fills the view, by default the drawn one; pictures to compare share it. Raises
+    DependencyError (no off-screen rendering).
     """
     try:
         import pyvista
         import vtkmodules.vtkCommonCore as vtk
 
-        vtk.vtkLogger.SetStderrVerbosity(vtk.vtkLogger.VERBOSITY_OFF)  # it reports every display that it does not find
+        vtk.vtkLogger.SetStderrVerbosity(vtk.vtkLogger.VERBOSITY_OFF)  # VTK reports every display that it does not find
     except ImportError as error:
         raise DependencyError(
-            f"Pictures need pyvista with EGL and GL: apt-get install libegl1 libgl1 ({error})."
+            f"Pictures need pyvista with EGL and GL: run apt-get install libegl1 libgl1 ({error})."
         ) from None
 
     try:
@@ -106,13 +106,13 @@ def render_scene(
         image = plotter.screenshot(return_img=True)
         plotter.close()
     except Exception as error:
-        raise DependencyError(f"Off-screen rendering failed: apt-get install libegl1 libgl1 ({error}).") from error
+        raise DependencyError(f"Off-screen rendering failed: run apt-get install libegl1 libgl1 ({error}).") from error
     return np.asarray(image, np.uint8)[..., :3]
 
 
 def _aim(plotter: Any, scene: DrawnScene, view: str, size: tuple[int, int]) -> None:
-    """Look from straight above, or down into the scene from the diagonal on which the camera walked, such that all but
-    a few stray voxels, and all boxes, fill the view. Both views are parallel projections: equal lengths look equal."""
+    """Aims the camera from straight above, or down into the scene from the corner nearest to the camera path. All boxes
+    and all but a few stray voxels fill the view. Both views are parallel projections: equal lengths look equal."""
     points, path = scene.vertices, scene.path
     middle = 0.5 * (np.percentile(points, 1, axis=0) + np.percentile(points, 99, axis=0))
     if view == "above":
@@ -124,7 +124,7 @@ def _aim(plotter: Any, scene: DrawnScene, view: str, size: tuple[int, int]) -> N
     axes = np.stack((right / np.linalg.norm(right), np.cross(back, right) / np.linalg.norm(np.cross(back, right))))
     spread = (points - middle) @ axes.T
     low, high = _bounds(spread, scene)
-    for corners, _ in scene.boxes:  # what was asked for is seen, however far off it is
+    for corners, _ in scene.boxes:  # the view holds what a word asks for, however far away it is
         at = (corners - middle) @ axes.T
         low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
     half = 0.5 * (high - low)
@@ -138,8 +138,8 @@ def _aim(plotter: Any, scene: DrawnScene, view: str, size: tuple[int, int]) -> N
 
 
 def _bounds(spread: NDArray[np.float64], scene: DrawnScene) -> tuple[NDArray[np.float64], ...]:
-    """(2,) and (2,) between which lies all but 0.3 % to either side of the scene's faces, by area, their vertices in
-    the view being given; of its points, where it has no faces."""
+    """Returns the (2,) lower and (2,) upper bounds of the scene's faces in the view, without 0.3 % of their area on
+    each side; the bounds of its points if it has no faces. spread: the vertices in the view."""
     weights = np.ones(len(spread))
     if len(scene.quads):
         corners = scene.vertices.reshape(-1, 4, 3)

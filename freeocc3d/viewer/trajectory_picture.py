@@ -1,4 +1,4 @@
-"""The camera's way from above: keyframes, closures, what was lost and found again, and submaps that nothing ties."""
+"""Draws the camera path from above: keyframes, loop closures, lost and relocalized frames, and unconnected submaps."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _TRACKED, _FOUND, _BETWEEN = (40, 90, 200), (240, 130, 20), (150, 90, 200)
 _KEYFRAME, _HELD, _WRONG = (15, 35, 90), (0, 150, 90), (215, 40, 40)
 _TEXT, _FAINT = (40, 40, 40), (150, 150, 150)
 _BAR, _LEGEND, _MARGIN = 56, 60, 40
-_ASIDE = 360  # width of the column for submaps apart
-_SHOWN = 3  # of them
+_ASIDE = 360  # width of the column for unconnected submaps
+_SHOWN = 3  # most of them in the picture
 _HEADING_PX = 12
 _DOT_M = 0.04
 _RULERS_M = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
@@ -36,7 +36,7 @@ def write_path_picture(
     capture: Path,
     metric: bool = True,
 ) -> None:
-    """Write a PNG. submaps: the mapped one first, whose world the Gaussians and (3,) ``up`` are in.  metric: whether
+    """Writes a PNG. submaps: the mapped one first; the Gaussians and (3,) ``up`` are in its world.  metric: whether
     lengths are meters. Raises OSError."""
     unit = "m" if metric else "units"
     picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
@@ -71,10 +71,10 @@ def _draw(
     mapped: tuple[Gaussians, NDArray[np.float64]] | None,
     unit: str,
 ) -> None:
-    """One submap, seen from above, into the box x, y, width, height. mapped: the Gaussians and where up is, for the
-    submap that was mapped."""
+    """Draws one submap from above into the box x, y, width, height. mapped: the Gaussians and the up direction, for the
+    mapped submap only."""
     frames, poses, means = submap.frames, submap.T_submap_cam, np.zeros((0, 3), np.float32)
-    if mapped is not None:  # with the frames that were interpolated
+    if mapped is not None:  # includes the interpolated frames
         frames = np.flatnonzero(trajectory.has_pose).astype(np.int32)
         poses, means = trajectory.T_world_cam[frames], mapped[0].means
     at_keyframe = np.searchsorted(frames, submap.keyframes)
@@ -91,7 +91,7 @@ def _draw(
     middle = 0.5 * (low + high)
 
     def pixel(flat: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(N, 2) meters to pixels; y points up in the plan and down in the picture."""
+        """Returns the pixels of (N, 2) places in meters; y points up in the plan and down in the picture."""
         center = np.array((x0 + 0.5 * width, y0 + 0.5 * height))
         return np.asarray(center + (flat - middle) * (scale, -scale))
 
@@ -123,7 +123,7 @@ def _plan(
     colors: NDArray[np.uint8],
     size: int,
 ) -> None:
-    """What stands in the room, faintly, without its ceiling; the highest on top."""
+    """Draws the room faintly from above, without its ceiling; the highest points lie on top."""
     x0, y0, width, rows = box
     size = min(max(size, 1), 6)
     u, v = np.rint(pixels - 0.5 * size).astype(int).T
@@ -137,7 +137,7 @@ def _plan(
 
 
 def _ruler(picture: NDArray[np.uint8], box: tuple[int, int, int, int], scale: float, unit: str) -> None:
-    """A length, at the lower left of the box."""
+    """Draws a ruler at the lower left of the box."""
     x0, y0, _, height = box
     meters = max((m for m in _RULERS_M if m * scale < 220), default=_RULERS_M[0])
     y, x = y0 + height - 12, x0 + 16
@@ -146,16 +146,16 @@ def _ruler(picture: NDArray[np.uint8], box: tuple[int, int, int, int], scale: fl
 
 
 def _legend(picture: NDArray[np.uint8], submaps: Sequence[Submap], trajectory: Trajectory) -> None:
-    """What the colors mean, with their numbers."""
+    """Draws the meaning of the colors, with the counts."""
     held = sum(int(s.held.sum()) for s in submaps)
     wrong = sum(int((~s.held).sum()) for s in submaps)
     counts = {name: int((trajectory.status == name).sum()) for name in ("relocalised", "interpolated", "lost", "apart")}
     entries = [
         ("path", _TRACKED, True),
-        (f"{sum(len(s.keyframes) for s in submaps)} keyframes, with where they look", _KEYFRAME, True),
-        (f"{held} closure{'s' if held != 1 else ''}", _HELD, held > 0),
+        (f"{sum(len(s.keyframes) for s in submaps)} keyframes with view directions", _KEYFRAME, True),
+        (f"{held} loop closure{'s' if held != 1 else ''}", _HELD, held > 0),
         (f"{wrong} refused", _WRONG, wrong > 0),
-        (f"{counts['relocalised']} relocalised", _FOUND, counts["relocalised"] > 0),
+        (f"{counts['relocalised']} relocalized", _FOUND, counts["relocalised"] > 0),
         (f"{counts['interpolated']} interpolated", _BETWEEN, counts["interpolated"] > 0),
         (f"{counts['lost']} lost", _FAINT, counts["lost"] > 0),
         (f"{counts['apart']} apart", _FAINT, counts["apart"] > 0),
@@ -179,7 +179,7 @@ def _line(
 
 
 def _fixed(place: NDArray[np.floating]) -> tuple[int, int]:
-    """A pixel with three binary digits after the point, as OpenCV takes it."""
+    """Returns a pixel in OpenCV's fixed-point form, with three binary digits after the point."""
     u, v = np.rint(8 * place).astype(int).tolist()
     return u, v
 

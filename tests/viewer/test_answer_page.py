@@ -124,6 +124,6 @@ def test_an_empty_map_has_no_page(room: Map, tmp_path: Path, monkeypatch: pytest
     assert result.note == "The map has no occupied voxels."
     assert empty.query_classes(["red"])[0].regions == []
     assert empty.query_image(np.full((8, 8, 3), 200, np.uint8)).note == "The map has no occupied voxels."
-    with pytest.raises(ExportError, match="has no occupied voxel to draw"):
+    with pytest.raises(ExportError, match="has no occupied voxels to draw"):
         answer_page.write_query_page(empty, [result], tmp_path / "q.html")
     assert list(tmp_path.iterdir()) == []
