@@ -1,4 +1,4 @@
-"""Writers of finished maps, one file per format; base.py is their contract."""
+"""Exports maps to other programs' files: one module per format; base.py states their contract."""
 
 from .base import export_map
 

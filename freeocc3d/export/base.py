@@ -1,9 +1,9 @@
-"""The contract of an exporter, and the one way in which all of them write: whole or not at all.
+"""The contract of an exporter. An export is written whole or not at all.
 
-An exporter is one file of this folder with ``Options`` and ``write(scan_map, path, options)``: it writes to ``path``,
-may raise OSError or ExportError, and returns what the user should know, in sentences, or None. ``path`` has its final
-name in a folder of its own: what a format needs beside it (an image, a description) is written into that folder, and
-moves with it. An exporter that has the option ``frame`` takes its voxels from ``frames.placed``.
+An exporter is a module of this folder with ``Options`` and ``write(scan_map, path, options)``. ``write`` writes to
+``path``, may raise OSError or ExportError, and returns sentences for the user, or None. ``path`` has its final name but
+lies in a temporary folder. Companion files (an image, a description) go into that folder and move with it. An exporter
+with the option ``frame`` takes its voxels from ``export_frames.place_voxels``.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from ..settings import registry
 def export_map(
     scan_map: Map, format_name: str, path: str | Path, options: Mapping[str, Any] | None = None, overwrite: bool = False
 ) -> list[str]:
-    """Write a map to ``path`` in the format of that name; returns what the user should know of it, in sentences.
+    """Writes a map to ``path`` in the named format. Returns sentences for the user.
 
-    Raises ConfigError (unknown format, naming the nearest; unknown option), ExportError (the target exists or cannot be
-    written, or the map has nothing to write).
+    Raises ConfigError (unknown format, with the nearest name; unknown option), ExportError (the target exists or cannot
+    be written, or the map has nothing to write).
     """
     exporter = registry.load("export", format_name)
     checked = registry.build_options(exporter, options or {}, f"{format_name}.")

@@ -1,7 +1,7 @@
-"""Exact Euclidean distances between two kinds of voxels in a dense grid, in the memory of their result.
+"""Computes exact Euclidean distances between two kinds of voxels in a dense grid, in the memory of the result.
 
-Squared distances are found axis by axis as lower envelopes of parabolas. A voxel's kind says which of the two
-distances it holds, so that one array of 4 bytes a voxel serves both and becomes the result in place.
+Squared distances are lower envelopes of parabolas, computed axis by axis. A voxel's kind says which of the two
+distances it holds. So one array of 4 bytes a voxel serves both, and becomes the result in place.
 Source: P. Felzenszwalb and D. Huttenlocher, Distance Transforms of Sampled Functions, Theory of Computing 8, 2012.
 """
 
@@ -12,14 +12,14 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 _NONE = np.int32(2**31 - 1)
-"""Squared distance where there is no voxel of the other kind."""
+"""Squared distance if no voxel of the other kind exists."""
 LONGEST = 26_000
-"""Voxels along an edge up to which squared distances fit into 32 bits."""
+"""Most voxels along an edge: squared distances still fit into 32 bits."""
 
 
 def transform_signed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """(X, Y, Z) distance, in voxels, from each voxel's center to that of the nearest one of the other kind, negative
-    inside; infinite where there is none. No edge may be longer than LONGEST."""
+    """Returns the (X, Y, Z) distance, in voxels, from each voxel's center to the nearest center of the other kind. It
+    is negative inside, and infinite if there is no other kind. No edge may be longer than LONGEST."""
     inside = np.ascontiguousarray(inside)
     squared = np.full(inside.shape, _NONE, np.int32)
     x, y, z = inside.shape
@@ -31,7 +31,7 @@ def transform_signed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 
 def transform_signed_reference(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The same by SciPy, in ten times the memory."""
+    """Computes the same with SciPy, in ten times the memory."""
     from scipy import ndimage
 
     out = np.full(inside.shape, np.inf)
@@ -44,7 +44,7 @@ def transform_signed_reference(inside: NDArray[np.bool_]) -> NDArray[np.float32]
 
 @njit(parallel=True, cache=True)
 def _along(squared: NDArray[np.int32], inside: NDArray[np.bool_]) -> None:
-    """Take one more axis, the middle one of (A, N, B), into account."""
+    """Adds one more axis to the distances: the middle one of (A, N, B)."""
     length, width = squared.shape[1], squared.shape[2]
     for line in prange(squared.shape[0] * width):
         a, b = line // width, line % width
@@ -59,7 +59,7 @@ def _along(squared: NDArray[np.int32], inside: NDArray[np.bool_]) -> None:
                 height[q] = squared[a, q, b] if own else 0
             if not present:
                 continue
-            # Parabolas of the lower envelope: from ``begins`` on, that over ``site`` is the lowest.
+            # The lower envelope: from ``begins`` on, the parabola over ``site`` is the lowest.
             last = -1
             for q in range(length):
                 if height[q] == _NONE:
@@ -86,7 +86,7 @@ def _along(squared: NDArray[np.int32], inside: NDArray[np.bool_]) -> None:
 
 @njit(parallel=True, cache=True)
 def _rooted(squared: NDArray[np.int32], inside: NDArray[np.bool_], distance: NDArray[np.float32]) -> None:
-    """Signed roots; ``distance`` may be the memory of ``squared``."""
+    """Writes the signed roots to ``distance``, which may share the memory of ``squared``."""
     for n in prange(len(squared)):
         root = np.inf if squared[n] == _NONE else np.sqrt(np.float64(squared[n]))
         distance[n] = np.float32(-root if inside[n] else root)

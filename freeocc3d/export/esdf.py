@@ -1,11 +1,12 @@
-"""Euclidean signed distances to the nearest obstacle, for trajectory optimisers: NumPy arrays, or OpenVDB (`.vdb`).
+"""Euclidean signed distances to the nearest obstacle, for trajectory optimizers: NumPy arrays, or OpenVDB (`.vdb`).
 
 Keys of the arrays:
     distance (X, Y, Z) float32, meters, from a voxel's center to the face of the nearest obstacle: to its center, less
-    half a voxel; negative within obstacles, to the nearest voxel that is none; NaN for unknown with `unknown=nan`
+    half a voxel; negative within obstacles, to the nearest voxel that is no obstacle; NaN for unknown with
+    `unknown=nan`
     state (X, Y, Z) uint8: 0 free, 1 occupied, 255 unknown; origin (3,) lower corner of voxel (0, 0, 0); voxel_size
     meters; frame; T_frame_map and T_world_map (4, 4)
-A .vdb has one grid `distance`, whose active voxels are the known ones, others reading 0; index 0 is a voxel's center.
+A .vdb has one grid `distance`. Its active voxels are the known ones; others read 0. Index 0 is a voxel's center.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from .openvdb_files import write_vdb
 
 REQUIRES: tuple[str, ...] = ()
 
-_BYTES_A_VOXEL = 6  # distance, state, and whether it is an obstacle
+_BYTES_A_VOXEL = 6  # distance, state and the obstacle mask
 _LARGEST = 2 << 30
 _BLOCKS_AT_ONCE = 1024
 _LOCAL = np.stack(np.unravel_index(np.arange(BLOCK**3), (BLOCK,) * 3), axis=1)
@@ -34,20 +35,20 @@ UNKNOWN_IS = "free", "obstacle", "nan"
 
 
 class Options(VoxelOptions, frozen=True):
-    """Frame, and what unknown space is; a name that ends in .npz gives arrays, in .vdb an OpenVDB grid."""
+    """Frame, and the meaning of unknown space. A name ending in .npz gives arrays, one in .vdb an OpenVDB grid."""
 
     unknown: Literal["free", "obstacle", "nan"] = "free"
-    """Unknown space: "free" is no obstacle, "obstacle" is one, "nan" is none and has no distance itself."""
+    """Unknown space: "free" is no obstacle, "obstacle" is an obstacle, "nan" is no obstacle and has no distance."""
     box: Box | None = None
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in meters: only voxels whose centers lie in
-    it are written, and only obstacles in it count; null = all."""
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in meters. Only voxels with centers in the
+    box are written, and only obstacles in it count; null = all."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the distances. Raises ConfigError for another ending, ExportError if the map has no obstacle, or would not
-    fit into 2 GiB."""
+    """Writes the distances. Raises ConfigError for another ending, ExportError if the map has no obstacle, or if the
+    distances do not fit into 2 GiB."""
     if path.suffix not in (".npz", ".vdb"):
-        raise ConfigError(f"Distances are written to .npz or .vdb, got '{path.name}'.")
+        raise ConfigError(f"Distances are written as .npz or .vdb, got '{path.name}'.")
     there = place_voxels(scan_map, options.frame, one_size=True, box=options.box)
     distance, state, origin = signed_distances(there.occupancy, options.unknown)
     if path.suffix == ".vdb":
@@ -67,7 +68,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 
 
 def _write_grid(path: Path, there: PlacedVoxels, distance: NDArray[np.float32]) -> None:
-    """The distances of the known voxels, block by block."""
+    """Writes the distances of the known voxels, block by block."""
     occupancy = there.occupancy
     known = occupancy.state != UNKNOWN
     low = known_box(occupancy)[0]
@@ -84,12 +85,12 @@ def _write_grid(path: Path, there: PlacedVoxels, distance: NDArray[np.float32]) 
 def signed_distances(
     occupancy: Occupancy, unknown: str
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float64]]:
-    """(X, Y, Z) distances and states over the box of all known voxels, which are of one size, and the (3,) lower corner
-    of the box. Exact; raises ExportError as ``write`` does."""
+    """Returns the exact (X, Y, Z) distances and the states over the box of all known voxels, and the (3,) lower corner
+    of the box. Voxels must be of one size. Raises ExportError as ``write`` does."""
     state, origin = states(occupancy)
     obstacle = state != FREE if unknown == "obstacle" else state == OCCUPIED
     if not obstacle.any():
-        raise ExportError("The map has no obstacle, so that there is no distance to one.")
+        raise ExportError("The map has no obstacle, so there are no distances.")
     distance = transform_signed(obstacle)
     distance[obstacle] += np.float32(0.5)
     np.subtract(distance, np.float32(0.5), out=distance, where=~obstacle)
@@ -100,15 +101,15 @@ def signed_distances(
 
 
 def states(occupancy: Occupancy) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """(X, Y, Z) states over the box of all known voxels, which are of one size, and its lower corner. Raises
-    ExportError where distances over it would not fit into 2 GiB, or nothing is known."""
+    """Returns the (X, Y, Z) states over the box of all known voxels, and the box's lower corner. Voxels must be of one
+    size. Raises ExportError if distances over the box do not fit into 2 GiB, or if nothing is known."""
     low, high = known_box(occupancy)
     shape = high - low
     size = _BYTES_A_VOXEL * float(np.prod(shape.astype(np.float64)))
     if size > _LARGEST or shape.max() > LONGEST:
         raise ExportError(
             f"Distances in {' x '.join(map(str, shape))} voxels take {size / 2**30:.1f} GiB of memory: export a part "
-            "of the map with --set box=…, or map with larger voxels."
+            "of the map with --set box=…, or reconstruct it with larger voxels."
         )
     grid = np.full(shape, UNKNOWN, np.uint8)
     for start in range(0, len(occupancy.keys), _BLOCKS_AT_ONCE):
@@ -120,11 +121,11 @@ def states(occupancy: Occupancy) -> tuple[NDArray[np.uint8], NDArray[np.float64]
 
 
 def known_box(occupancy: Occupancy) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(3,) indices of the first voxel of the box of all known ones, which are of one size, and of the voxel behind it.
-    Raises ExportError if nothing is known."""
+    """Returns the (3,) index of the first voxel in the box of all known voxels, and the (3,) index after the last.
+    Voxels must be of one size. Raises ExportError if nothing is known."""
     known = (occupancy.state != UNKNOWN).reshape(-1, BLOCK, BLOCK, BLOCK)
     if not known.any():
-        raise ExportError("Nothing of the map is known: there are no distances to write.")
+        raise ExportError("The map has no known voxels, so there are no distances to write.")
     low, high = np.zeros(3, np.int64), np.zeros(3, np.int64)
     for axis in range(3):
         others = tuple(1 + other for other in range(3) if other != axis)

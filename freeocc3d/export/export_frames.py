@@ -1,4 +1,4 @@
-"""The frames that exports may be in, and a map's voxels brought to one of them."""
+"""The frames of exports. Brings a map's voxels into one of them."""
 
 from __future__ import annotations
 
@@ -18,43 +18,44 @@ from ..settings.option_types import Finite, converted
 from ..settings.typed_options import TypedOptions
 
 Frame = Literal["map", "gravity", "first-camera"]
-"""The map's frame; z up with the floor at z = 0 and the walls along x and y; z up with the first camera at the origin,
-looking along x."""
+"""The map's frame; z up with the floor at z = 0 and the walls along x and y; z up with the first camera at the origin
+and its view along x."""
 UprightFrame = Literal["gravity", "first-camera"]
-"""Those in which z points up."""
+"""The frames in which z points up."""
 Box = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 
 class BoxOptions(TypedOptions, frozen=True):
-    """The part of a map that is written."""
+    """The part of a map to write."""
 
     box: Box | None = None
-    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in meters: only voxels whose centers lie in
-    it are written; null = all."""
+    """Lower and upper corner of a box in the frame, x0, y0, z0, x1, y1, z1 in meters. Only voxels with centers in the
+    box are written; null = all."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.box is not None and not np.less(self.box[:3], self.box[3:]).all():
             raise ConfigError(
-                "'box' has a lower and an upper corner, x0, y0, z0, x1, y1, z1 in meters, each of the first three less "
-                f"than its counterpart; got {', '.join(f'{value:g}' for value in self.box)}."
+                "'box' takes a lower and an upper corner, x0, y0, z0, x1, y1, z1 in meters, with x0 < x1, y0 < y1 and "
+                f"z0 < z1; got {', '.join(f'{value:g}' for value in self.box)}."
             )
 
 
 class VoxelOptions(BoxOptions, frozen=True):
-    """The frame of the voxels that are written, and which of them are."""
+    """The frame of the written voxels, and the part of the map to write."""
 
     frame: Frame = "gravity"
-    """"gravity" (z up, floor at 0), "first-camera" (z up, origin there) or "map". Voxels keep their places only in the
-    map's frame; for the others they are resampled."""
+    """"gravity" (z up, floor at 0), "first-camera" (z up, first camera at the origin) or "map". Voxels keep their
+    places only in the map's frame; the other frames resample them."""
 
 
 @dataclass(frozen=True)
 class PlacedVoxels:
     """Voxels in a frame.
 
-    occupancy: in coordinates of the frame, without features where it is not the map's own.  rows: (V,) row of the map's
-    occupied voxel that each occupied one stands for.  T_frame_map: (4, 4).  metric: whether lengths are meters.
+    occupancy: in coordinates of the frame, without features unless it is the map's own.  rows: (V,) for each occupied
+    voxel, the row of the map's occupied voxel that it stands for.  T_frame_map: (4, 4).  metric: whether lengths are
+    meters.
     """
 
     occupancy: Occupancy
@@ -65,11 +66,11 @@ class PlacedVoxels:
 
     @property
     def unit(self) -> str:
-        """What lengths are in."""
+        """The unit of lengths, in words."""
         return "meters" if self.metric else "units of unknown length"
 
     def described(self) -> dict[str, Any]:
-        """What a reader of an export has to know of its frame; of plain values."""
+        """Returns what a reader of an export must know about its frame, as plain values."""
         return {
             "frame": self.frame,
             "T_frame_map": self.T_frame_map.tolist(),
@@ -80,7 +81,8 @@ class PlacedVoxels:
 
 
 def to_frame(scan_map: Map, frame: str) -> NDArray[np.float64]:
-    """(4, 4) ``T_frame_map`` of a frame, by its name. Raises ConfigError for another name."""
+    """Returns the (4, 4) ``T_frame_map`` of a named frame. Raises ConfigError for an unknown name, ExportError for a
+    map without a first camera."""
     converted(Frame, frame, "frame")
     if frame == "map":
         return np.eye(4)
@@ -102,13 +104,15 @@ def place_voxels(
     one_size: bool = False,
     box: Box | None = None,
 ) -> PlacedVoxels:
-    """The map's voxels in a frame. In the map's frame they stay what they are; in another they are resampled on a
-    lattice of the map's voxel size (the largest, of a map of several), and so they are where ``one_size`` asks for it
-    or where ``origin``, a place of the new lattice, does not lie on the old one.
+    """Returns the map's voxels in a frame.
 
-    origin: (3,) lower corner of some voxel, in the frame; by default such that z = 0 lies amid a layer of voxels, the
-    map's lattice in the map's frame.  box: x0, y0, z0, x1, y1, z1 in the frame: what lies outside of it, by voxels'
-    centers, is unknown. Raises ExportError for a map of which nothing is known, there.
+    In the map's frame, voxels keep their places. In another frame, they are resampled on a lattice of the map's
+    (largest) voxel size. They are also resampled if ``one_size`` asks for it, or if ``origin`` is not on the map's
+    lattice.
+
+    origin: (3,) lower corner of some voxel, in the frame; by default the map's lattice in the map's frame, else z = 0
+    lies in the middle of a layer of voxels.  box: x0, y0, z0, x1, y1, z1 in the frame; voxels with centers outside of
+    it become unknown. Raises ExportError if nothing is known, or nothing in the box.
     """
     there = _placed(scan_map, frame, origin, one_size)
     return _within(there, np.array(box).reshape(2, 3)) if box is not None else there
@@ -120,7 +124,7 @@ def _placed(scan_map: Map, frame: str, origin: ArrayLike | None, one_size: bool)
 
     occupancy, T = scan_map.occupancy, to_frame(scan_map, frame)
     if not len(occupancy.keys):
-        raise ExportError("The map has no voxel to write.")
+        raise ExportError("The map has no known voxels to write.")
     own = frame == "map" and _on_lattice(occupancy, origin)
     if own and not (one_size and occupancy.deepest):
         return PlacedVoxels(occupancy, np.arange(len(occupancy.colors)), frame, T, scan_map.metric)
@@ -145,7 +149,9 @@ def _within(there: PlacedVoxels, corners: NDArray[np.float64]) -> PlacedVoxels:
         known = centers[(occupancy.state != UNKNOWN).any(axis=1)]
         low, high = known.min(axis=(0, 2)), known.max(axis=(0, 2))
         spans = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high, strict=True))
-        raise ExportError(f"Nothing of the map lies in the box: in the {there.frame} frame it reaches from {spans} m.")
+        raise ExportError(
+            f"Nothing of the map lies in the box: in the {there.frame} frame the map reaches from {spans} m."
+        )
     kept = inside[occupancy.state == OCCUPIED]
     part = occupancy.replace(
         features=occupancy.features[kept],
@@ -158,19 +164,19 @@ def _within(there: PlacedVoxels, corners: NDArray[np.float64]) -> PlacedVoxels:
 
 
 def find_floor_z(scan_map: Map, T_frame_map: NDArray[np.float64]) -> float:
-    """Height of the floor in a frame whose z points up, meters."""
+    """Returns the height of the floor in a frame with z up, meters."""
     return float((T_frame_map @ invert(scan_map.T_gravity_map))[2, 3])
 
 
 def write_description(path: Path, described: dict[str, Any]) -> None:
-    """Write ``PATH.json`` next to an export whose format cannot say its frame. Raises OSError."""
+    """Writes ``PATH.json`` next to an export, for formats that cannot hold the frame. Raises OSError."""
     unit = "metre" if described.get("metric", True) else "unknown"
     text = json.dumps({"file": path.name, "unit": unit, **described}, indent=1)
     path.with_name(f"{path.name}.json").write_text(text + "\n", encoding="utf-8")
 
 
 def find_world(scan_map: Map, T_frame_map: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) from the frame to the world that the map's ``T_world_map`` leads to."""
+    """Returns the (4, 4) transform from the frame to the world of the map's ``T_world_map``."""
     return np.asarray(np.array(scan_map.manifest.T_world_map, np.float64) @ invert(T_frame_map))
 
 
@@ -182,7 +188,7 @@ def _on_lattice(occupancy: Occupancy, origin: ArrayLike | None) -> bool:
 
 
 def _nearest(occupancy: Occupancy, one: Occupancy) -> NDArray[np.int64]:
-    """(V,) row of the occupied voxel nearest to each of a map made of the same voxels."""
+    """Returns, for each occupied voxel of ``one``, the (V,) row of the nearest occupied voxel of the original map."""
     from scipy.spatial import KDTree
 
     if not len(one.colors):

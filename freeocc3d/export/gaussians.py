@@ -16,17 +16,17 @@ REQUIRES: tuple[str, ...] = ()
 
 
 class Options(TypedOptions, frozen=True):
-    """Frame and orientation; NAME.json next to the file holds the transform from the map."""
+    """Frame and orientation. NAME.json next to the file holds the transform from the map."""
 
     upright: bool = True
-    """Turn the frame so that up is -y, as viewers of such files expect; false = the frame's own axes, in the map's the
-    first camera's, which looks along +z with y down."""
+    """Turn the frame so that up is -y, as viewers of such files expect; false = keep the frame's axes. In the map's
+    frame these are the first camera's: view along +z, y down."""
     frame: Frame = "map"
-    """"map", "gravity" (floor at 0) or "first-camera" (origin there)."""
+    """"map", "gravity" (floor at 0) or "first-camera" (first camera at the origin)."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the Gaussians. Raises ExportError for a map without any."""
+    """Writes the Gaussians. Raises ExportError for a map without Gaussians."""
     from ..gaussians.anchors import align_gaussians
     from ..gaussians.splat_ply import write_standard_ply
 
@@ -47,7 +47,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 
 
 def _to_minus_y(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The least rotation (3, 3) that takes a unit vector to (0, -1, 0); half a turn about x where that is opposite."""
+    """Returns the least rotation (3, 3) that takes a unit vector to (0, -1, 0); half a turn about x for (0, 1, 0)."""
     target = np.array((0.0, -1.0, 0.0))
     axis, cosine = np.cross(up, target), float(up @ target)
     if cosine < -1 + 1e-9:

@@ -1,9 +1,9 @@
-"""GeoJSON: what words find, as outlines on the floor for maps and fleet managers.
+"""GeoJSON: the regions of words as outlines on the floor, for maps and fleet managers.
 
 A FeatureCollection with one Polygon for each region: the convex outline of its voxels seen from above, x and y in
 meters of the frame (no longitudes), with word, score, confidence, centroid, height_min_m and height_max_m,
-area and volume. Members `frame` and `T_frame_map` of the collection say what frame that is, `unit`
-whether its lengths are meters. Source: RFC 7946.
+area and volume. The collection's members `frame` and `T_frame_map` give the frame; `unit` says whether lengths are
+meters. Source: RFC 7946.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ class Options(TypedOptions, frozen=True):
     words: tuple[str, ...] = ()
     """Words to ask, as in [sofa, chair]; none = all words that the map's encoder or a scene vocabulary names."""
     frame: UprightFrame = "gravity"
-    """"gravity" (walls along x and y) or "first-camera" (origin there, x where it looked)."""
+    """"gravity" (walls along x and y) or "first-camera" (first camera at the origin, its view along x)."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> list[str]:
-    """Write the regions; returns a sentence for each word that nothing matches, which has no feature, or of which only
-    a part is understood. Raises ExportError without any word to ask or voxel to find it in."""
+    """Writes the regions. Returns a sentence for each word that nothing matches (it has no feature in the file), or of
+    which the encoder understands only a part. Raises ExportError for a map without words or without occupied voxels."""
     words = list(options.words) or scan_map.vocabulary
     if not words:
-        raise ExportError("The map has no vocabulary of its own: name words with --set 'words=[sofa, chair]'.")
+        raise ExportError("The map has no vocabulary: give words with --set 'words=[sofa, chair]'.")
     T_frame_map = to_frame(scan_map, options.frame)
     occupancy = scan_map.occupancy
     if not len(occupancy.colors):
-        raise ExportError("The map has no occupied voxel, in which words could be found.")
+        raise ExportError("The map has no occupied voxels, so words find nothing.")
     voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
 
     def corners(rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """(8 N, 3) corners of N voxels, in the frame."""
+        """Returns the (8 N, 3) corners of N voxels, in the frame."""
         lattice = voxels[rows, None] + _CORNERS * edges[rows, None, None]
         return transform(T_frame_map, occupancy.origin + lattice.reshape(-1, 3) * occupancy.finest)
 
@@ -89,10 +89,10 @@ def _feature(word: str, region: Region, corners: NDArray[np.float64], centroid: 
 
 
 def outline(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """The convex hull of (N, 2) points that do not lie on a line, as a closed counter-clockwise ring of
-    corners to the millimeter, and its area."""
+    """Returns the convex hull of (N, 2) points that do not lie on a line, as a closed counter-clockwise ring of corners
+    rounded to the millimeter, and its area."""
     from scipy.spatial import ConvexHull
 
     points = np.round(points[ConvexHull(points).vertices], 3)
-    hull = ConvexHull(points)  # again, for a turned lattice's corners along an edge are not quite on one line
+    hull = ConvexHull(points)  # once more: corners of a turned lattice along an edge are not quite on one line
     return points[np.append(hull.vertices, hull.vertices[0])], float(hull.volume)

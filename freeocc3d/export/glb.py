@@ -1,7 +1,7 @@
 """glTF binary: the occupied voxels as a colored mesh for Blender, Unity, Unreal and web viewers.
 
-One mesh of the faces between occupied and other voxels, in the frame's coordinates; its node turns it so that up is +y,
-as glTF has it. The node's `extras` say which frame that is. Source: glTF 2.0 specification, Khronos Group.
+One mesh holds the faces between occupied and other voxels, in the frame's coordinates. Its node turns it so that up is
++y, as glTF requires. The node's `extras` name the frame. Source: glTF 2.0 specification, Khronos Group.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ class Options(VoxelOptions, frozen=True):
     """Frame and color."""
 
     color: ColorBy = "rgb"
-    """"rgb" for the surface's own color, "class", "height" or "probability", as of `ply`."""
+    """"rgb" for the surface's own color, "class", "height" or "probability", as in `ply`."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the mesh. Raises ExportError for a map without an occupied voxel."""
+    """Writes the mesh. Raises ExportError for a map without occupied voxels."""
     there = place_voxels(scan_map, options.frame, box=options.box)
     if not len(there.occupancy.colors):
-        raise ExportError("There is no occupied voxel to write.")
+        raise ExportError("The map has no occupied voxels to write.")
     positions, quads, rows = find_exposed_faces(there.occupancy)
     triangles = quads[:, (0, 1, 2, 0, 2, 3)].astype(np.uint32)
-    colors = np.full((len(positions), 4), 255, np.uint8)  # with alpha, for attributes begin at multiples of 4 bytes
+    colors = np.full((len(positions), 4), 255, np.uint8)  # with alpha, because attributes begin at multiples of 4 bytes
     colors[:, :3] = np.repeat(_linear(choose_colors(scan_map, there, options.color))[rows], 4, axis=0)
     turned = np.eye(4)
     turned[:3, :3] = (_Z_UP_TO_Y_UP @ scan_map.T_gravity_map @ invert(there.T_frame_map))[:3, :3]
@@ -90,7 +90,7 @@ def _described(
 
 
 def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Colors of the screen, sRGB, as the light that a renderer computes with and glTF's vertex colors are."""
+    """Returns sRGB screen colors as linear light, which renderers compute with and glTF's vertex colors hold."""
     c = np.arange(256) / 255.0
     table = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     return np.rint(255 * table).astype(np.uint8)[colors]

@@ -1,7 +1,7 @@
 """Costs of words for planners: masks for Nav2's KeepoutFilter, over the cells of a plan.
 
-A mask holds 0 where no word has a cost, 100 where a robot must not be, and 1 to 99 where it may be at that cost.
-Nav2 takes them as they are for `type: 0, base: 0.0, multiplier: 1.0` of its costmap filter info server.
+A mask holds 0 where no word has a cost, 100 where a robot must not go, and 1 to 99 where it may go at that cost.
+Nav2 uses these values unchanged with `type: 0, base: 0.0, multiplier: 1.0` of its costmap filter info server.
 Source: nav2_costmap_2d's KeepoutFilter, nav2_map_server's map_io.
 """
 
@@ -23,7 +23,7 @@ from .export_frames import PlacedVoxels
 from .map_server_files import COSTS, CellGrid, encode_costs, write_map
 
 TOGETHER = "avoid"
-"""What the mask of all words together is called."""
+"""Name of the mask of all words together."""
 _FORBIDDEN = 100
 _FARTHEST = 1000.0  # meters
 _SYNTAX = "as in carpet, glass:0.5 (meters to keep from it) or plant:0.5:60% (a cost that falls off over them)"
@@ -31,7 +31,7 @@ _SYNTAX = "as in carpet, glass:0.5 (meters to keep from it) or plant:0.5:60% (a 
 
 @dataclass(frozen=True)
 class Avoided:
-    """A word with the meters to keep from it, and the cost of being there in per cent; 100 is not allowed."""
+    """A word, the distance to keep from it in meters, and the cost of going there in percent; 100 forbids it."""
 
     word: str
     meters: float = 0.0
@@ -39,18 +39,18 @@ class Avoided:
 
     @property
     def file_part(self) -> str:
-        """The word as a part of a file's name."""
+        """The word as a part of a file name."""
         return re.sub(r"\W+", "_", self.word) or "_"
 
 
 def parse_avoided(entries: Sequence[str]) -> list[Avoided]:
-    """``WORD``, ``WORD:METERS``, ``WORD:COST%`` or ``WORD:METERS:COST%``. Raises ConfigError."""
+    """Reads ``WORD``, ``WORD:METERS``, ``WORD:COST%`` or ``WORD:METERS:COST%``. Raises ConfigError."""
     found = [_parsed(entry) for entry in entries]
     parts = [TOGETHER, *(avoided.file_part for avoided in found)]
     if len(set(parts)) < len(parts):
         raise ConfigError(
-            "'avoid' names two words whose masks would have the same file name, or a word whose mask would be called "
-            f"'{TOGETHER}' like the mask of all words: leave one out."
+            "'avoid' names two words with the same mask file name, or a word with the file name of the mask of all "
+            f"words, '{TOGETHER}': leave one word out."
         )
     return found
 
@@ -63,18 +63,18 @@ def _parsed(entry: str) -> Avoided:
     except ValueError:
         meters = cost = np.nan
     if not word or numbers or not (0 <= meters <= _FARTHEST and 1 <= cost <= _FORBIDDEN and cost == int(cost)):
-        raise ConfigError(f"'avoid' takes words, {_SYNTAX}, costs being whole and 1 to 100, got '{entry}'.")
+        raise ConfigError(f"'avoid' takes words, {_SYNTAX}, with whole costs from 1 to 100; got '{entry}'.")
     return Avoided(word, meters, int(cost))
 
 
 def write_layers(
     scan_map: Map, path: Path, there: PlacedVoxels, avoided: Sequence[Avoided], grid: CellGrid, highest: float
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Write a mask for each word and one of all, NAME.WORD.yaml and NAME.avoid.yaml for a plan NAME.yaml. Returns
-    what was written, and a sentence for each word that is nowhere, so that its mask is empty, or half understood.
+    """Writes a mask for each word and one for all words: NAME.WORD.yaml and NAME.avoid.yaml for a plan NAME.yaml.
+    Returns what it wrote, and a sentence for each word that is nowhere (its mask is empty) or only partly understood.
 
-    highest: z in the frame up to which a thing counts; a robot drives under what is higher. Raises ExportError for a
-    word that the map does not understand: an empty mask would look as if there were nothing to avoid.
+    highest: z in the frame up to which a thing counts; a robot drives under higher things. Raises ExportError for a
+    word that the map does not understand: an empty mask would say that there is nothing to avoid.
     """
     if not avoided:
         return [], []
@@ -93,7 +93,7 @@ def write_layers(
         if not inside.any():
             why = result.note if not len(rows) else f"All of '{one.word}' lies above the robot's height."
             notes.append(f"{why} Its mask {path.stem}.{one.file_part}.yaml is empty.")
-        elif result.note:  # of the word, only a part was understood
+        elif result.note:  # only a part of the word was understood
             notes.append(result.note)
         layer = path.with_name(f"{path.stem}.{one.file_part}.yaml")
         about = f"costs of {json.dumps(one.word)}: {_about(one)}"
@@ -110,8 +110,8 @@ def write_layers(
 def compute_cost_map(
     cells: NDArray[np.int64], shape: tuple[int, int], size: float, avoided: Avoided
 ) -> NDArray[np.uint8]:
-    """(X, Y) costs 0…100 around (N, 2) cells, which may lie outside of the plan: the cost on them, and 100 within the
-    distance, or a lower one that falls off evenly over it. Distances are Euclidean, between the cells' centers."""
+    """Returns the (X, Y) costs 0…100 around (N, 2) cells, which may lie outside of the plan. A cost of 100 holds within
+    the whole distance; a lower cost falls off evenly over it. Distances are Euclidean, between the cells' centers."""
     from scipy import ndimage
 
     costs = np.zeros(shape, np.uint8)

@@ -1,6 +1,6 @@
-"""The pair of files that ROS map_server reads: NAME.yaml and NAME.pgm.
+"""Writes the pair of files that ROS map_server reads: NAME.yaml and NAME.pgm.
 
-`origin` is the lower left corner of the lower left pixel, and the top row of the image is the largest y.
+`origin` is the lower left corner of the lower left pixel. The top row of the image has the largest y.
 Source: nav2_map_server's map_io.
 """
 
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Where cells are: x of cell (i, j) is origin[0] + [i, i + 1) * size, meters; y likewise of j.
+    """The places of cells: cell (i, j) covers x = origin[0] + [i, i + 1) * size, meters, and y likewise with j.
 
-    origin: (2,) lower corner of cell (0, 0).  frame: name of the frame that this is in.
+    origin: (2,) lower corner of cell (0, 0).  frame: name of the frame of the coordinates.
     """
 
     origin: NDArray[np.float64]
@@ -28,8 +28,9 @@ class CellGrid:
 
 @dataclass(frozen=True)
 class Reading:
-    """What a pixel p is read as: with o = 1 - p / 255, occupied (100) where o > occupied, free (0) where o < free, and
-    between them unknown (-1) in mode "trinary", or the share of the way from free to occupied in per cent in "scale".
+    """How map_server reads a pixel p. With o = 1 - p / 255, it is occupied (100) if o > occupied, and free (0) if o <
+    free. Between them it is unknown (-1) in mode "trinary"; in mode "scale" it is the percentage of the way from free
+    to occupied.
     """
 
     mode: str
@@ -38,18 +39,18 @@ class Reading:
 
 
 PLAN = Reading("trinary", 0.65, 0.196)
-"""An unknown pixel, 205, is 0.19608, which 0.196 does not take for free."""
+"""An unknown pixel, 205, is 0.19608, so a threshold of 0.196 does not read it as free."""
 COSTS = Reading("scale", 0.999, 0.001)
-"""White is 0 and black 100; ``encode_costs`` are read as what they were."""
+"""White is 0 and black is 100; map_server reads the pixels of ``encode_costs`` as the costs."""
 
 
 def encode_costs(costs: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Pixels that are read as costs 0…100 with COSTS."""
+    """Returns the pixels that read as costs 0…100 with COSTS."""
     return np.rint(255 - 2.55 * costs.astype(np.float64)).astype(np.uint8)
 
 
 def write_map(path: Path, pixels: NDArray[np.uint8], grid: CellGrid, reading: Reading, about: str) -> None:
-    """Write ``path``, a .yaml, and the image of (X, Y) pixels next to it: x to the right, y upwards. Raises OSError."""
+    """Writes ``path``, a .yaml, and the image of (X, Y) pixels next to it: x to the right, y up. Raises OSError."""
     image = path.with_suffix(".pgm")
     rows = np.ascontiguousarray(pixels.T[::-1])
     image.write_bytes(f"P5\n{rows.shape[1]} {rows.shape[0]}\n255\n".encode("ascii") + rows.tobytes())

@@ -1,10 +1,10 @@
-"""ROS map_server and Nav2: `map.yaml` and `map.pgm`, a plan of what stands between two heights above the floor.
+"""ROS map_server and Nav2: `map.yaml` and `map.pgm`, a plan of the obstacles between two heights above the floor.
 
-A pixel is occupied (0) where any voxel of its column between the heights is; else free (254) where enough of them are
-free; else unknown (205). The floor lies below the lower height and is no obstacle. The top row is the largest y,
-`origin` the lower left corner of the lower left pixel, as map_server reads them. NAME.yaml.json holds the frame.
-`avoid` adds a layer of costs a word, NAME.WORD.yaml and .pgm of the same cells, and NAME.avoid.yaml of all words: masks
-for Nav2's KeepoutFilter. Source: nav2_map_server's map_io.
+A pixel is occupied (0) if any voxel of its column between the heights is occupied; else free (254) if enough of them
+are free; else unknown (205). The floor lies below the lower height and is no obstacle. The top row has the largest y,
+and `origin` is the lower left corner of the lower left pixel, as map_server expects. NAME.yaml.json holds the frame.
+`avoid` adds masks for Nav2's KeepoutFilter with the same cells: NAME.WORD.yaml and .pgm with the costs of each word,
+and NAME.avoid.yaml with the costs of all words. Source: nav2_map_server's map_io.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ _MOST_PIXELS = 1 << 28
 
 
 class Options(BoxOptions, frozen=True):
-    """The robot's heights, and what counts as free."""
+    """The heights of obstacles, and what counts as free."""
 
     frame: UprightFrame = "gravity"
-    """"gravity" (walls along x and y) or "first-camera" (origin there, x where it looked)."""
+    """"gravity" (walls along x and y) or "first-camera" (first camera at the origin, its view along x)."""
     min_height: Finite = 0.1
-    """Meters above the floor from which something is an obstacle; what is lower is driven over."""
+    """Least height of an obstacle above the floor, meters. The robot drives over lower things."""
     max_height: Positive = 1.8
-    """Meters above the floor up to which something is an obstacle; what is higher is driven under."""
+    """Greatest height of an obstacle above the floor, meters. The robot drives under higher things."""
     min_free: Share = 0.5
-    """Share of a column's voxels between the heights that have to be free for its cell to be free, 0…1; 0 = any."""
+    """Least share of a column's voxels between the heights that must be free for a free cell, 0…1; 0 = any."""
     inflation: NotNegative = 0.0
-    """Meters around obstacles that are occupied as well; planners mostly inflate by themselves."""
+    """Radius around obstacles that is occupied too, meters; most planners inflate obstacles themselves."""
     avoid: tuple[str, ...] = ()
-    """Words whose places cost a robot, as in [carpet:40%, glass:0.5]: WORD is not to be entered, WORD:METERS to be kept
-    this far from, WORD:COST% may be entered at a cost of 1 to 99, and WORD:METERS:COST% near by at a cost that falls to
-    0 over the meters. What hangs above max_height does not count."""
+    """Words with a cost for the robot, as in [carpet:40%, glass:0.5]. WORD: the robot must not enter. WORD:METERS: it
+    must keep this distance. WORD:COST%: it may enter at a cost of 1 to 99. WORD:METERS:COST%: the cost falls to 0 over
+    the distance. Things above max_height do not count."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -54,10 +54,10 @@ class Options(BoxOptions, frozen=True):
 
 
 def write(scan_map: Map, path: Path, options: Options) -> list[str]:
-    """Write the plan; returns a sentence for each word to avoid that is nowhere. Raises ConfigError unless the file is
-    named .yaml, ExportError if nothing is known between the heights, or of a word."""
+    """Writes the plan. Returns a sentence for each word to avoid that is nowhere. Raises ConfigError unless the file is
+    named .yaml, ExportError if nothing is known between the heights, or if the map does not understand a word."""
     if path.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"A map_server map is named by its .yaml, got '{path.name}'.")
+        raise ConfigError(f"The name of a map_server map must end in .yaml, got '{path.name}'.")
     there = place_voxels(scan_map, options.frame, box=options.box)
     floor, size = find_floor_z(scan_map, there.T_frame_map), there.occupancy.voxel_size
     cells, origin = plan(there.occupancy, floor + options.min_height, floor + options.max_height, options.min_free)
@@ -77,8 +77,9 @@ def write(scan_map: Map, path: Path, options: Options) -> list[str]:
 def plan(
     occupancy: Occupancy, low: float, high: float, min_free: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """(X, Y) FREE, OCCUPIED or UNKNOWN of the columns over the known voxels' box, from the voxels of one size whose
-    centers lie between two heights z, and the (2,) lower corner of cell (0, 0), meters. Raises ExportError."""
+    """Returns the (X, Y) plan, FREE, OCCUPIED or UNKNOWN, over the box of the known voxels, and the (2,) lower corner
+    of cell (0, 0), meters. Each column counts voxels with centers between two heights z; voxels must be of one size.
+    Raises ExportError."""
     size, (x0, y0, z0) = occupancy.voxel_size, occupancy.origin
     first, last = int(np.ceil((low - z0) / size - 0.5)), int(np.floor((high - z0) / size - 0.5))
     columns = {}
@@ -87,11 +88,13 @@ def plan(
         columns[state] = voxels[(voxels[:, 2] >= first) & (voxels[:, 2] <= last), :2]
     every = np.concatenate(list(columns.values()))
     if not len(every):
-        raise ExportError(f"Nothing is known between the heights {low:g} and {high:g} m: there is no plan to write.")
+        raise ExportError(f"Nothing is known between the heights {low:g} and {high:g} m, so there is no plan to write.")
     corner = every.min(axis=0)
     shape = every.max(axis=0).astype(np.int64) - corner + 1
     if shape.prod() > _MOST_PIXELS:
-        raise ExportError(f"A plan of {shape[0]} x {shape[1]} cells is too large: map with larger voxels.")
+        raise ExportError(
+            f"A plan of {shape[0]} x {shape[1]} cells is too large: reconstruct the map with larger voxels."
+        )
     counts = {
         state: np.bincount((at - corner) @ np.array((shape[1], 1)), minlength=int(shape.prod())).reshape(shape)
         for state, at in columns.items()
@@ -103,7 +106,7 @@ def plan(
 
 
 def inflate(cells: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
-    """The plan with every cell within ``radius`` cells of an occupied one occupied."""
+    """Returns the plan with all cells within ``radius`` cells of an occupied cell occupied."""
     from scipy import ndimage
 
     if not (cells == OCCUPIED).any():

@@ -3,14 +3,14 @@
 Keys of the dense form (`form=dense`), over the box of all known voxels:
     occupancy (X, Y, Z) uint8: 0 free, 1 occupied, 255 unknown
     probability (X, Y, Z) float16: alpha of the voxel's center
-    labels (X, Y, Z) uint8: 0 free, k = classes[k - 1], len(classes) + 1 = occupied by nothing known, 255 unknown
-    classes (C,) names, C = 0 without a vocabulary; at most 253, so that every label fits into a byte
+    labels (X, Y, Z) uint8: 0 free, k = classes[k - 1], len(classes) + 1 = occupied by an unknown class, 255 unknown
+    classes (C,) names, C = 0 without a vocabulary; no more than 253, so that every label fits into a byte
     origin (3,) lower corner of voxel (0, 0, 0), meters; voxel_size meters; frame, the name of the arrays' frame;
     T_world_map (4, 4) from the arrays' frame to the map's world
-Of the sparse form: voxels (V, 3) int32 indices, state (V,) uint8 as above, probability (V,), labels (V,), classes,
-origin, voxel_size, frame, T_world_map; voxel (i, j, k) covers origin + [i, i + 1) * voxel_size in both. Of a map of
-several voxel sizes, voxel_size is the smallest; larger voxels fill as many as they cover in the dense form, and the
-sparse one has edges (V,) int32 too: voxel (i, j, k) covers origin + [i, i + edge) * voxel_size.
+Keys of the sparse form: voxels (V, 3) int32 indices, state (V,) uint8 as above, probability (V,), labels (V,), classes,
+origin, voxel_size, frame, T_world_map. In both forms, voxel (i, j, k) covers origin + [i, i + 1) * voxel_size. In a map
+of several voxel sizes, voxel_size is the smallest. In the dense form, a larger voxel fills all cells that it covers.
+The sparse form then also has edges (V,) int32: voxel (i, j, k) covers origin + [i, i + edge) * voxel_size.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from .export_frames import Frame, VoxelOptions, find_world, place_voxels
 REQUIRES: tuple[str, ...] = ()
 
 _LARGEST_DENSE = 2 << 30
-_MOST_CLASSES = 253  # 0 is free, 254 at the most stands for "nothing known", 255 is unknown
+_MOST_CLASSES = 253  # 0 is free, up to 254 means "nothing known", 255 is unknown
 
 
 class Options(VoxelOptions, frozen=True):
@@ -41,7 +41,7 @@ class Options(VoxelOptions, frozen=True):
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the arrays. Raises ExportError if the dense grid would not fit into memory."""
+    """Writes the arrays. Raises ExportError if the dense grid does not fit into memory."""
     form = dense if options.form == "dense" else sparse
     classes = scan_map.vocabulary[:_MOST_CLASSES]
     there = place_voxels(scan_map, options.frame, box=options.box)
@@ -57,7 +57,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 
 
 def sparse(occupancy: Occupancy, labels: NDArray[np.uint8], classes: int) -> dict[str, Any]:
-    """Known voxels, row by row; ``labels`` (V,) 0…classes of the occupied ones, 0 = nothing known."""
+    """Returns the known voxels, row by row. labels: (V,) 0…classes of the occupied voxels, 0 = nothing known."""
     block, local = np.nonzero(occupancy.state != UNKNOWN)
     state = occupancy.state[block, local]
     offsets = np.stack((local // 64, local // 8 % 8, local % 8), axis=1)
@@ -75,7 +75,7 @@ def sparse(occupancy: Occupancy, labels: NDArray[np.uint8], classes: int) -> dic
 
 
 def dense(occupancy: Occupancy, labels: NDArray[np.uint8], classes: int) -> dict[str, Any]:
-    """The grid over the box of all known voxels; an empty map gives arrays of shape (0, 0, 0)."""
+    """Returns the grid over the box of all known voxels; an empty map gives arrays of shape (0, 0, 0)."""
     known = sparse(occupancy, labels, classes)
     voxels, edges = known["voxels"], known.get("edges", np.ones(len(known["voxels"]), np.int32))
     low = voxels.min(axis=0) if len(voxels) else np.zeros(3, np.int32)

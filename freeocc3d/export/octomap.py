@@ -1,7 +1,7 @@
 """OctoMap: an octree of free and occupied space, `.bt` (free or occupied), `.ot` (with log-odds, and colors).
 
-Read by MoveIt, OMPL's examples, octovis and whatever links OctoMap. The tree's resolution is the map's smallest voxel;
-a map of several voxel sizes becomes leaves of other depths. NAME.json next to it holds the frame.
+MoveIt, OMPL's examples, octovis and all programs that link OctoMap read it. The tree's resolution is the map's smallest
+voxel; larger voxels become leaves of lower depth. NAME.json next to the file holds the frame.
 Source: the file formats of A. Hornung et al., OctoMap, Autonomous Robots 2013, as its library 1.9 writes them.
 """
 
@@ -23,23 +23,25 @@ REQUIRES: tuple[str, ...] = ()
 
 _CLAMP = np.log(0.1192 / 0.8808), np.log(0.971 / 0.029)
 """OctoMap's default range of log-odds."""
-_LEAST = 0.05  # log-odds: an occupied voxel has more, a free one less than the negative
-_UNSET = 255  # of all three channels: OctoMap's color of a node that has none
+_LEAST = 0.05  # log-odds: an occupied voxel has more, a free voxel less than the negative
+_UNSET = 255  # in all three channels: OctoMap's color of a node without color
 
 
 class Options(VoxelOptions, frozen=True):
-    """Frame, and whether there are colors; a name that ends in .bt gives the binary form, in .ot the full one."""
+    """Frame and colors. A name ending in .bt gives the binary form, one in .ot the full form."""
 
     color: bool = False
-    """Write a ColorOcTree, for .ot: occupied leaves have the surface's color."""
+    """Write a ColorOcTree (.ot only): occupied leaves have the surface's color."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the tree. Raises ConfigError for another ending than .bt and .ot or colors in a .bt; ExportError if
-    nothing is known, or the map is larger than a tree of its resolution can be."""
+    """Writes the tree. Raises ConfigError for an ending other than .bt and .ot, or for colors in a .bt; ExportError if
+    nothing is known, or if the map is too large for a tree of its resolution."""
     binary = path.suffix == ".bt"
     if not binary and path.suffix != ".ot":
-        raise ConfigError(f"An OctoMap file is named .bt (free or occupied) or .ot (log-odds), got '{path.name}'.")
+        raise ConfigError(
+            f"The name of an OctoMap file must end in .bt (free or occupied) or .ot (log-odds), got '{path.name}'."
+        )
     if binary and options.color:
         raise ConfigError("A .bt holds no colors: name the file .ot.")
     there = place_voxels(scan_map, options.frame, origin=(0.0, 0.0, 0.0), box=options.box)
@@ -54,18 +56,20 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 
 
 def collect_leaves(occupancy: Occupancy, log_odds: bool, color: bool) -> list[Leaves]:
-    """The known voxels by size, the smallest first. log_odds: values from the voxels' probabilities, which keep each
-    voxel on its side; else all occupied and all free ones have one. Raises ExportError as ``write`` does."""
+    """Returns the known voxels by size, the smallest first. log_odds: take values from the probabilities, with each
+    voxel on its side of 0; else all occupied voxels have one value and all free voxels another. Raises ExportError as
+    ``write`` does."""
     shift = np.rint(occupancy.origin / occupancy.finest).astype(np.int64)
     corners = np.concatenate([occupancy.voxels(state) for state in (OCCUPIED, FREE)]) + shift
     edges = np.concatenate([occupancy.edges(state) for state in (OCCUPIED, FREE)])
     if not len(corners):
-        raise ExportError("Nothing of the map is known, neither free nor occupied: there is no tree to write.")
+        raise ExportError("The map has no known voxels, free or occupied, so there is no tree to write.")
     if corners.min() < -KEY_ORIGIN or (corners + edges[:, None]).max() > KEY_ORIGIN:
         reach = KEY_ORIGIN * occupancy.finest
         raise ExportError(
-            f"The map reaches farther than {reach:.0f} m from its origin, which is as far as an octree of "
-            f"{occupancy.finest:g} m voxels goes: export a part of it with --set box=…, or map with larger voxels."
+            f"The map reaches farther than {reach:.0f} m from its origin, the limit of an octree of "
+            f"{occupancy.finest:g} m voxels: export a part of it with --set box=…, or reconstruct it with larger "
+            "voxels."
         )
     states = np.repeat((OCCUPIED, FREE), [np.count_nonzero(occupancy.state == state) for state in (OCCUPIED, FREE)])
     values = np.where(states == OCCUPIED, 1.0, -1.0).astype(np.float32)
@@ -86,12 +90,12 @@ def _log_odds(probability: NDArray[np.float32], occupied: NDArray[np.bool_]) -> 
 
 
 def _binary_nodes(tree: Octree) -> bytes:
-    """Two bytes for each node with children, two bits a child; leaves stand in their parents only."""
+    """Returns two bytes for each node with children, two bits per child. Leaves appear only in their parents."""
     return tree.kinds[tree.children > 0].astype("<u2").tobytes()
 
 
 def _full_nodes(tree: Octree, color: bool) -> bytes:
-    """Log-odds, color if any, and which children there are, for each node."""
+    """Returns, for each node, its log-odds, its color if any, and which children it has."""
     fields: list[tuple[Any, ...]] = [("value", "<f4"), *([("color", "u1", 3)] if color else []), ("children", "u1")]
     nodes = np.empty(len(tree), fields)
     nodes["value"], nodes["children"] = tree.values, tree.children

@@ -1,4 +1,4 @@
-"""Voxels of one or several sizes as an octree of OctoMap's shape, pruned and in the order of its files."""
+"""Turns voxels of one or several sizes into an octree of OctoMap's shape, pruned and in the order of its files."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 DEPTH = 16
 """Levels below the root: a leaf at full depth is one voxel."""
 KEY_ORIGIN = 1 << DEPTH - 1
-"""Key of the voxel whose lower corner is the tree's origin."""
+"""Key of the voxel with its lower corner at the tree's origin."""
 
 
 @dataclass(frozen=True)
 class Leaves:
     """Known cubes of one size.
 
-    corners: (N, 3) lower corners in voxels of full depth from the tree's origin, multiples of the cubes' edge.
+    corners: (N, 3) lower corners from the tree's origin, in voxels of full depth, multiples of the cubes' edge.
     values: (N,) float32 log-odds.  colors: (N, 3) uint8.
     """
 
@@ -32,12 +32,12 @@ class Leaves:
 
 @dataclass(frozen=True)
 class Octree:
-    """All nodes, depth first from the root, children in the order of their number: bit 0 = upper half along x, bit 1
-    along y, bit 2 along z.
+    """All nodes, depth first from the root, with children in the order of their numbers: bit 0 = upper half along x,
+    bit 1 along y, bit 2 along z.
 
-    values: (M,) float32 log-odds, of an inner node the largest of its children's.  colors: (M, 3) uint8, of an inner
-    node their mean.  children: (M,) uint8, bit i = child i is there, 0 = a leaf.  kinds: (M,) uint16, bits 2 i and
-    2 i + 1 say of child i: 0 unknown, 1 free, 2 occupied, 3 with children of its own.
+    values: (M,) float32 log-odds; an inner node has its children's largest.  colors: (M, 3) uint8; an inner node has
+    its children's mean.  children: (M,) uint8, bit i = child i exists, 0 = a leaf.  kinds: (M,) uint16, bits 2 i and
+    2 i + 1 describe child i: 0 unknown, 1 free, 2 occupied, 3 with its own children.
     """
 
     values: NDArray[np.float32]
@@ -51,7 +51,7 @@ class Octree:
 
 @dataclass(frozen=True)
 class _Level:
-    """Nodes of one depth by ascending Morton code."""
+    """Nodes of one depth, sorted by Morton code."""
 
     codes: NDArray[np.int64]
     values: NDArray[np.float32]
@@ -69,8 +69,9 @@ class _Level:
 
 
 def build_octree(levels: Sequence[Leaves]) -> Octree:
-    """The pruned tree of cubes that do not overlap, level n having edges of 2^n voxels: eight leaves of one value and
-    color become one of the next size. Corners must lie within the tree, [-KEY_ORIGIN, KEY_ORIGIN)."""
+    """Returns the pruned tree of cubes that do not overlap. Cubes of level n have edges of 2^n voxels. Pruning turns
+    eight leaves of one value and color into one leaf of the next size. Corners must lie within the tree, [-KEY_ORIGIN,
+    KEY_ORIGIN)."""
     below = _leaves(levels[0] if levels else None, 0)
     kept: list[_Level] = []
     for height in range(DEPTH):
@@ -79,7 +80,7 @@ def build_octree(levels: Sequence[Leaves]) -> Octree:
         own = _leaves(levels[height + 1] if height + 1 < len(levels) else None, height + 1)
         below = _Level.joined([parents, own])
     kept.append(below)
-    # Depth first: by the first voxel that a node holds, the larger node first.
+    # Depth first: sorts by a node's first voxel, with the larger node first.
     first = [level.codes << 3 * height for height, level in enumerate(kept)]
     order = np.argsort(
         np.concatenate([codes * (DEPTH + 1) + DEPTH - height for height, codes in enumerate(first)]), kind="stable"
@@ -92,7 +93,7 @@ def build_octree(levels: Sequence[Leaves]) -> Octree:
 
 
 def _merged(level: _Level) -> tuple[_Level, _Level]:
-    """The nodes of a level that stay, and their parents; of eight equal leaves only the parent, a leaf, stays."""
+    """Returns the nodes of a level that stay, and their parents. Eight equal leaves become one leaf, their parent."""
     if not len(level.codes):
         return level, level
     parent = level.codes >> 3
@@ -133,7 +134,7 @@ def _leaves(leaves: Leaves | None, height: int) -> _Level:
 
 
 def _spread(key: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(N,) 16-bit numbers with two zero bits put between their bits."""
+    """Returns the (N,) 16-bit numbers with two zero bits between their bits."""
     x = key & 0xFFFF
     x = (x | x << 16) & 0x0000FF0000FF
     x = (x | x << 8) & 0x00F00F00F00F

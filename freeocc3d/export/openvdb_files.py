@@ -1,4 +1,4 @@
-"""A float grid as OpenVDB writes it: one tree 5-4-3, whose leaves are the map's blocks of 8 x 8 x 8 voxels.
+"""Writes a float grid as OpenVDB does: one 5-4-3 tree; its leaves are the map's blocks of 8 x 8 x 8 voxels.
 
 Source: the reader and writer of OpenVDB 10 (io/Archive, tree/RootNode, InternalNode, LeafNode), file format 224.
 """
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from ..core.types import BLOCK
 
 _MAGIC, _FILE_VERSION, _LIBRARY_VERSION = 0x56444220, 224, (10, 0)
-_ACTIVE_VALUES_ONLY = 2  # of the compression flags: inactive values are the background and are left out
+_ACTIVE_VALUES_ONLY = 2  # a compression flag: inactive values equal the background and are left out
 _INACTIVE_ARE_BACKGROUND = 0
-_LEAVES = 16  # along an edge of the nodes that hold leaves
-_NODES = 32  # along an edge of the nodes that hold these
+_LEAVES = 16  # along an edge of a node that holds leaves
+_NODES = 32  # along an edge of a node that holds such nodes
 _NO_TILES = bytes(_NODES**3 // 8)
 
 
@@ -34,10 +34,10 @@ def write_vdb(
     center: NDArray[np.float64],
     metadata: Mapping[str, str],
 ) -> None:
-    """Write one grid of background 0. Raises OSError.
+    """Writes one grid with background 0. Raises OSError.
 
-    keys: (B, 3) indices of one or more blocks.  values, active: (B, 512), the local index being (i * 8 + j) * 8 + k;
-    what is not active has no value.  center: (3,) position of the center of voxel (0, 0, 0), where OpenVDB has index 0.
+    keys: (B, 3) indices of one or more blocks.  values, active: (B, 512), with local index (i * 8 + j) * 8 + k; a voxel
+    that is not active has no value.  center: (3,) center of voxel (0, 0, 0), which is OpenVDB's index 0.
     """
     node = keys.astype(np.int64) // _LEAVES
     root = node // _NODES
@@ -71,7 +71,7 @@ def write_vdb(
 
 
 def _buffers(masks: NDArray[np.uint8], values: NDArray[np.float32], active: NDArray[np.bool_]) -> bytes:
-    """Of each leaf its mask, a byte on its inactive values, and its active values."""
+    """Returns, for each leaf, its mask, a byte about its inactive values, and its active values."""
     head = np.concatenate((masks, np.full((len(masks), 1), _INACTIVE_ARE_BACKGROUND, np.uint8)), axis=1)
     records = np.concatenate((head, np.ascontiguousarray(values, "<f4").view(np.uint8)), axis=1)
     kept = np.concatenate((np.ones(head.shape, bool), np.repeat(active, 4, axis=1)), axis=1)
@@ -105,7 +105,7 @@ def _mask(offsets: NDArray[np.int64], edge: int) -> bytes:
 
 
 def _runs(rows: NDArray[np.int64]) -> list[slice]:
-    """Stretches of equal rows."""
+    """Returns the runs of equal rows."""
     starts = np.flatnonzero((np.diff(rows, axis=0) != 0).any(axis=1)) + 1
     bounds = [0, *starts.tolist(), len(rows)]
     return [slice(first, last) for first, last in itertools.pairwise(bounds)]

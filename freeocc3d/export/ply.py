@@ -22,7 +22,7 @@ from .export_frames import Frame, PlacedVoxels, VoxelOptions, place_voxels
 REQUIRES: tuple[str, ...] = ()
 
 ColorBy = Literal["rgb", "class", "height", "probability"]
-"""What occupied voxels may be colored by."""
+"""What the color of an occupied voxel shows."""
 
 
 class Options(VoxelOptions, frozen=True):
@@ -30,14 +30,14 @@ class Options(VoxelOptions, frozen=True):
 
     frame: Frame = "map"
     form: Literal["cubes", "points"] = "cubes"
-    """"cubes" for a mesh of the faces between occupied and other voxels, "points" for voxel centers."""
+    """"cubes" for a mesh of the faces between occupied and other voxels, "points" for the voxels' centers."""
     color: ColorBy = "rgb"
-    """"rgb" for the surface's own color, "class" for the class that fits best, "height" above the lowest voxel, or
-    "probability" of being occupied, 0 to 1; the last two from dark blue to yellow."""
+    """"rgb" for the surface's own color, "class" for the best class, "height" above the lowest voxel, or "probability"
+    of occupancy, 0 to 1; the last two go from dark blue to yellow."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the occupied voxels. Raises ExportError for a map without any."""
+    """Writes the occupied voxels. Raises ExportError for a map without occupied voxels."""
     _refuse_empty(scan_map.occupancy)
     there = place_voxels(scan_map, options.frame, box=options.box)
     _refuse_empty(there.occupancy)
@@ -45,7 +45,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 
 
 def write_query_ply(occupancy: Occupancy, results: list[QueryResult], path: Path, overwrite: bool = False) -> None:
-    """Write all occupied voxels as cubes, those of the results' regions in one strong color a word, the others pale.
+    """Writes all occupied voxels as cubes: the regions of each word in a strong color of their own, the others pale.
     Raises ExportError."""
     _refuse_empty(occupancy)
     colors = highlight_regions(occupancy.colors, [result.regions for result in results])
@@ -54,11 +54,11 @@ def write_query_ply(occupancy: Occupancy, results: list[QueryResult], path: Path
 
 def _refuse_empty(occupancy: Occupancy) -> None:
     if len(occupancy.colors) == 0:
-        raise ExportError("There is no occupied voxel to write.")
+        raise ExportError("The map has no occupied voxels to write.")
 
 
 def choose_colors(scan_map: Map, there: PlacedVoxels, by: str) -> NDArray[np.uint8]:
-    """(V, 3) color of each occupied voxel of a placed map, by one of ``ColorBy``."""
+    """Returns the (V, 3) color of each occupied voxel of a placed map. by: one of ``ColorBy``."""
     occupancy = there.occupancy
     if by == "class":
         return assign_class_colors(scan_map.vocabulary)[scan_map.labels()[there.rows]]
@@ -87,8 +87,8 @@ def write_colored_ply(
     quads: NDArray[np.int32] | None = None,
     described: dict[str, Any] | None = None,
 ) -> None:
-    """Binary little-endian PLY with colored vertices and, if given, quads; what describes it in comments. Raises
-    OSError."""
+    """Writes a binary little-endian PLY with colored vertices and, if given, quads. The description goes into comments.
+    Raises OSError."""
     vertices = np.empty(
         len(points), [*((name, "<f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
     )

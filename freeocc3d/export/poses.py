@@ -1,4 +1,4 @@
-"""Keyframes with poses, for COLMAP and nerfstudio: a folder that Gaussian splatting and NeRF trainers take.
+"""Keyframes with poses, for COLMAP and nerfstudio: a folder that Gaussian splatting and NeRF trainers read.
 
     colmap       FOLDER/sparse/0/{cameras,images,points3D}.txt and FOLDER/images/
     nerfstudio   FOLDER/transforms.json, sparse_pc.ply and FOLDER/images/
@@ -36,18 +36,18 @@ class Options(TypedOptions, frozen=True):
     form: Literal["colmap", "nerfstudio"] = "colmap"
     """"colmap" or "nerfstudio"."""
     frame: Frame = "gravity"
-    """"gravity" (z up, floor at 0), "first-camera" (z up, from there) or "map"."""
+    """"gravity" (z up, floor at 0), "first-camera" (z up, first camera at the origin) or "map"."""
     points: NotNegativeInt = 100_000
-    """The most of the Gaussians' means, evenly spread, that are the points which training starts from."""
+    """Greatest number of points for the start of training: evenly spread means of Gaussians."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the folder. Raises ExportError for a map without keyframes, MapError for a missing image."""
+    """Writes the folder. Raises ExportError for a map without keyframes, MapError for a missing image."""
     views = scan_map.keyframes.views()
     T_frame_map = to_frame(scan_map, options.frame)
     T_frame_cam = T_frame_map @ scan_map.trajectory.T_world_keyframe
     if not views:
-        raise ExportError("The map has no keyframe to write.")
+        raise ExportError("The map has no keyframes to write.")
     gaussians = scan_map.gaussians
     chosen = gaussians[:: max(1, -(-len(gaussians) // options.points))] if options.points else gaussians[:0]
     points = transform(T_frame_map, chosen.means.astype(np.float64))
@@ -63,7 +63,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 def _write_colmap(
     path: Path, views: Views, T_frame_cam: NDArray[np.float64], points: NDArray[np.float64], gaussians: Gaussians
 ) -> None:
-    """World-to-camera poses, and pixel coordinates whose origin is the corner of the first pixel."""
+    """Writes world-to-camera poses. Pixel coordinates start at the corner of the first pixel."""
     folder = path / "sparse" / "0"
     folder.mkdir(parents=True)
     numbers: dict[Intrinsics, int] = {}
@@ -87,7 +87,7 @@ def _write_colmap(
 def _write_nerfstudio(
     path: Path, views: Views, T_frame_cam: NDArray[np.float64], points: NDArray[np.float64], gaussians: Gaussians
 ) -> None:
-    """Camera-to-world poses of OpenGL cameras, which look along -z with y up."""
+    """Writes camera-to-world poses of OpenGL cameras: view along -z, y up."""
     frames: list[dict[str, Any]] = []
     for (image, camera), T in zip(views, T_frame_cam * (1, -1, -1, 1), strict=True):
         frames.append(

@@ -1,18 +1,18 @@
-"""Open3D's VoxelBlockGrid: what `open3d.t.geometry.VoxelBlockGrid.load` opens, with evidence, colors and features.
+"""Open3D's VoxelBlockGrid, for `open3d.t.geometry.VoxelBlockGrid.load`, with evidence, colors and features.
 
-Blocks of 8 x 8 x 8 voxels with these attributes for each voxel, zeros where it is not said otherwise:
+Blocks of 8 x 8 x 8 voxels have these attributes for each voxel, with zeros for all other voxels:
     probability (1) float32: alpha of the voxel's center; state (1) uint8: 0 free, 1 occupied, 255 unknown
     free, hits (1) uint16: number of depth images that saw through the voxel, and that ended in it
-    color (3) uint8 RGB, and feature (R) float32, the unit language feature: of occupied voxels
-The file holds more arrays, which Open3D ignores and `numpy.load` reads:
+    color (3) uint8 RGB, and feature (R) float32, the unit language feature: for occupied voxels
+The file also holds arrays that Open3D ignores and `numpy.load` reads:
     origin (3,) lower corner of voxel (0, 0, 0), meters; T_world_map (4, 4) from the grid's frame to the map's world
     feature_basis (R, D): the cosine of a feature and a word's unit feature t (D,) is feature @ (feature_basis @ t)
     words: names of the map's vocabulary as UTF-8 bytes, one a line; word_features (W, R): their features in the basis,
     so that cosines are feature @ word_features.T; word_attainable (W,): a score is a cosine over this
-Features of other words: `freeocc3d.load_map(MAP).text_encoder.encode_words([word]).features`. NAME.npz.json beside the
-file holds the frame, the encoder, and the score from which a voxel matches.
-Open3D takes values to stand at `index * voxel_size`; add `origin + voxel_size / 2` for the centers of voxels. Its
-blocks hold their values in the order z, y, x. A map of several voxel sizes is sampled at its largest.
+Features of other words: `freeocc3d.load_map(MAP).text_encoder.encode_words([word]).features`. NAME.npz.json next to the
+file holds the frame, the encoder, and the least score of a match.
+Open3D places values at `index * voxel_size`; add `origin + voxel_size / 2` to get the centers of voxels. Its blocks
+hold their values in the order z, y, x. A map of several voxel sizes is sampled at the largest size.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ _PER_VOXEL = {"probability": np.float32, "free": np.uint16, "hits": np.uint16, "
 _OF_OCCUPIED = {"color": np.uint8, "feature": np.float32}
 _BLOCKS_AT_ONCE = 64
 _LARGEST_ATTRIBUTE = (1 << 31) - 1
-"""Bytes: Open3D reads no 64-bit ZIP archives."""
+"""Largest attribute, bytes: Open3D does not read 64-bit ZIP archives."""
 
 _Read = Callable[[slice], NDArray[Any]]
-"""Gives (n, 512, channels) of a slice of n blocks."""
+"""Returns the values (n, 512, channels) of a slice of n blocks."""
 
 
 class Options(VoxelOptions, frozen=True):
-    """Frame, and whether features are written."""
+    """Frame and features."""
 
     frame: Frame = "map"
     features: bool = True
@@ -56,10 +56,10 @@ class Options(VoxelOptions, frozen=True):
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Write the grid. Raises ConfigError for another ending than .npz, ExportError if nothing is known, or if features
-    take more than 2 GiB."""
+    """Writes the grid. Raises ConfigError for an ending other than .npz, ExportError if nothing is known, or if
+    features take more than 2 GiB."""
     if path.suffix != ".npz":
-        raise ConfigError(f"A VoxelBlockGrid is written to a file that ends in .npz, got '{path.name}'.")
+        raise ConfigError(f"The name of a VoxelBlockGrid must end in .npz, got '{path.name}'.")
     there = place_voxels(scan_map, options.frame, one_size=True, box=options.box)
     described, beside = there.described(), {"T_world_map": find_world(scan_map, there.T_frame_map)}
     features: Features | None = None
@@ -73,14 +73,14 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 
 
 def _basis(features: Features) -> NDArray[np.float32]:
-    """(R, D) orthonormal directions in which the features lie."""
+    """Returns the (R, D) orthonormal basis of the features."""
     if isinstance(features, CodedFeatures):
         return features.codec.basis
     return np.eye(features.shape[1], dtype=np.float32)
 
 
 def _vocabulary(scan_map: Map, basis: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
-    """The arrays that say what the map's words are in the features' basis."""
+    """Returns the arrays of the map's words in the features' basis."""
     words = scan_map.vocabulary
     text = scan_map.text_encoder.encode_words(words)
     attainable = np.ones(len(words)) if text.attainable is None else text.attainable
@@ -97,13 +97,13 @@ def write_grid(
     features: Features | None = None,
     beside: Mapping[str, NDArray[Any]] | None = None,
 ) -> None:
-    """Write the file block by block, so that features are decoded where they are written and never all at once.
+    """Writes the file block by block, so that all features are never decoded at once.
 
     occupancy: of one voxel size.  features: (V, D) of its occupied voxels, coded or not; None leaves "feature" out.
-    beside: further arrays for the file, of numbers that Open3D knows. Raises ExportError, OSError.
+    beside: more arrays for the file, of number types that Open3D knows. Raises ExportError, OSError.
     """
     if occupancy.deepest:
-        raise ExportError("A VoxelBlockGrid holds voxels of one size: make them so first, with levels.make_uniform.")
+        raise ExportError("A VoxelBlockGrid holds voxels of one size: call levels.make_uniform first.")
     attributes = _attributes(occupancy, features)
     arrays: dict[str, NDArray[Any]] = {
         "key": occupancy.keys,
@@ -145,12 +145,12 @@ def _write_values(stream: IO[bytes], read: _Read, shape: tuple[int, int, int, in
 
 
 def _attributes(occupancy: Occupancy, features: Features | None) -> dict[str, tuple[int, _Read]]:
-    """By name: the number of channels, and what gives the values of some blocks."""
+    """Returns, by name, the number of channels and the function that reads the values of some blocks."""
     occupied = occupancy.state == OCCUPIED
     first = np.concatenate(([0], np.cumsum(np.count_nonzero(occupied, axis=1))))
 
     def spread(blocks: slice, values: Callable[[slice], NDArray[Any]], channels: int) -> NDArray[Any]:
-        """The rows of occupied voxels at their places, zeros elsewhere."""
+        """Puts the rows of occupied voxels at their places, with zeros elsewhere."""
         out = np.zeros((blocks.stop - blocks.start, BLOCK**3, channels), np.float32)
         out[occupied[blocks]] = values(slice(int(first[blocks.start]), int(first[blocks.stop])))
         return out
@@ -175,14 +175,14 @@ def _attributes(occupancy: Occupancy, features: Features | None) -> dict[str, tu
 def read_occupancy(
     grid: o3d.t.geometry.VoxelBlockGrid, voxel_size: float, origin: NDArray[np.float64] | None = None
 ) -> Occupancy:
-    """The occupancy that a grid with at least "probability" and "state" holds, its blocks in the order of their keys.
+    """Returns the occupancy of a grid, which needs at least "probability" and "state". Blocks are sorted by their keys.
 
-    Blocks of 16, 24, … voxels an edge are cut into ours. voxel_size, origin: not kept by Open3D; origin is the lower
-    corner of voxel (0, 0, 0), by default the world's origin. Raises FreeOccError for a grid of other attributes.
+    Blocks of 16, 24, … voxels an edge are cut into blocks of 8. voxel_size, origin: Open3D does not keep them; origin
+    is the lower corner of voxel (0, 0, 0), by default the world's origin. Raises FreeOccError for other attributes.
     """
     keys, arrays, places = _read_attributes(grid)
     if not {"probability", "state"} <= arrays.keys():
-        raise FreeOccError("The VoxelBlockGrid has no attributes 'probability' and 'state': it holds no occupancy.")
+        raise FreeOccError("The VoxelBlockGrid has no attributes 'probability' and 'state', so it holds no occupancy.")
     edge = round(len(places) ** (1 / 3))
     keys = (keys[:, None] * edge + places[None]).reshape(-1, 3)
     order = np.argsort(pack_voxels(keys))
@@ -207,7 +207,7 @@ def read_occupancy(
 def _read_attributes(
     grid: o3d.t.geometry.VoxelBlockGrid,
 ) -> tuple[NDArray[np.int64], dict[str, NDArray[np.generic]], NDArray[np.int64]]:
-    """(B, 3) indices of a grid's blocks, the attributes of ours that it has, cut into our blocks, and their places."""
+    """Returns the (B, 3) indices of a grid's blocks, its known attributes cut into blocks of 8, and their places."""
     import open3d as o3d
     import open3d.core as o3c
 
@@ -218,19 +218,21 @@ def _read_attributes(
         for name in (*_PER_VOXEL, *_OF_OCCUPIED):
             try:
                 values = grid.attribute(name)[rows].cpu().numpy()
-            except RuntimeError:  # there is none: Open3D gives a tensor of nothing, which refuses everything
+            except RuntimeError:  # a missing attribute: Open3D returns an undefined tensor, which raises on every use
                 continue
             arrays[name], places = _cut(values)
     return keys, arrays, places
 
 
 def _cut(values: NDArray[np.generic]) -> tuple[NDArray[np.generic], NDArray[np.int64]]:
-    """Open3D's blocks (B, R, R, R, C) as ours, (B (R / 8)^3, 512, C), and the place of each of the (R / 8)^3 within
-    its block. Raises FreeOccError if 8 does not divide R."""
+    """Returns Open3D's blocks (B, R, R, R, C) as blocks of 8, (B (R / 8)^3, 512, C), and the place of each of the
+    (R / 8)^3 blocks within its block. Raises FreeOccError if 8 does not divide R."""
     resolution, channels = values.shape[1], values.shape[4]
     parts = resolution // BLOCK
     if parts * BLOCK != resolution:
-        raise FreeOccError(f"The VoxelBlockGrid has blocks of {resolution} voxels an edge: 8, 16, 24, … are read.")
+        raise FreeOccError(
+            f"The VoxelBlockGrid has blocks of {resolution} voxels an edge, but only 8, 16, 24, … can be read."
+        )
     cut = values.reshape(-1, parts, BLOCK, parts, BLOCK, parts, BLOCK, channels)
     ours = cut.transpose(0, 5, 3, 1, 6, 4, 2, 7).reshape(-1, BLOCK**3, channels)
     return ours, np.stack(np.unravel_index(np.arange(parts**3), (parts,) * 3), axis=1)

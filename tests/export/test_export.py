@@ -131,7 +131,7 @@ def test_bad_requests_are_reported_and_leave_nothing(tmp_path) -> None:
         export_map(good, "npz", tmp_path / "a", {"from": "dense"})
     with pytest.raises(ConfigError, match="dense or sparse"):
         export_map(good, "npz", tmp_path / "a", {"form": "octree"})
-    with pytest.raises(ExportError, match="no occupied voxel"):
+    with pytest.raises(ExportError, match="no occupied voxels"):
         export_map(map_of(occupancy_of([])), "ply", tmp_path / "a.ply")
     with pytest.raises(ExportError, match="Cannot write"):
         export_map(good, "ply", tmp_path / "missing" / "a.ply")

@@ -76,7 +76,7 @@ def test_a_box_outside_of_the_map_is_refused(tmp_path, keyframes, kind, name) ->
     assert said.startswith("Nothing of the map lies in the box: in the ")
     assert "x -0." in said
     said = refused(scan_map, kind, tmp_path / name, {"box": [1, 0, 0, 0, 1, 1]})
-    assert f"'{kind}.box' has a lower and an upper corner" in said
+    assert f"'{kind}.box' takes a lower and an upper corner" in said
     said = refused(scan_map, kind, tmp_path / name, {"box": [0, 0, 0, 1, 1]})
     assert f"'{kind}.box' must be a list of 6 numbers or null, got [0, 0, 0, 1, 1]" in said
 

@@ -37,7 +37,7 @@ def test_words_are_those_asked_for(tmp_path) -> None:
     assert export_map(scan_map, "geojson", tmp_path / "map.geojson", {"words": ["table"]}, True) == ["no table"]
     assert json.loads((tmp_path / "map.geojson").read_text())["features"] == []
     scan_map.vocabulary = []
-    with pytest.raises(ExportError, match="name words"):
+    with pytest.raises(ExportError, match="give words"):
         export_map(scan_map, "geojson", tmp_path / "b.geojson")
     with pytest.raises(ConfigError, match="must be gravity or first-camera"):
         export_map(scan_map, "geojson", tmp_path / "b.geojson", {"frame": "map"})

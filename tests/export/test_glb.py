@@ -58,7 +58,7 @@ def test_the_file_says_which_frame_it_is(tmp_path) -> None:
     (node,) = json.loads(data[20 : 20 + length])["nodes"]
     assert node["extras"]["frame"] == "gravity"
     np.testing.assert_allclose(node["extras"]["T_frame_map"], scan_map.T_gravity_map)
-    with pytest.raises(ExportError, match="no occupied voxel"):
+    with pytest.raises(ExportError, match="no occupied voxels"):
         export_map(map_of(occupancy_of([], free=SPACE)), "glb", tmp_path / "b.glb")
     with pytest.raises(ConfigError, match="rgb, class"):
         export_map(scan_map, "glb", tmp_path / "b.glb", {"color": "loud"})

@@ -137,7 +137,7 @@ def test_debians_tools_open_and_compare(tmp_path) -> None:
 
 def test_what_cannot_be_written_is_reported(tmp_path) -> None:
     scan_map = map_of(scattered())
-    with pytest.raises(ConfigError, match=r"named .bt"):
+    with pytest.raises(ConfigError, match=r"must end in \.bt"):
         export_map(scan_map, "octomap", tmp_path / "map.octree")
     with pytest.raises(ConfigError, match="no colors"):
         export_map(scan_map, "octomap", tmp_path / "map.bt", {"color": True})

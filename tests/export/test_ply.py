@@ -49,9 +49,9 @@ def test_a_level_map_has_one_height(tmp_path) -> None:
 @pytest.mark.parametrize("color", ["rgb", "height", "probability"])
 def test_an_empty_map_is_refused_in_a_sentence(tmp_path, color) -> None:
     empty = SimpleNamespace(metric=True, occupancy=occupancy_of([]), up=np.array((0.0, 0.0, 1.0)))
-    with pytest.raises(ExportError, match="no occupied voxel"):
+    with pytest.raises(ExportError, match="no occupied voxels"):
         export_map(empty, "ply", tmp_path / "map.ply", {"color": color})
-    with pytest.raises(ExportError, match="no occupied voxel"):
+    with pytest.raises(ExportError, match="no occupied voxels"):
         ply.write_query_ply(empty.occupancy, [], tmp_path / "map.ply")
     assert list(tmp_path.iterdir()) == []
 

@@ -78,5 +78,5 @@ def test_what_cannot_be_written_is_reported(tmp_path, scan_map) -> None:
         export_map(scan_map, "poses", tmp_path / "out", overwrite=True)
     scan_map.keyframes = Keyframes(tmp_path / "none")
     scan_map.trajectory.T_world_keyframe = np.zeros((0, 4, 4))
-    with pytest.raises(ExportError, match="no keyframe"):
+    with pytest.raises(ExportError, match="no keyframes"):
         export_map(scan_map, "poses", tmp_path / "out2")

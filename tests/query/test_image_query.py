@@ -76,7 +76,7 @@ def test_what_is_no_picture_and_what_says_nothing() -> None:
         def encode(self, frame: object) -> NDArray[np.float16]:
             return np.zeros((2, 2, 5), np.float16)
 
-    with pytest.raises(FreeOccError, match="nothing to say of this part"):
+    with pytest.raises(FreeOccError, match="finds no feature in this part"):
         image_query.patch_feature(Silent(), picture())
 
 

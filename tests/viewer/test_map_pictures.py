@@ -116,7 +116,7 @@ def test_an_empty_map_and_an_unwritable_place_are_reported(tmp_path) -> None:
     with pytest.raises(ExportError, match=r"map\.png in place of"):
         map_pictures.write_map_picture(room, tmp_path / "map.jpg")
     room.occupancy = occupancy_of([])
-    with pytest.raises(ExportError, match="no occupied voxel"):
+    with pytest.raises(ExportError, match="no occupied voxels"):
         map_pictures.write_map_picture(room, tmp_path / "map.png")
     assert list(tmp_path.iterdir()) == []
 
@@ -162,5 +162,5 @@ def test_the_legend_tells_regions_and_scores() -> None:
 def test_an_empty_map_is_refused_however_it_is_colored(tmp_path, by) -> None:
     room = room_map(tmp_path)
     room.occupancy = occupancy_of([])
-    with pytest.raises(ExportError, match="no occupied voxel"):
+    with pytest.raises(ExportError, match="no occupied voxels"):
         map_pictures.write_map_picture(room, tmp_path / "map.png", by)
