@@ -1,1 +1,1 @@
-"""Scores of trajectories and maps against the truth."""
+"""Scores trajectories and maps against the truth."""

@@ -1,8 +1,8 @@
-"""Occupancy and class scores on a truth's lattice, counted once in a confusion matrix.
+"""Computes occupancy and class scores on a truth's lattice from one confusion matrix.
 
-Scenes are pooled by adding their matrices, as EmbodiedOcc's evaluation does (Y. Wu et al., EmbodiedOcc, ICCV 2025):
-IoU is binary, occupied or not; the IoU of a class is tp / (tp + fp + fn) over all voxels of all scenes; mIoU is the
-mean over a list of classes, in which a class that never occurs counts 0.
+The sum of the scenes' matrices pools them, as in EmbodiedOcc's evaluation (Y. Wu et al., EmbodiedOcc, ICCV 2025). IoU
+is binary, occupied or not. The IoU of a class is tp / (tp + fp + fn) over all voxels of all scenes. mIoU is the mean
+over a list of classes; a class that never occurs counts 0.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from ..core.types import FREE
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is claimed about the voxels of a truth's lattice. Unknown is not occupied.
+    """A claim about the voxels of a truth's lattice. Unknown voxels are not occupied.
 
     occupied: (X, Y, Z) bool.
-    labels: (X, Y, Z) uint8, k = class k of the truth where the voxel is occupied and its class is known, else 0; None
-        where the method knows no classes.
+    labels: (X, Y, Z) uint8, k = class k of the truth for an occupied voxel of known class, else 0; None if the method
+        knows no classes.
     """
 
     occupied: NDArray[np.bool_]
@@ -33,24 +33,24 @@ class Prediction:
 def count_confusion(
     labels_true: NDArray[np.uint8], predicted: Prediction, mask: NDArray[np.bool_], classes: int
 ) -> NDArray[np.int64]:
-    """(C + 1, C + 2) voxels inside the mask by truth (rows: free, class 1 … C) and prediction (columns: not occupied,
-    class 1 … C, occupied by no known class).
+    """Counts the (C + 1, C + 2) voxels inside the mask by truth (rows: free, class 1 … C) and prediction (columns: not
+    occupied, class 1 … C, occupied by an unknown class).
 
-    labels_true: (X, Y, Z), 0 free, k class k.  mask: (X, Y, Z) bool, within what the truth knows.  classes: C.
+    labels_true: (X, Y, Z), 0 free, k class k.  mask: (X, Y, Z) bool, only voxels whose truth is known.  classes: C.
     Raises FreeOccError: shapes differ, the prediction is not boolean, the mask is empty.
     """
     occupied = predicted.occupied
     if occupied.shape != labels_true.shape:
         raise FreeOccError(f"The prediction's lattice {occupied.shape} is not the truth's {labels_true.shape}.")
     if occupied.dtype != np.bool_:
-        # 255, the state of unknown voxels, would be taken for occupied.
-        raise FreeOccError(f"A prediction is boolean, occupied or not, but this one is {occupied.dtype}.")
+        # A number would count unknown voxels, 255, as occupied.
+        raise FreeOccError(f"A prediction must be boolean, occupied or not, but this one is {occupied.dtype}.")
     if not mask.any():
-        raise FreeOccError("The ground truth observed no voxel at all, so there is nothing to score.")
+        raise FreeOccError("The ground truth observed no voxels, so there is nothing to score.")
     row = labels_true[mask].astype(np.int64)
     label = np.zeros(len(row), np.int64) if predicted.labels is None else predicted.labels[mask].astype(np.int64)
     if max(row.max(), label.max()) > classes:
-        raise FreeOccError(f"A label is {max(row.max(), label.max())}, but only {classes} classes are named.")
+        raise FreeOccError(f"A label is {max(row.max(), label.max())}, but only {classes} classes have names.")
     column = np.where(occupied[mask], np.where(label > 0, label, classes + 1), FREE)
     counts = np.bincount(row * (classes + 2) + column, minlength=(classes + 1) * (classes + 2))
     return counts.reshape(classes + 1, classes + 2)
@@ -58,7 +58,7 @@ def count_confusion(
 
 @dataclass(frozen=True)
 class Scores:
-    """Fractions 0…1 from a pooled confusion matrix; one without a denominator is 0.
+    """Fractions 0…1 from a pooled confusion matrix; a fraction without a denominator is 0.
 
     matrix: (C + 1, C + 2), see ``count_confusion``.  classes: names of class 1 … C.
     """
@@ -77,27 +77,27 @@ class Scores:
 
     @property
     def iou(self) -> float:
-        """Occupied in both over occupied in either."""
+        """Voxels occupied in both / voxels occupied in either."""
         return _fraction(self._both, int(self.matrix.sum() - self.matrix[0, 0]))
 
     @property
     def precision(self) -> float:
-        """Occupied in both over predicted occupied."""
+        """Voxels occupied in both / voxels predicted as occupied."""
         return _fraction(self._both, int(self.matrix[:, 1:].sum()))
 
     @property
     def recall(self) -> float:
-        """Occupied in both over truly occupied."""
+        """Voxels occupied in both / truly occupied voxels."""
         return _fraction(self._both, int(self.matrix[1:].sum()))
 
     @property
     def class_voxels(self) -> NDArray[np.int64]:
-        """(C,) true voxels of each class."""
+        """(C,) number of true voxels of each class."""
         return self.matrix[1:].sum(axis=1)
 
     @property
     def class_iou(self) -> NDArray[np.float64]:
-        """(C,) IoU of each class, 0 where it occurs in neither."""
+        """(C,) IoU of each class; 0 for a class that occurs in neither."""
         C = len(self.classes)
         hit = np.diagonal(self.matrix[1:, 1 : C + 1]).astype(np.float64)
         either = self.class_voxels + self.matrix[:, 1 : C + 1].sum(axis=0) - hit
@@ -109,12 +109,12 @@ class Scores:
         return tuple(name for name, count in zip(self.classes, self.class_voxels, strict=True) if count)
 
     def most_frequent(self, count: int) -> tuple[str, ...]:
-        """The ``count`` classes with most true voxels, most frequent first; fewer where the truth holds fewer."""
+        """Returns the ``count`` classes with most true voxels, most frequent first; fewer if the truth holds fewer."""
         order = np.argsort(-self.class_voxels, kind="stable")
         return tuple(self.classes[k] for k in order[:count] if self.class_voxels[k])
 
     def miou(self, names: Sequence[str]) -> float:
-        """Mean IoU over some classes; one that does not occur counts 0."""
+        """Returns the mean IoU over some classes; a class that does not occur counts 0."""
         rows = [self.classes.index(name) for name in names]
         return float(self.class_iou[rows].mean()) if rows else 0.0
 

@@ -1,10 +1,10 @@
-"""Published ground truth: the packages of EmbodiedOcc-ScanNet and ReplicaOcc.
+"""Reads published ground truth: the packages of EmbodiedOcc-ScanNet and ReplicaOcc.
 
     global_occ_package/<scene>.pkl                              a scene's labeled grid
     streme_occ_new_package/{train,test,val}/<scene>_<idx>_new.pkl   which of its voxels a frame sees
 
 Sources of the layout: the loaders that the projects publish. Wu et al., EmbodiedOcc, ICCV 2025 (global package and
-frames' masks); FreeOcc, RSS 2026 (ReplicaOcc, whose classes are named outside its packages).
+masks of frames); FreeOcc, RSS 2026 (ReplicaOcc, with class names outside its packages).
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ _FARTHEST = 1e6
 
 
 def load_global_package(path: Path, classes: tuple[str, ...] | None = None) -> GroundTruth:
-    """A scene of EmbodiedOcc-ScanNet or ReplicaOcc: ``global_occ_package/<scene>.pkl``.
+    """Reads a scene of EmbodiedOcc-ScanNet or ReplicaOcc: ``global_occ_package/<scene>.pkl``.
 
-    classes: names of the labels, the first, of label 0, not used, for a package that neither brings names itself (under
-    ``classes`` or ``class_names``) nor has EmbodiedOcc's labels.
+    classes: names of the labels, for a package that has no names itself (under ``classes`` or ``class_names``) and does
+    not have EmbodiedOcc's labels. The first name, of label 0, is not used.
     ``global_pts`` are voxel centers, in the frame of the true poses. ``global_mask`` is not used: neither EmbodiedOcc
-    nor FreeOcc score by it. Where ``streme_occ_new_package`` lies beside the package's folder and has frames of the
+    nor FreeOcc score by it. If ``streme_occ_new_package`` lies next to the package's folder and has frames of the
     scene, they give ``frames_mask``.
     Raises FreeOccError: unreadable, an array missing or of another form, an irregular grid, a label without a name.
     """
@@ -58,8 +58,8 @@ def load_global_package(path: Path, classes: tuple[str, ...] | None = None) -> G
         names = classes or names
     if highest >= len(names):
         raise FreeOccError(
-            f"'global_labels' of {path} hold class {highest}, but only {len(names) - 1} classes are named: give the "
-            "names of all the data set's classes, in its order, with --classes."
+            f"'global_labels' of {path} hold class {highest}, but only {len(names) - 1} classes have names: give the "
+            "names of all classes of the data set, in its order, with --classes."
         )
     folder = path.absolute().parent.parent / FRAMES_FOLDER
     mask_of_frames = load_frames_mask(folder, path.stem, shape, _frame_names(package, path))
@@ -69,9 +69,9 @@ def load_global_package(path: Path, classes: tuple[str, ...] | None = None) -> G
 def load_frames_mask(
     folder: Path, scene: str, shape: tuple[int, int, int], frames: Sequence[str] | None = None
 ) -> NDArray[np.bool_] | None:
-    """(X, Y, Z) bool, the union of ``mask_in_global`` over a scene's frames; None if the folder has none of them.
+    """Returns the (X, Y, Z) union of ``mask_in_global`` over a scene's frames; None if the folder has none of them.
 
-    folder: ``streme_occ_new_package``.  frames: names of the frames, such as "00012"; None: all that are there.
+    folder: ``streme_occ_new_package``.  frames: names of the frames, such as "00012"; None = all in the folder.
     Raises FreeOccError: some of the frames are missing, a file is damaged, a mask does not fit the scene's grid.
     """
     pattern = re.compile(rf"{re.escape(scene)}_(\d+)_new\.pkl")
@@ -96,10 +96,11 @@ def load_frames_mask(
 
 
 def read_split(path: Path) -> list[str]:
-    """Scenes of a split, each once, in the file's order.
+    """Reads the scenes of a split, each once, in the file's order.
 
-    A text with a scene, ``<scene>_<frame>`` or a path of them a line, empty lines and ``#`` comments skipped, or a JSON
-    list of the same. Raises FreeOccError: no such file, an entry names no scene, no entry at all.
+    The file is a text with one entry per line, without empty lines and ``#`` comments, or a JSON list of entries. An
+    entry is ``<scene>``, ``<scene>_<frame>`` or a path that ends in one. Raises FreeOccError: no such file, an entry
+    without a scene, no entries.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -107,7 +108,7 @@ def read_split(path: Path) -> list[str]:
     except OSError as error:
         raise FreeOccError(f"Cannot read the split {path}: {(error.strerror or str(error)).lower()}.") from error
     except (ValueError, RecursionError) as error:
-        raise FreeOccError(f"The split {path} is damaged: it is no UTF-8 text or no valid JSON.") from error
+        raise FreeOccError(f"The split {path} is damaged: it is not UTF-8 text or not valid JSON.") from error
     if not isinstance(entries, list) or not all(isinstance(entry, str) for entry in entries):
         raise FreeOccError(f"The split {path} must be a list of scene names.")
     scenes = [_scene_of(entry.strip(), path) for entry in entries if entry.strip()]
@@ -117,26 +118,26 @@ def read_split(path: Path) -> list[str]:
 
 
 def find_package(folder: Path, scene: str) -> Path:
-    """``<folder>/<scene>.pkl`` or ``<folder>/global_occ_package/<scene>.pkl``.
+    """Returns the path ``<folder>/<scene>.pkl`` or ``<folder>/global_occ_package/<scene>.pkl``.
 
-    Raises FreeOccError: not there, with the nearest names that are; ``scene`` is no plain name.
+    Raises FreeOccError: the package is missing (the message lists the nearest names), ``scene`` is not a plain name.
     """
     if not re.fullmatch(r"\w[\w.-]*", scene):
-        raise FreeOccError(f"'{scene}' is no name of a scene, such as scene0000_00 or room0.")
+        raise FreeOccError(f"'{scene}' is not the name of a scene, such as scene0000_00 or room0.")
     places = (folder, folder / GLOBAL_FOLDER)
     for place in places:
         if (place / f"{scene}.pkl").is_file():
             return place / f"{scene}.pkl"
     there = sorted({path.stem for place in places for path in place.glob("*.pkl")})
     nearest = difflib.get_close_matches(scene, there, n=3, cutoff=0.0)
-    known = f"the nearest are {', '.join(nearest)}" if nearest else "it has no packages at all"
-    raise FreeOccError(f"{folder} has no package of {scene}, neither in itself nor in {GLOBAL_FOLDER}: {known}.")
+    known = f"the nearest are {', '.join(nearest)}" if nearest else "it has no packages"
+    raise FreeOccError(f"{folder} has no package of {scene}, in the folder itself or in {GLOBAL_FOLDER}: {known}.")
 
 
 def _load_dict(path: Path) -> dict[Any, Any]:
     package = load_pickle(path)
     if not isinstance(package, dict):
-        raise FreeOccError(f"{path} is no package: it holds a {type(package).__name__} in place of named arrays.")
+        raise FreeOccError(f"{path} is not a package: it holds a {type(package).__name__} in place of named arrays.")
     return package
 
 
@@ -155,7 +156,7 @@ def _array(package: dict[Any, Any], key: str, path: Path) -> NDArray[Any]:
 
 
 def _triple(package: dict[Any, Any], key: str, path: Path) -> list[float]:
-    """Three finite numbers, kept as an array or a plain list."""
+    """Returns three finite numbers from an array or a plain list."""
     value = _value(package, key, path)
     numbers: Any = value.tolist() if isinstance(value, np.ndarray) and value.size == 3 else value
     if not isinstance(numbers, list | tuple) or len(numbers) != 3:
@@ -173,23 +174,24 @@ def _shape(package: dict[Any, Any], path: Path) -> tuple[int, int, int]:
 
 
 def _on_grid(values: NDArray[Any], shape: tuple[int, int, int], key: str, path: Path) -> NDArray[Any]:
-    """(X, Y, Z) values of an array (X, Y, Z) or (X * Y * Z,)."""
+    """Returns the (X, Y, Z) values of an array (X, Y, Z) or (X * Y * Z,)."""
     if values.dtype.kind not in "biuf" or values.shape not in (shape, (math.prod(shape),)):
         raise FreeOccError(
-            f"'{key}' of {path} must be numbers {shape} as 'scene_dim', got {values.dtype} {values.shape}."
+            f"'{key}' of {path} must be numbers of shape {shape}, as 'scene_dim' says, got {values.dtype} "
+            f"{values.shape}."
         )
     return values.reshape(shape)
 
 
 def _labels(values: NDArray[Any], path: Path, key: str = "global_labels") -> NDArray[np.uint8]:
-    """A copy as uint8 of labels of any kind of number."""
+    """Returns a uint8 copy of labels of any number type."""
     if values.dtype.kind not in "iuf" or not ((values >= 0) & (values <= 255) & (values == np.rint(values))).all():
         raise FreeOccError(f"'{key}' of {path} must be whole numbers from 0 to 255.")
     return values.astype(np.uint8)
 
 
 def _lattice(points: NDArray[Any], shape: tuple[int, int, int], path: Path) -> tuple[NDArray[np.float64], float]:
-    """Lower corner (3,) and voxel size, meters, of a grid whose centers are (X, Y, Z, 3) or (X * Y * Z, 3)."""
+    """Returns the lower corner (3,) and voxel size, meters, of a grid with centers (X, Y, Z, 3) or (X * Y * Z, 3)."""
     what = f"'global_pts' of {path}"
     if points.dtype.kind != "f" or points.shape not in ((*shape, 3), (math.prod(shape), 3)):
         raise FreeOccError(f"{what} must be points {(*shape, 3)} as 'scene_dim', got {points.dtype} {points.shape}.")
@@ -199,27 +201,27 @@ def _lattice(points: NDArray[Any], shape: tuple[int, int, int], path: Path) -> t
     first = points[0, 0, 0].astype(np.float64)
     axes = [axis for axis in range(3) if shape[axis] > 1]
     if not axes:
-        raise FreeOccError(f"{what} is a single point, which does not tell the size of a voxel.")
+        raise FreeOccError(f"{what} is a single point, so the voxel size is unknown.")
     steps = np.array([points[tuple(np.eye(3, dtype=int)[axis])] - first for axis in axes])
     if (steps.argmax(axis=1) != axes).any():
-        raise FreeOccError(f"{what} must run along x, y and z, in this order and upwards.")
-    # Over the whole extent the rounding of float32 coordinates does not count.
+        raise FreeOccError(f"{what} must ascend along x, y and z, in this order.")
+    # Over the whole extent, the rounding of float32 coordinates is negligible.
     extent = points[-1, -1, -1].astype(np.float64) - first
     spacings = np.array([extent[axis] / (shape[axis] - 1) for axis in axes])
     voxel_size = round(float(extent[axes].sum() / sum(shape[axis] - 1 for axis in axes)), 6)
     tolerance = 0.01 * voxel_size
     if not (voxel_size > 0 and (np.abs(spacings - voxel_size) < tolerance).all()):
         along = ", ".join(f"{'xyz'[axis]} {spacing:.4g}" for axis, spacing in zip(axes, spacings, strict=True))
-        raise FreeOccError(f"{what} must be the centers of cubes, but are apart along {along} m.")
+        raise FreeOccError(f"{what} must be the centers of cubes, but their spacing is {along} m.")
     for axis in range(3):
         line = (first[axis] + voxel_size * np.arange(shape[axis])).reshape([-1 if a == axis else 1 for a in range(3)])
         if not np.abs(points[..., axis] - line).max() < tolerance:
-            raise FreeOccError(f"{what} are not a regular grid along x, y and z.")
+            raise FreeOccError(f"{what} must be a regular grid along x, y and z.")
     return first - voxel_size / 2, voxel_size
 
 
 def _class_names(package: dict[Any, Any], path: Path) -> tuple[str, ...] | None:
-    """The class names that a package brings, with one for label 0 in front."""
+    """Returns the class names in a package, with a name for label 0 in front."""
     key = next((key for key in ("classes", "class_names") if key in package), None)
     if key is None:
         return None
@@ -230,7 +232,7 @@ def _class_names(package: dict[Any, Any], path: Path) -> tuple[str, ...] | None:
 
 
 def _frame_names(package: dict[Any, Any], path: Path) -> list[str] | None:
-    """Names of the frames that EmbodiedOcc scores a scene by, or None if the package does not list them."""
+    """Returns the names of the frames that EmbodiedOcc scores a scene by; None if the package does not list them."""
     paths = package.get("valid_img_paths")
     if isinstance(paths, np.ndarray):
         paths = paths.ravel().tolist()
@@ -242,25 +244,23 @@ def _frame_names(package: dict[Any, Any], path: Path) -> list[str] | None:
 
 
 def _add_mask(union: NDArray[np.bool_], mask: NDArray[Any], path: Path) -> None:
-    """Set the voxels of a frame's mask: a mask (X, Y, Z) or (X * Y * Z,), as EmbodiedOcc's loader uses it, or the
-    places of its voxels in the flattened grid."""
+    """Adds the voxels of a frame's mask to the union. mask: (X, Y, Z) or (X * Y * Z,), as in EmbodiedOcc's loader, or
+    the indices of its voxels in the flattened grid."""
     if mask.shape in (union.shape, (union.size,)) and mask.dtype.kind in "biuf" and ((mask == 0) | (mask == 1)).all():
         union |= mask.reshape(union.shape).astype(bool)
     elif mask.ndim == 1 and mask.dtype.kind in "iu" and ((mask >= 0) & (mask < union.size)).all():
         union.reshape(-1)[mask] = True
     else:
         raise FreeOccError(
-            f"'mask_in_global' of {path} is neither a mask of the scene's {union.shape} voxels nor their places, got "
+            f"'mask_in_global' of {path} is neither a mask of the scene's {union.shape} voxels nor their indices, got "
             f"{mask.dtype} {mask.shape}: does the file belong to this data set?"
         )
 
 
 def _scene_of(entry: str, path: Path) -> str:
-    """The scene that a split's entry names."""
+    """Returns the scene that an entry of a split names."""
     if match := re.search(r"(?<![A-Za-z0-9])scene\d{4}_\d{2}(?!\d)", entry):
         return match[0]
     if entry.startswith("scene") or not re.fullmatch(r"[A-Za-z]\w*(-\w+)*", entry):
-        raise FreeOccError(
-            f"The split {path} has an entry '{shorten(entry)}' that names no scene, such as scene0000_00."
-        )
+        raise FreeOccError(f"The entry '{shorten(entry)}' of the split {path} names no scene, such as scene0000_00.")
     return entry

@@ -1,4 +1,4 @@
-"""Files of ground truth: ``ground_truth.npz``, and the packages that data sets publish."""
+"""Reads and writes ground truth: ``ground_truth.npz``, and the packages that data sets publish."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from .true_occupancy import GroundTruth
 
 
 def load_ground_truth(path: str | Path, classes: tuple[str, ...] | None = None) -> GroundTruth:
-    """Read ``ground_truth.npz`` or a data set's ``global_occ_package/<scene>.pkl``; arrays only, nothing is executed.
+    """Reads ``ground_truth.npz`` or a data set's ``global_occ_package/<scene>.pkl``. It reads arrays only and runs no
+    code.
 
-    classes: names of the labels 0, 1, … of a package that does not name them.
-    Raises FreeOccError: no such file, damaged, an array is missing or has another shape or type than ``GroundTruth``
-    states, a label has no class.
+    classes: names of the labels 0, 1, … for a package without names.
+    Raises FreeOccError: no such file, a damaged file, an array that is missing or differs in shape or type from
+    ``GroundTruth``, a label without a class.
     """
     path = Path(path)
     if path.suffix == ".pkl":
@@ -36,7 +37,7 @@ def load_ground_truth(path: str | Path, classes: tuple[str, ...] | None = None) 
         raise FreeOccError(f"'classes' of {path} must be a list of names, got {names.dtype} {names.shape}.")
     largest = int(labels.max(initial=0, where=labels != UNKNOWN))
     if largest >= max(len(names), 1):
-        raise FreeOccError(f"'labels' of {path} hold class {largest}, but only {len(names)} classes are named.")
+        raise FreeOccError(f"'labels' of {path} hold class {largest}, but only {len(names)} classes have names.")
     mask = arrays.get("frames_mask")
     if mask is not None and (mask.dtype != np.bool_ or mask.shape != labels.shape):
         raise FreeOccError(f"'frames_mask' of {path} must be bool {labels.shape}, got {mask.dtype} {mask.shape}.")
@@ -44,7 +45,7 @@ def load_ground_truth(path: str | Path, classes: tuple[str, ...] | None = None) 
 
 
 def save_ground_truth(truth: GroundTruth, path: Path, overwrite: bool = False) -> None:
-    """Write ``ground_truth.npz``. Raises ExportError: it exists, or cannot be written."""
+    """Writes ``ground_truth.npz``. Raises ExportError: the file exists, or cannot be written."""
     arrays: dict[str, Any] = {
         "labels": truth.labels,
         "origin": truth.origin,
@@ -62,7 +63,7 @@ def save_ground_truth(truth: GroundTruth, path: Path, overwrite: bool = False) -
 
 
 def read_grid_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an .npz file by name, their sizes checked first. Raises FreeOccError."""
+    """Returns all arrays of an .npz file by name, after a check of their sizes. Raises FreeOccError."""
     if not path.is_file():
         raise FreeOccError(f"Cannot read {path}: there is no such file.")
     if not zipfile.is_zipfile(path):
@@ -74,7 +75,7 @@ def read_grid_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def read_lattice(arrays: dict[str, NDArray[Any]], path: Path) -> tuple[NDArray[np.float64], float]:
-    """Origin (3,) and voxel size of a grid, meters. Raises FreeOccError."""
+    """Returns origin (3,) and voxel size of a grid, meters. Raises FreeOccError."""
     origin = require_array(arrays, "origin", path)
     size = require_array(arrays, "voxel_size", path)
     if origin.dtype.kind != "f" or origin.shape != (3,) or not np.isfinite(origin).all():
@@ -85,7 +86,7 @@ def read_lattice(arrays: dict[str, NDArray[Any]], path: Path) -> tuple[NDArray[n
 
 
 def require_array(arrays: dict[str, NDArray[Any]], name: str, path: Path) -> NDArray[Any]:
-    """One of them. Raises FreeOccError if it is not there."""
+    """Returns the named array. Raises FreeOccError if it is missing."""
     if name not in arrays:
         raise FreeOccError(f"{path} has no '{name}'; it holds {', '.join(arrays) or 'nothing'}.")
     return arrays[name]

@@ -1,7 +1,7 @@
-"""What is claimed about the voxels of a truth's lattice: by a map, by Gaussians of any origin, by a finished grid.
+"""Predicts the voxels of a truth's lattice: from a map, from Gaussians of any origin, or from a finished grid.
 
 Gaussians are moved into the true frame (paper, "Coordinate System Alignment") and projected at the truth's own voxel
-centers: nothing is resampled from a finished grid, unless a finished grid is all that there is.
+centers. Only a finished grid is resampled.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _SAME_SIZE, _SAME_LATTICE = 1e-4, 1e-3
 def predict_from_map(
     scan_map: Map, settings: Settings, alignment: TrajectoryAlignment, truth: GroundTruth, classes: ClassMap
 ) -> tuple[Prediction, str]:
-    """A map's claim, and one sentence about its classes if there is something to say.
+    """Returns a map's prediction, and a sentence about its classes, or an empty string.
 
-    settings: the map's configuration, of which layer 4's sections are used, at the truth's voxel size. Free space is
-    carved again on the truth's lattice from the map's keyframes. A voxel takes the class that its nearest word stands
-    for (paper, s(x, c) = f(x)^T t_c).
+    settings: the map's configuration; the sections of layer 4 apply, at the truth's voxel size. The map's keyframes
+    carve free space again on the truth's lattice. A voxel takes the class of its nearest word (paper, s(x, c) =
+    f(x)^T t_c).
     """
     splatting = _splatting(settings, truth)
     gaussians = anchors.align_gaussians(scan_map.gaussians, alignment.scale, alignment.rotation, alignment.translation)
@@ -74,9 +74,10 @@ def predict_from_gaussians(
     alignment: TrajectoryAlignment,
     truth: GroundTruth,
 ) -> Prediction:
-    """The claim of N Gaussians without keyframes: occupied where alpha reaches the threshold, nothing carved.
+    """Returns the prediction of N Gaussians without keyframes: occupied where alpha reaches the threshold, without
+    carving.
 
-    semantics: (N, C) weight of each class 1 … C; a voxel takes the class of the largest posterior mean.
+    semantics: (N, C) weight of each class 1 … C; a voxel takes the class with the largest posterior mean.
     """
     splatting = _splatting(settings, truth)
     moved = anchors.align_gaussians(gaussians, alignment.scale, alignment.rotation, alignment.translation)
@@ -100,22 +101,24 @@ def predict_from_gaussians(
 def predict_from_frames(
     folder: Path, poses: Poses, settings: Settings, truth: GroundTruth, classes: ClassMap
 ) -> tuple[Prediction, int]:
-    """The claim of per-frame Gaussians fused by true poses, and the number of frames fused: the paper's protocol for
-    methods that predict each frame by itself (GaussTR, GaussianOcc).
+    """Returns the prediction of per-frame Gaussians, fused by true poses, and the number of fused frames. This is the
+    paper's protocol for methods that predict each frame separately (GaussTR, GaussianOcc).
 
-    folder: a file per frame in the camera's frame (OpenCV axes, meters), the last number in its name being the frame's
-    timestamp: a 3DGS PLY, or an NPZ with means (N, 3), scales (N, 3), quats_wxyz (N, 4), opacities (N,) and perhaps
-    semantics (N, C) over the scored classes or labels (N,), which count them from 1.
-    Raises FreeOccError: no such files, none has a pose, a file is damaged.
+    folder: holds a file per frame, in the camera's frame (OpenCV axes, meters). The last number in its name is the
+    frame's timestamp. A file is a 3DGS PLY, or an NPZ with means (N, 3), scales (N, 3), quats_wxyz (N, 4), opacities
+    (N,) and, optionally, semantics (N, C) over the scored classes or labels (N,) that count them from 1.
+    Raises FreeOccError: no such files, no file with a pose, a damaged file.
     """
     paths = [p for p in folder.glob("*") if p.suffix in (".ply", ".npz")] if folder.is_dir() else []
     numbered = {float(numbers[-1]): p for p in paths if (numbers := re.findall(r"\d+(?:\.\d+)?", p.stem))}
     if not numbered:
-        raise FreeOccError(f"There are no per-frame Gaussians (.ply or .npz with the frame's number) in {folder}.")
+        raise FreeOccError(
+            f"{folder} has no per-frame Gaussians: .ply or .npz files with the frame's number in the name."
+        )
     times = np.array(sorted(numbered))
     rows, rows_true = associate(times, poses.timestamps)
     if not len(rows):
-        raise FreeOccError(f"No file of {folder} has the number of a frame with a true pose.")
+        raise FreeOccError(f"No file in {folder} has the number of a frame with a true pose.")
     parts, semantics = [], []
     for time, T_world_cam in zip(times[rows], poses.T_world_cam[rows_true], strict=True):
         read = _read_frame if numbered[time].suffix == ".npz" else _read_labeled
@@ -125,7 +128,7 @@ def predict_from_frames(
     fused = Gaussians(*(np.concatenate([getattr(p, name) for p in parts]) for name in Gaussians.__dataclass_fields__))
     known = [weights for weights in semantics if weights is not None]
     if known and len(known) < len(semantics):
-        raise FreeOccError(f"Some files of {folder} hold classes and some do not: give all or none.")
+        raise FreeOccError(f"Some files in {folder} hold classes and some do not: give classes in all or in none.")
     fused_semantics = np.concatenate(known) if known else None
     return predict_from_gaussians(fused, fused_semantics, settings, TrajectoryAlignment.identity(), truth), len(rows)
 
@@ -133,16 +136,17 @@ def predict_from_frames(
 def predict_from_grid(
     path: Path, alignment: TrajectoryAlignment, truth: GroundTruth, classes: ClassMap
 ) -> tuple[Prediction, str]:
-    """The claim of a finished voxel grid, read at the truth's voxel centers, and one sentence if the lattices differ.
+    """Returns the prediction of a finished voxel grid at the truth's voxel centers, and a sentence if the lattices
+    differ.
 
-    path: NPZ as ``export --format npz`` or a ground truth writes it. Raises FreeOccError: damaged, another voxel size.
+    path: an NPZ of ``export --format npz``, or of a ground truth. Raises FreeOccError: damaged, another voxel size.
     """
     arrays = read_grid_arrays(path)
     origin, size = read_lattice(arrays, path)
     if abs(size * alignment.scale / truth.voxel_size - 1) > _SAME_SIZE:
         raise FreeOccError(
-            f"{path} has voxels of {size:g} m, the ground truth of {truth.voxel_size:g} m: make one with the other's, "
-            "for a finished grid cannot be scored on another lattice."
+            f"{path} has voxels of {size:g} m, the ground truth of {truth.voxel_size:g} m: make both with one voxel "
+            "size, because a finished grid cannot be scored on another lattice."
         )
     labels = require_array(arrays, "labels", path) if "occupancy" not in arrays else arrays.get("labels")
     grid = arrays.get("occupancy", labels)
@@ -171,7 +175,7 @@ def predict_from_grid(
     if labels is None or "classes" not in arrays:
         return Prediction(occupied), note
     names = [str(name).lower() for name in arrays["classes"].tolist()]
-    # An export's classes begin with label 1, a ground truth's with label 0.
+    # Class names begin at label 1 in an export, at label 0 in a ground truth.
     names = names[1:] if "occupancy" not in arrays else names
     table = np.zeros(max(256, int(labels.max(initial=0)) + 1), np.uint8)
     table[1 : len(names) + 1] = [classes.labels.get(name, 0) for name in names]
@@ -183,19 +187,19 @@ def predict_from_grid(
 
 
 def _scaled(scan_map: Map, alignment: TrajectoryAlignment) -> Iterator[PosedFrame]:
-    """Keyframes in the true frame, depth in its meters; a similarity scales the cameras' frames as well."""
+    """Yields keyframes in the true frame, with depth in its meters. A similarity also scales the cameras' frames."""
     poses = alignment.poses(scan_map.trajectory.T_world_keyframe)
     for row, (frame, T) in enumerate(zip(scan_map.keyframes, poses, strict=True)):
         yield PosedFrame(frame.scaled(alignment.scale), T, row)
 
 
 def _splatting(settings: Settings, truth: GroundTruth) -> splat.Options:
-    """Layer 4's options at the truth's voxel size, on the processor wherever the map was made."""
+    """Returns layer 4's options at the truth's voxel size, on the CPU even for a map made on a GPU."""
     return settings.occupancy.changed(device="cpu", voxel_size=truth.voxel_size)
 
 
 def _least_scale(settings: Settings, alignment: TrajectoryAlignment, truth: GroundTruth) -> float:
-    """What the map's Gaussians are widened to on the truth's lattice, meters."""
+    """Returns the scale that the map's Gaussians are widened to on the truth's lattice, meters."""
     cell_size = settings.gaussians.cell_size or 0.5 * settings.occupancy.voxel_size
     return anchors.compute_least_scale(settings.gaussians, alignment.scale * cell_size, truth.voxel_size)
 
@@ -203,8 +207,8 @@ def _least_scale(settings: Settings, alignment: TrajectoryAlignment, truth: Grou
 def _words(
     encoder: TextEncoder, classes: ClassMap, truth: GroundTruth
 ) -> tuple[TextFeatures | None, NDArray[np.uint8], str]:
-    """The words that stand for scored classes and that the encoder can express, the class of each (with a last entry
-    for "nothing known"), and a sentence about the truth's classes that it cannot. No words at all: (None, …)."""
+    """Returns the words for scored classes that the encoder understands, the class of each (with a last entry for
+    "nothing known"), and a sentence about the truth's classes that it does not understand. Without words: (None, …)."""
     words = list(classes.words)
     text = encoder.encode_words(words)
     rows = np.flatnonzero(text.features.any(axis=1))
@@ -212,15 +216,15 @@ def _words(
     lacking = [classes.classes[k - 1] for k in np.unique(truth.labels) if 0 < k < UNKNOWN and k not in reached]
     note = ""
     if not len(rows):
-        note = f"None of the classes is known to the map's encoder, which knows {encoder.knows}: mIoU is not available."
+        note = f"The map's encoder knows none of the classes, only {encoder.knows}: mIoU is not available."
     elif lacking:
-        note = f"The map's encoder cannot name {', '.join(lacking)}, which the truth holds: that counts as missed."
+        note = f"The map's encoder cannot name {', '.join(lacking)}, which the truth holds: they count as missed."
     chosen = TextFeatures(text.features[rows], tuple(text.understood[row] for row in rows)) if len(rows) else None
     return chosen, np.array([*(classes.labels[words[row]] for row in rows), 0], np.uint8), note
 
 
 def encode_one_hot(labels: NDArray[np.integer] | None, classes: ClassMap, path: Path) -> NDArray[np.float32] | None:
-    """(N, C) from (N,) labels 1 … C, 0 or 255 for none. Raises FreeOccError for any other."""
+    """Returns (N, C) weights from (N,) labels 1 … C; 0 and 255 mean no class. Raises FreeOccError for other labels."""
     if labels is None:
         return None
     count = len(classes.classes)

@@ -1,12 +1,12 @@
 """Builds the truth of a capture as the paper builds ReplicaOcc (supplement, "Benchmark Details").
 
-(i)   Every ``pixel_stride``-th pixel of every frame is back-projected with the capture's own pose; the points of a
-      voxel vote for its class by their class images' values.
-(ii)  The voxels are placed into a regular grid over their extent, lattice planes at ``lattice_offset`` + n * size.
-(iii) A voxel is observed if, in one of every ``frame_stride``-th frame, its center lies in front of the camera, inside
-      the image and no farther than the measured depth plus ``tolerance`` voxels.
+(i)   Back-project every ``pixel_stride``-th pixel of every frame with the capture's own pose. The points of a voxel
+      vote for its class with the values of the class images.
+(ii)  Place the voxels into a regular grid over their extent, with lattice planes at ``lattice_offset`` + n * size.
+(iii) A voxel is observed if, in some ``frame_stride``-th frame, its center lies in front of the camera, inside the
+      image and no farther than the measured depth plus ``tolerance`` voxels.
 
-An observed voxel has its class, or is free if it has none; all else is 255.
+An observed voxel has its class, or is free if it has none. All other voxels are 255.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _LARGEST_GRID = 1 << 29
 _ROWS_BEFORE_MERGE = 4_000_000
 _MOST_CLASSES = 254
 UNLABELED = "occupied"
-"""Class of every surface where a capture has no class images."""
+"""Class of every surface if a capture has no class images."""
 
 
 class Options(TypedOptions, frozen=True):
@@ -48,26 +48,26 @@ class Options(TypedOptions, frozen=True):
     voxel_size: Positive = 0.08
     """Edge of a voxel, meters."""
     pixel_stride: PositiveInt = 4
-    """Every n-th pixel, in both directions, is back-projected."""
+    """Back-project every n-th pixel, in both directions."""
     frame_stride: PositiveInt = 2
-    """Every n-th frame decides what was observed."""
+    """Use every n-th frame to decide what is observed."""
     max_range: Positive = 10.0
     """Depth beyond this many meters counts as not measured."""
     lattice_offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    """Meters by which the lattice is shifted: half a voxel in z puts a floor at z = 0 inside a voxel, not on a face."""
+    """Shift of the lattice, meters: half a voxel in z puts a floor at z = 0 inside a voxel, not on a face."""
     min_points: PositiveInt = 1
-    """Points that a voxel needs; the noise of a sensor scatters some into the voxels next to a surface."""
+    """Least number of points of a voxel: sensor noise scatters some points into the voxels next to a surface."""
     fill: Literal["inside", "within"] = "inside"
-    """"inside": a cell is occupied if a point lies in it; "within": also if a cell next to it, no farther than one
-    voxel from center to center, is."""
+    """"inside": a cell is occupied if a point lies in it; "within": also if a neighbor cell is, no farther than one
+    voxel from center to center."""
     tolerance: NotNegative = 1.0
-    """Voxel edges that a voxel's center may lie behind the measured depth and still be observed."""
+    """How far an observed voxel's center may lie behind the measured depth, in voxel edges."""
     dilation: NotNegativeInt = 0
-    """Voxels by which what was observed is grown, across faces."""
+    """Grow the observed space by this many voxels, across faces."""
 
 
 def build_truth(capture: str | Path, overrides: Sequence[str] = (), progress: Progress | None = None) -> GroundTruth:
-    """The truth of the capture in a folder. overrides: "name=value" of ``Options``, or "capture.name=value".
+    """Builds the truth of the capture in a folder. overrides: "name=value" of ``Options``, or "capture.name=value".
 
     Raises FreeOccError: no poses, nothing measured, a grid too large for memory; ConfigError.
     """
@@ -75,7 +75,7 @@ def build_truth(capture: str | Path, overrides: Sequence[str] = (), progress: Pr
     for override in overrides:
         name, separator, text = override.partition("=")
         if not separator:
-            raise ConfigError(f"An option reads name=value, got '{override}'.")
+            raise ConfigError(f"An option must be name=value, got '{override}'.")
         if name.startswith("capture."):
             of_capture.append(override)
         else:
@@ -87,11 +87,11 @@ def build_truth(capture: str | Path, overrides: Sequence[str] = (), progress: Pr
 
 
 def build_truth_from_capture(capture: Capture, options: Options, progress: Progress | None = None) -> GroundTruth:
-    """The truth of an opened capture: poses and class images are its own. Frames without a pose are left out."""
+    """Builds the truth of an open capture from its own poses and class images. It leaves out frames without a pose."""
     progress = progress or Progress()
     frames = [index for index in select_frames(capture) if capture.pose(index) is not None]
     if not frames:
-        raise FreeOccError(f"{capture.path} has no poses, from which alone a ground truth could be built.")
+        raise FreeOccError(f"{capture.path} has no poses: a ground truth needs them.")
     names, labels_of = _classes(capture, frames)
     votes = Votes(options, len(names))
     _each(capture, frames, "points", progress, lambda frame, T: votes.add(frame, T, labels_of(frame)))
@@ -115,7 +115,7 @@ def build_truth_from_capture(capture: Capture, options: Options, progress: Progr
 
 
 class Votes:
-    """(i): the points of each voxel by class; grows with the surface, not with the frames."""
+    """(i): the points of each voxel by class. Memory grows with the surface, not with the number of frames."""
 
     def __init__(self, options: Options, classes: int):
         self.options = options
@@ -124,7 +124,7 @@ class Votes:
         self._counts: list[NDArray[np.int64]] = []
 
     def add(self, frame: Frame, T_world_cam: NDArray[np.float64], labels: NDArray[np.uint8]) -> None:
-        """Take a frame. labels: (H, W) class image of the frame's size, 0 = no class."""
+        """Adds a frame. labels: (H, W) class image of the frame's size, 0 = no class."""
         step = self.options.pixel_stride
         depth = frame.depth_m[::step, ::step]
         v, u = np.nonzero((depth > 0) & (depth <= self.options.max_range))
@@ -141,8 +141,9 @@ class Votes:
             self._merge()
 
     def labeled(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        """(V, 3) voxels in which points lie and (V,) the class of most of them; of equally many the first in the list.
-        Points without a class do not vote; a voxel that holds no others is 255, one with too few points is left out."""
+        """Returns the (V, 3) voxels with points, and the (V,) class of most points; a tie goes to the first class in
+        the list. Points without a class do not vote. A voxel with only such points is 255. A voxel with too few points
+        is left out."""
         self._merge()
         if not self._keys:
             return np.zeros((0, 3), np.int64), np.zeros(0, np.uint8)
@@ -156,7 +157,7 @@ class Votes:
         )
 
     def _append(self, pairs: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
-        """Add (P, 2) sorted pairs (voxel, label) with their counts, equal ones summed."""
+        """Adds (P, 2) sorted pairs (voxel, label) with their counts, and sums equal pairs."""
         if len(pairs):
             start = np.flatnonzero(np.append(True, (pairs[1:] != pairs[:-1]).any(axis=1)))
             self._keys.append(pairs[start])
@@ -177,7 +178,7 @@ def mark_observed(
     origin: NDArray[np.float64],
     options: Options,
 ) -> None:
-    """(iii): mark in ``seen`` (X, Y, Z) the voxels of the lattice at ``origin`` that one frame observes."""
+    """(iii): marks in ``seen`` (X, Y, Z) the voxels of the lattice at ``origin`` that one frame observes."""
     camera, T_cam_world = frame.intrinsics, invert(T_world_cam)
     depth = np.where(frame.depth_m <= options.max_range, frame.depth_m, 0).astype(np.float32)
     _observe(
@@ -193,7 +194,7 @@ def mark_observed(
 @njit(parallel=True, cache=True)
 def _observe(
     seen: NDArray[np.bool_],
-    R: NDArray[np.float64],  # voxels to meters in the camera's frame
+    R: NDArray[np.float64],  # from voxels to meters in the camera's frame
     t: NDArray[np.float64],
     camera: NDArray[np.float64],
     depth_m: NDArray[np.float32],
@@ -221,11 +222,13 @@ def _observe(
 
 
 def _classes(capture: Capture, frames: list[int]) -> tuple[tuple[str, ...], Callable[[Frame], NDArray[np.uint8]]]:
-    """The names of the classes, and what gives a frame's class image at the size of its depth."""
+    """Returns the names of the classes, and a function that returns a frame's class image at the size of its depth."""
     if len(capture.classes) < 2 or capture.labels(frames[0]) is None:
         return (taxonomy.FREE, UNLABELED), lambda frame: np.ones(frame.depth_m.shape, np.uint8)
     if len(capture.classes) > _MOST_CLASSES + 1:
-        raise FreeOccError(f"{capture.path} names more than {_MOST_CLASSES} classes, which a byte cannot tell apart.")
+        raise FreeOccError(
+            f"{capture.path} names more than {_MOST_CLASSES} classes, but a label is one byte: name fewer."
+        )
 
     def labels_of(frame: Frame) -> NDArray[np.uint8]:
         image = capture.labels(frame.index)
@@ -236,7 +239,7 @@ def _classes(capture: Capture, frames: list[int]) -> tuple[tuple[str, ...], Call
             if image.max(initial=0) >= len(capture.classes):
                 raise FreeOccError(
                     f"The class image of frame {frame.index} of {capture.path} has value {image.max()}, but only "
-                    f"{len(capture.classes)} classes are named."
+                    f"{len(capture.classes)} classes have names."
                 )
         rows, columns = (
             ((np.arange(size) + 0.5) * own / size).astype(np.int64)
@@ -254,7 +257,7 @@ def _each(
     progress: Progress,
     work: Callable[[Frame, NDArray[np.float64]], None],
 ) -> None:
-    """Decode the frames and hand each to ``work`` with its pose; a broken one is told and left out."""
+    """Decodes the frames and calls ``work`` with each frame and its pose. Reports broken frames and leaves them out."""
     progress.stage(stage, len(frames))
     for done, (index, frame) in enumerate(read_ahead(capture, frames), start=1):
         T_world_cam = capture.pose(index)
@@ -266,19 +269,19 @@ def _each(
 
 
 def _grid(voxels: NDArray[np.int64], labels: NDArray[np.uint8], options: Options, source: str) -> NDArray[np.uint8]:
-    """(ii): (X, Y, Z) labels over the voxels' extent, 0 where there is none."""
+    """(ii): returns the (X, Y, Z) labels over the extent of the voxels, 0 for cells without a voxel."""
     shape = voxels.max(axis=0) + 1
     if math.prod(shape.tolist()) > _LARGEST_GRID:
         size = " x ".join(str(n) for n in shape)
         raise FreeOccError(
-            f"The points of {source} spread over {size} voxels of {options.voxel_size:g} m, too many for memory: are "
-            "its poses and depth scale right? Otherwise use larger voxels."
+            f"The points of {source} spread over {size} voxels of {options.voxel_size:g} m, too many for memory: check "
+            "its poses and depth scale, or use larger voxels."
         )
     grid = np.zeros(shape, np.uint8)
     grid[tuple(voxels.T)] = labels
     if options.fill == "within":
         inside = grid.copy()
-        for axis in range(3):  # of several neighbors at the same distance the first in this order counts
+        for axis in range(3):  # a tie between neighbors goes to the first in this order
             for ahead in (False, True):
                 here, there = _neighbors(axis, ahead)
                 free = grid[here] == 0
@@ -287,7 +290,7 @@ def _grid(voxels: NDArray[np.int64], labels: NDArray[np.uint8], options: Options
 
 
 def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The mask with the voxels that share a face with one of it."""
+    """Returns the mask, grown by the voxels that share a face with it."""
     grown = mask.copy()
     for axis in range(3):
         for ahead in (False, True):
@@ -297,7 +300,7 @@ def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _neighbors(axis: int, ahead: bool) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Slices that put each voxel beside its neighbor along an axis."""
+    """Returns slices that pair each voxel with its neighbor along an axis."""
     low, high = [slice(None)] * 3, [slice(None)] * 3
     low[axis], high[axis] = slice(None, -1), slice(1, None)
     return (tuple(low), tuple(high)) if ahead else (tuple(high), tuple(low))

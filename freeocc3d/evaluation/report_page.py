@@ -1,4 +1,4 @@
-"""An evaluation as one HTML file that needs nothing beside it: figures, classes, confusions, trajectories, pictures."""
+"""Writes an evaluation as one self-contained HTML file: figures, classes, confusions, trajectories, pictures."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from .scene_scoring import ScoredScene
 from .scoring import PRIMARY_MASK, TOP, Evaluation
 
 MOST_SEGMENTS = 2000
-"""Pieces that a drawn trajectory has at most."""
+"""Most pieces of a drawn trajectory."""
 
 NO_CLASS = "occupied, no class"
 NOT_OCCUPIED = "not occupied"
-_PLAIN = (120, 150, 190)  # of a voxel whose class nobody knows
+_PLAIN = (120, 150, 190)  # color of a voxel without a known class
 
 DIFFERENCES = {
     "right": (176, 190, 176),
@@ -33,13 +33,13 @@ DIFFERENCES = {
     "missed": (40, 110, 220),
     "invented": (220, 50, 50),
 }
-"""What the picture of differences tells apart, in its colors."""
+"""The kinds of voxels in the picture of differences, with their colors."""
 
 
 def write_report(evaluation: Evaluation, path: Path, overwrite: bool = False) -> None:
-    """Write the page; the same evaluation gives the same page. Where pictures cannot be rendered it says so instead.
+    """Writes the page. The same evaluation gives the same page. If pictures cannot be rendered, the page says why.
 
-    Raises ExportError: it exists, or cannot be written.
+    Raises ExportError: the file exists, or cannot be written.
     """
     page = _page(evaluation)
     write_whole(path, lambda target: _write_text(target, page), overwrite)
@@ -77,7 +77,7 @@ def _page(evaluation: Evaluation) -> str:
 
 
 def _lists(evaluation: Evaluation) -> list[dict[str, Any]]:
-    """mIoU over each list of classes, or why there is none."""
+    """Returns mIoU over each list of classes, or why there is none."""
     rows = []
     for name, names in evaluation.miou_over.items():
         why = ""
@@ -86,7 +86,7 @@ def _lists(evaluation: Evaluation) -> list[dict[str, Any]]:
         elif names is None:
             count = len(evaluation.scores.present)
             top = name in {f"top_{k}" for k in TOP}
-            why = f"the truth holds {count} classes" if top else "the classes are other ones: map them with --classes"
+            why = f"the truth holds {count} classes" if top else "the classes differ: map them with --classes"
         absent = [c for c in names or () if c in evaluation.absent]
         rows.append({
             "name": name, "miou": None if why else evaluation.miou(names), "why": why, "names": names or (),
@@ -96,8 +96,8 @@ def _lists(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def _classes(evaluation: Evaluation) -> list[dict[str, Any]]:
-    """Each class that the truth or the prediction holds, most frequent first: its IoU, how much of it was found
-    occupied as whatever, and what it was taken for."""
+    """Returns each class that the truth or the prediction holds, most frequent first: its IoU, the share of it that was
+    found occupied, and the classes that the prediction gives it."""
     scores = evaluation.scores
     matrix = scores.matrix
     colors = assign_class_colors(list(evaluation.classes))
@@ -123,7 +123,7 @@ def _classes(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def _confusion(evaluation: Evaluation) -> dict[str, Any]:
-    """The confusion matrix without the classes that occur in neither, as shares of its rows."""
+    """Returns the confusion matrix as shares of its rows, without the classes that occur in neither."""
     matrix = evaluation.scores.matrix
     occurs = matrix[1:].sum(axis=1) + matrix[:, 1:-1].sum(axis=0) > 0
     kept = np.flatnonzero(np.concatenate(([True], occurs)))
@@ -140,7 +140,7 @@ def _confusion(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _scene(own: Evaluation) -> dict[str, Any]:
-    """What the page says of one scene."""
+    """Returns the page's values for one scene."""
     scene = own.scenes[0]
     pictures, lacking = _pictures(own)
     mask = scene.truth.masks()[PRIMARY_MASK]
@@ -163,7 +163,7 @@ def _scene(own: Evaluation) -> dict[str, Any]:
 
 
 def _pictures(own: Evaluation) -> tuple[dict[str, str], str]:
-    """Data addresses of the pictures of the truth, the prediction and the difference, or why there are none."""
+    """Returns the pictures of the truth, the prediction and the difference as data addresses, or why there are none."""
     scene = own.scenes[0]
     truth, predicted, mask = scene.truth, scene.predicted, scene.truth.masks()[PRIMARY_MASK]
     true_way = np.zeros((0, 3)) if scene.errors is None else scene.errors.true
@@ -184,7 +184,7 @@ def _pictures(own: Evaluation) -> tuple[dict[str, str], str]:
     except DependencyError as error:
         return {}, f"There are no pictures. {error}"
     if not pictures:
-        return {}, "There are no pictures: neither the truth nor the prediction holds an occupied voxel."
+        return {}, "There are no pictures: neither the truth nor the prediction has occupied voxels."
     return {
         name: f"data:image/png;base64,{base64.b64encode(picture).decode()}" for name, picture in pictures.items()
     }, ""
@@ -193,7 +193,7 @@ def _pictures(own: Evaluation) -> tuple[dict[str, str], str]:
 def compare_voxels(
     true: NDArray[np.integer], occupied: NDArray[np.bool_], labels: NDArray[np.integer] | None
 ) -> NDArray[np.uint8]:
-    """(X, Y, Z) per voxel 0 where both say free, else 1 + the place in ``DIFFERENCES``.
+    """Returns (X, Y, Z): 0 where both are free, else 1 + the index in ``DIFFERENCES``.
 
     true: (X, Y, Z), 0 free, k class k.  labels: (X, Y, Z), as ``Prediction.labels``; without them no class is wrong.
     """
@@ -210,8 +210,8 @@ def _difference_colors() -> NDArray[np.uint8]:
 
 
 def _drawn_way(scene: ScoredScene) -> dict[str, Any]:
-    """The trajectories from above, in centimeters, y downwards as on screens: points of the true one, and pieces of the
-    estimated one with the color of their error."""
+    """Returns the trajectories from above, in centimeters, with y down as on screens: points of the true one, and
+    pieces of the estimated one with the color of their error."""
     errors = scene.errors
     assert errors is not None
     R = turn_upright(scene.up, errors.true)
@@ -222,7 +222,7 @@ def _drawn_way(scene: ScoredScene) -> dict[str, Any]:
     true, way = true - low, way - low
     off = errors.errors_m[::step]
     worst = max(float(errors.errors_m.max()), 1e-9)
-    colors = color_by_value(1 - 0.85 * off / worst)  # the palest of the colors would vanish on white
+    colors = color_by_value(1 - 0.85 * off / worst)  # leaves out the palest colors, which are invisible on white
     unit = max(float(extent.max()), 1.0)
     return {
         "box": (-0.04 * unit, -0.04 * unit, extent[0] + 0.08 * unit, extent[1] + 0.08 * unit),

@@ -1,7 +1,7 @@
 """Reads pickles of published data sets without running them.
 
-A pickle is a program. Here it may only put together NumPy arrays of numbers and plain containers; everything else is
-refused.
+A pickle is a program. Here it may only build NumPy arrays of numbers and plain containers. The reader refuses
+everything else.
 """
 
 from __future__ import annotations
@@ -20,28 +20,30 @@ from numpy.typing import NDArray
 from ..core.errors import FreeOccError
 
 _LARGEST_FILE = 1 << 30
-"""EmbodiedOcc's largest grid, 200 x 220 x 90 voxels with float64 centers and int64 labels, takes 0.2 GB."""
+"""Largest file, bytes. EmbodiedOcc's largest grid, 200 x 220 x 90 voxels with float64 centers and int64 labels, takes
+0.2 GB."""
 
 _MOST_OPERATIONS = 1_000_000
 _MOST_TUPLES = 10_000
 _MOST_SHARED_TUPLES = 16
-"""A package takes some thousand operations, a few of them tuples. Hashed as a key, a tuple that is nested too deep
-overflows the stack, and one whose parts are each used twice takes time that doubles with every level."""
+"""Most operations, tuples, and tuples that are used again. A package has some thousand operations and a few tuples. As a key, a
+tuple that is nested too deep overflows the stack when it is hashed, and a tuple that uses each part twice takes time
+that doubles with every level."""
 
 _NO_TUPLE = frozenset({
     "UNICODE", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8", "STRING", "BINSTRING", "SHORT_BINSTRING",
     "SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8", "EMPTY_LIST", "LIST", "EMPTY_DICT", "DICT", "EMPTY_SET",
     "FROZENSET", "GLOBAL", "STACK_GLOBAL", "REDUCE",
 })  # fmt: skip
-"""Operations that leave something else than a tuple on top of the stack."""
+"""Operations after which the top of the stack is not a tuple."""
 
 
 class RestrictedUnpickler(pickle.Unpickler):
     """Reads a pickle of NumPy arrays of numbers and plain containers, written by NumPy 1 or 2 in any protocol.
 
-    No class or function of the pickle's choice is ever called: the few names that such a pickle holds stand for methods
-    of this class, which check sizes before they take memory. ``load`` raises FreeOccError for what is refused, and
-    whatever ``pickle`` raises for damaged data; ``load_pickle`` turns that into FreeOccError as well.
+    It never calls a class or function that the pickle chooses. The few names in such a pickle stand for methods of this
+    class, which check sizes before they take memory. ``load`` raises FreeOccError for refused content, and any error of
+    ``pickle`` for damaged data; ``load_pickle`` turns these into FreeOccError too.
     """
 
     def __init__(self, data: bytes, path: Path):
@@ -51,7 +53,7 @@ class RestrictedUnpickler(pickle.Unpickler):
         self._array_bytes_left = self._text_left = len(data)
 
     def find_class(self, module: str, name: str) -> Any:
-        """What stands for a name. Raises FreeOccError for a name that a pickle of arrays does not need."""
+        """Returns the method that stands for a name. Raises FreeOccError for a name that arrays do not need."""
         admitted: dict[tuple[str, str], Any] = {
             ("numpy", "ndarray"): "ndarray",
             ("numpy", "dtype"): self._dtype,
@@ -67,29 +69,29 @@ class RestrictedUnpickler(pickle.Unpickler):
         if (module, name) not in admitted:
             raise FreeOccError(
                 f"{self.path} is refused: it asks for {shorten(f'{module}.{name}')}, and a package may hold only NumPy "
-                "arrays and plain values, since a pickle can run any code; get it from its publisher again."
+                "arrays and plain values, because a pickle can run any code. Download it from its publisher again."
             )
         return admitted[module, name]
 
     def array(self, raw: Any, dtype: Any, shape: Any, order: str) -> NDArray[Any]:
-        """The array of some bytes, without a copy.
+        """Returns the array of some bytes, without a copy.
 
-        All arrays together may not be larger than the file: each byte of a package is there once.
+        All arrays together may not be larger than the file, because a package holds each byte once.
         """
         if not isinstance(raw, bytes | bytearray) or not isinstance(dtype, _DType) or not isinstance(shape, tuple):
             raise ValueError("an array's state has the wrong types")
         if not all(type(n) is int and n >= 0 for n in shape):
-            raise ValueError(f"an array's shape is no list of {len(shape)} counts")
+            raise ValueError(f"an array's shape is not a list of {len(shape)} counts")
         size = math.prod(shape) * dtype.dtype.itemsize
         if size != len(raw) or size > self._array_bytes_left:
-            raise ValueError("an array states a size that its data do not have")
+            raise ValueError("an array's size differs from that of its data")
         self._array_bytes_left -= size
         if not size:
             return np.zeros(shape, dtype.dtype)
         return np.frombuffer(raw, dtype.dtype).reshape(shape, order="F" if order == "F" else "C")
 
     def _reconstruct(self, kind: Any, shape: Any, code: Any) -> NDArray[Any]:
-        # NumPy always starts from an empty array, whose content its state brings.
+        # NumPy always starts from an empty array; the array's state then fills it.
         if kind != "ndarray":
             raise ValueError("an array of another kind than ndarray")
         empty = _Array((0,), np.uint8)
@@ -118,10 +120,10 @@ class RestrictedUnpickler(pickle.Unpickler):
     def _encode(self, text: Any, codec: Any) -> bytes:
         # Protocols 0 to 2 have no bytes: Python 3 writes them as text.
         if not isinstance(text, str) or codec != "latin1":
-            raise ValueError("bytes are written as something else than latin1 text")
+            raise ValueError("bytes are not written as latin1 text")
         self._text_left -= len(text)
         if self._text_left < 0:
-            raise ValueError("the same text is turned into bytes again and again")
+            raise ValueError("the same text is converted to bytes too often")
         return text.encode("latin1")
 
     def _no_bytes(self) -> bytes:
@@ -132,7 +134,7 @@ class RestrictedUnpickler(pickle.Unpickler):
 
 
 class _DType:
-    """Stands for a dtype while a pickle is read: a pickle's state may alter NumPy's own, out of bounds."""
+    """Stands for a dtype while a pickle is read: a pickle's state could corrupt NumPy's own dtype."""
 
     __slots__ = ("dtype", "unpickler")
 
@@ -150,26 +152,26 @@ class _DType:
 
 
 class _Array(np.ndarray[Any, Any]):
-    """An array whose content is still to come."""
+    """An array before its content is read."""
 
     unpickler: RestrictedUnpickler
 
     def __setstate__(self, state: Any) -> None:
         _, shape, dtype, is_fortran, raw = state
-        # The size is checked here; NumPy then fills this very array, which the pickle already refers to.
+        # After the check of the size, NumPy fills this same array, which the pickle already refers to.
         self.unpickler.array(raw, dtype, shape, "C")
         super().__setstate__((1, shape, dtype.dtype, bool(is_fortran), raw))  # type: ignore[arg-type]
         del self.unpickler
 
 
 def load_pickle(path: Path) -> object:
-    """What a pickle of arrays and plain containers holds.
+    """Reads a pickle of arrays and plain containers.
 
-    Raises FreeOccError: no such file, too large, damaged, or it asks for anything else than these.
+    Raises FreeOccError: no such file, too large, damaged, or it asks for anything else.
     """
     try:
         if path.stat().st_size > _LARGEST_FILE:
-            raise FreeOccError(f"{path} is larger than 1 GiB: no package of a scene's ground truth is.")
+            raise FreeOccError(f"{path} is larger than 1 GiB, so it is not the ground truth of a scene.")
         data = path.read_bytes()
     except OSError as error:
         raise FreeOccError(f"Cannot read {path}: {(error.strerror or str(error)).lower()}.") from error
@@ -178,15 +180,15 @@ def load_pickle(path: Path) -> object:
     except FreeOccError:
         raise
     except Exception as error:  # Damaged data make pickle raise almost anything.
-        raise FreeOccError(f"{path} is damaged or not a pickle: get it from its publisher again.") from error
+        raise FreeOccError(f"{path} is damaged or not a pickle: download it from its publisher again.") from error
 
 
 def _check_operations(data: bytes, path: Path) -> None:
-    """Raises FreeOccError or ValueError where a pickle's operations would take memory or time out of all proportion.
+    """Raises FreeOccError or ValueError if a pickle's operations would take too much memory or time.
 
-    Each operation makes at most one object, and the bytes of arrays are counted as they are read, so that memory grows
-    with the file. Objects that are referred to again are numbered, in an array of pickle's own that is as long as the
-    largest number, which is the file's choice.
+    Each operation makes one object or none, and the reader counts the bytes of arrays, so memory grows with the file.
+    Objects that the pickle refers to again have numbers. Pickle keeps them in an array as long as the largest number,
+    and the file chooses that number.
     """
     tuples, shared, previous = 0, 0, ""
     may_be_tuple: dict[int, bool] = {}
@@ -195,15 +197,15 @@ def _check_operations(data: bytes, path: Path) -> None:
         if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
             number = len(may_be_tuple) if name == "MEMOIZE" else int(argument)
             if number > count:
-                raise ValueError("an object's number is larger than the objects are many")
+                raise ValueError("an object's number exceeds the number of objects")
             may_be_tuple[number] = previous not in _NO_TUPLE
         tuples += name.startswith("TUPLE")
         shared += name == "DUP" or (name in ("GET", "BINGET", "LONG_BINGET") and may_be_tuple[int(argument)])
         if count > _MOST_OPERATIONS or tuples > _MOST_TUPLES or shared > _MOST_SHARED_TUPLES:
-            raise FreeOccError(f"{path} is refused: it is put together of more parts than a package of arrays has.")
+            raise FreeOccError(f"{path} is refused: it has more parts than a package of arrays.")
         previous = name
 
 
 def shorten(text: str) -> str:
-    """A file's own words on one line of a message, without codes that a terminal would obey."""
+    """Returns a file's own words on one line for a message, without terminal control codes."""
     return "".join(letter for letter in " ".join(text[:200].split()) if letter.isprintable())[:100]

@@ -1,6 +1,6 @@
-"""One scene scored: its truth, a claim about its voxels and, where there is one, its trajectory.
+"""Scores one scene: a prediction of its voxels against the truth and, if there is one, its trajectory.
 
-The claim comes from a saved map, from the Gaussians of another system, from per-frame Gaussians or from a voxel grid.
+The prediction comes from a saved map, the Gaussians of another system, per-frame Gaussians or a voxel grid.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from .true_occupancy import GroundTruth
 class ScoredScene:
     """One scored scene.
 
-    name: of the map, file or folder that was scored.  truth: in terms of the scored classes.
-    alignment: of the estimate's world with the true one.  errors: of the trajectory, None where there is none.
-    frames: of the capture, or with a true pose.  frames_with_pose: of those, with an estimated pose.
-    up: (3,) unit vector towards the ceiling in the true world, for pictures.
-    notes: sentences about what should be known when the figures are read.
+    name: of the scored map, file or folder.  truth: with the scored classes.
+    alignment: of the estimated world with the true world.  errors: of the trajectory, None without a trajectory.
+    frames: number of frames of the capture, or with a true pose.  frames_with_pose: those with an estimated pose.
+    up: (3,) unit vector toward the ceiling in the true world, for pictures.
+    notes: sentences that a reader of the figures should know.
     """
 
     name: str
@@ -63,10 +63,10 @@ def score_map(
     how: str = "se3",
     overrides: Sequence[str] = (),
 ) -> ScoredScene:
-    """Score a map. poses: the true ones, by default those of the capture that the map was made of.
+    """Scores a map. poses: the true ones, by default those of the map's capture.
 
-    overrides: options of layer 4, ``occupancy.threshold=0.4``, in place of those that the map was made with.
-    Raises FreeOccError: no true poses, an alignment that is not determined.
+    overrides: options of layer 4 that replace the map's own, such as ``occupancy.threshold=0.4``.
+    Raises FreeOccError: no true poses, too few poses for an alignment.
     """
     settings = config.load_saved(scan_map.path / CONFIG, list(overrides))
     estimated = select_estimated_poses(scan_map.trajectory)
@@ -80,7 +80,7 @@ def score_map(
     predicted, note = predictions.predict_from_map(scan_map, settings, alignment, truth, classes)
     notes = [note] if note else []
     if not scan_map.metric and how != "sim3":
-        notes.append("The map's scale is unknown: --align sim3 compares it at the true one.")
+        notes.append("The map's scale is unknown: use --align sim3 to compare it at the true scale.")
     return ScoredScene(
         name=str(scan_map.path),
         truth=truth,
@@ -103,10 +103,10 @@ def score_gaussians(
     how: str = "se3",
     overrides: Sequence[str] = (),
 ) -> ScoredScene:
-    """Score the Gaussians of another system: a 3DGS PLY and the trajectory that belongs to it.
+    """Scores the Gaussians of another system: a 3DGS PLY with its trajectory.
 
-    trajectory: the system's own, whose world the Gaussians are in; None if they are in the true frame (``how`` none).
-    poses: the true ones. Raises FreeOccError as ``score_map``, and for a PLY that cannot be read.
+    trajectory: the system's own; the Gaussians are in its world. None if they are in the true frame (``how`` none).
+    poses: the true ones. Raises FreeOccError as ``score_map`` does, and for an unreadable PLY.
     """
     alignment, errors = _aligned(trajectory, poses, how, ply)
     gaussians, labels = read_standard_ply(ply)
@@ -121,7 +121,7 @@ def score_gaussians(
 def score_frames(
     folder: Path, truth: GroundTruth, classes: ClassMap, poses: Poses, overrides: Sequence[str] = ()
 ) -> ScoredScene:
-    """Score per-frame Gaussians fused by true poses (``project.of_frames``)."""
+    """Scores per-frame Gaussians fused by true poses (``predictions.predict_from_frames``)."""
     predicted, fused = predictions.predict_from_frames(
         folder, poses, config.load(None, list(overrides)), truth, classes
     )
@@ -138,7 +138,7 @@ def score_grid(
     poses: Poses | None = None,
     how: str = "se3",
 ) -> ScoredScene:
-    """Score a finished voxel grid. Without a trajectory it is in the true frame already."""
+    """Scores a finished voxel grid. A grid without a trajectory is already in the true frame."""
     alignment, errors = _aligned(trajectory, poses, how if trajectory is not None else "none", path)
     predicted, note = predictions.predict_from_grid(path, alignment, truth, classes)
     return _other(path, truth, predicted, alignment, errors, trajectory, poses, [note] if note else [])
@@ -153,8 +153,8 @@ def _aligned(
                 "the trajectory that it was made with (--trajectory)" if trajectory is None else "true poses (--poses)"
             )
             raise FreeOccError(
-                f"{path} is aligned by camera centers, for which {lacking} must be given; if it is in the frame of the "
-                "true poses already, use --align none."
+                f"The alignment of {path} compares camera centers: give {lacking}. If {path.name} is already in the "
+                "frame of the true poses, use --align none."
             )
         return TrajectoryAlignment.identity(), None
     alignment = align_trajectories(trajectory, poses, how)
@@ -171,7 +171,7 @@ def _other(
     poses: Poses | None,
     notes: Sequence[str],
 ) -> ScoredScene:
-    """A scene of another system's."""
+    """Returns the scored scene of another system."""
     return ScoredScene(
         name=str(path),
         truth=truth,
@@ -186,14 +186,14 @@ def _other(
 
 
 def _up(truth: GroundTruth, poses: Poses | None) -> NDArray[np.float64]:
-    """(3,) where up is in the true world; without poses z, as in the published data sets."""
+    """Returns the (3,) up direction in the true world; without poses it is z, as in the published data sets."""
     if poses is None:
         return np.array((0.0, 0.0, 1.0))
     return estimate_up(poses.T_world_cam, truth.centers()[(truth.labels > 0) & (truth.labels != UNKNOWN)])
 
 
 def _own_poses(scan_map: Map) -> Poses:
-    """The poses that the map's capture states. Raises FreeOccError."""
+    """Returns the true poses in the map's capture. Raises FreeOccError."""
     try:
         capture = scan_map.capture
     except FreeOccError as error:

@@ -1,8 +1,7 @@
-"""Which classes are scored, and how the names of other taxonomies map to them.
+"""The scored classes, and the names of other taxonomies that map to them.
 
-A class file (``capture/class_files.py``) is used in both directions: the truth's names are turned into the
-scored classes, and a map is asked for every name that the file knows, each voxel taking the class that its best name
-maps to.
+A class file (``capture/class_files.py``) works in both directions. It turns the truth's names into the scored classes.
+It also gives the names to ask a map for: each voxel takes the class that its best name maps to.
 """
 
 from __future__ import annotations
@@ -33,8 +32,9 @@ _MOST_CLASSES = 254
 
 @dataclass(frozen=True)
 class ClassMap:
-    """classes: names of the scored classes, label k being ``classes[k - 1]``.
+    """A map from names to scored classes.
 
+    classes: names of the scored classes; label k is ``classes[k - 1]``.
     labels: label of every known name in lower case, 0 for a name that is not scored.
     """
 
@@ -43,13 +43,13 @@ class ClassMap:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Every name that stands for a scored class: what a map is asked."""
+        """Every name that stands for a scored class: the words to ask a map for."""
         return tuple(name for name, label in self.labels.items() if label)
 
     def apply(self, truth: GroundTruth, source: str) -> GroundTruth:
-        """The truth in terms of the scored classes; voxels of classes that are not scored become 255.
+        """Returns the truth with the scored classes. Voxels of other classes become 255.
 
-        source: the class file's name, for messages. Raises FreeOccError: a class that the truth holds is not known.
+        source: the class file's name, for messages. Raises FreeOccError: the truth holds an unknown class.
         """
         table = np.full(256, UNKNOWN, np.uint8)
         table[0] = 0
@@ -57,7 +57,7 @@ class ClassMap:
         unknown = [truth.classes[k] for k in occurring if truth.classes[k].lower() not in self.labels]
         if unknown:
             raise FreeOccError(
-                f"{source} says nothing of {', '.join(repr(name) for name in unknown)}, which the ground truth holds: "
+                f"{source} does not name {', '.join(repr(name) for name in unknown)}, which the ground truth holds: "
                 "add each to its 'map', with one of its classes or null."
             )
         for k in occurring:
@@ -66,12 +66,12 @@ class ClassMap:
 
 
 def map_each_to_itself(classes: tuple[str, ...]) -> ClassMap:
-    """Every class for itself. classes: as in ``GroundTruth``, the first is not used."""
+    """Maps every class to itself. classes: as in ``GroundTruth``; the first is not used."""
     return ClassMap(classes[1:], {name.lower(): k for k, name in enumerate(classes) if k})
 
 
 def load_class_map(path: Path) -> ClassMap:
-    """Read a class file. Raises FreeOccError: no such file, not of this form, a target that is no class."""
+    """Reads a class file. Raises FreeOccError: no such file, another form, a target that is not a class."""
     listed = read_class_file(path)
     labels = {name.lower(): label for label, name in enumerate(listed.names, start=1)}
     if len(labels) < len(listed.names) or len(listed.names) > _MOST_CLASSES:

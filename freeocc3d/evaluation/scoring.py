@@ -1,7 +1,6 @@
-"""Scenes scored one by one and pooled: what ``freeocc3d evaluate`` does.
+"""Scores scenes one by one and pools them: what ``freeocc3d evaluate`` does.
 
-The result states which classes are scored, under which masks, and what could not be scored: no figure stands without
-them.
+Every figure comes with its context: the scored classes, the masks, and what could not be scored.
 """
 
 from __future__ import annotations
@@ -29,11 +28,12 @@ TOP = (10, 20, 30, 40)
 
 @dataclass(frozen=True)
 class ScoringRequest:
-    """What is to be scored: maps, or one of ``gaussians``, ``grid`` and ``frames``, as on the command line.
+    """The things to score: maps, or one of ``gaussians``, ``grid`` and ``frames``, as on the command line.
 
-    ground_truths: one for each map, or one folder of packages, or none: the captures' own ``ground_truth.npz``.
-    poses: one for each map, or none: the captures' own.  classes: a class file.  split: a file that lists the scenes to
-    score.  overrides: options of layer 4.  align: se3, sim3 or none; None = se3, and sim3 if a map's scale is unknown.
+    ground_truths: one for each map, or one folder of packages; if empty, the captures' own ``ground_truth.npz``.
+    poses: one for each map; if empty, the captures' own.  classes: a class file.  split: a file that lists the scenes
+    to score.  overrides: options of layer 4.  align: se3, sim3 or none; None = sim3 if a map's scale is unknown, else
+    se3.
     """
 
     maps: Sequence[Path] = ()
@@ -50,7 +50,7 @@ class ScoringRequest:
 
 
 def evaluate_scenes(asked: ScoringRequest) -> Evaluation:
-    """Read what is asked for, score each scene, pool. Raises FreeOccError with one sentence about what does not fit."""
+    """Reads the inputs, scores each scene and pools the scores. Raises FreeOccError for inputs that do not fit."""
     maps = [load_map(path) for path in asked.maps]
     how = asked.align or ("se3" if all(scan_map.metric for scan_map in maps) else "sim3")
     if asked.split is not None:
@@ -61,7 +61,7 @@ def evaluate_scenes(asked: ScoringRequest) -> Evaluation:
     truths = _truths(captures, asked.ground_truths, count, listed)
     if len(asked.poses) not in (0, count):
         raise FreeOccError(
-            f"--poses is given {len(asked.poses)} times for {count} scenes: once for each, or not at all."
+            f"--poses is given {len(asked.poses)} times for {count} scenes: give it once for each scene, or never."
         )
     poses: list[Poses | None] = [read_poses(path) for path in asked.poses] or [None] * count
     classes = listed or collect_common_classes(truths)
@@ -69,7 +69,7 @@ def evaluate_scenes(asked: ScoringRequest) -> Evaluation:
     trajectory = None if asked.trajectory is None else read_poses(asked.trajectory)
     for other in (asked.gaussians, asked.grid, asked.frames):
         if other is not None and not other.exists():
-            raise FreeOccError(f"There is no {other} to score.")
+            raise FreeOccError(f"There is no file or folder {other} to score.")
     if maps:
         scenes = [
             score_map(scan_map, truth, classes, true, how, asked.overrides)
@@ -81,7 +81,7 @@ def evaluate_scenes(asked: ScoringRequest) -> Evaluation:
         scenes = [score_grid(asked.grid, truths[0], classes, trajectory, poses[0], how)]
     elif asked.frames is not None:
         if poses[0] is None:
-            raise FreeOccError("Per-frame Gaussians are fused by true poses: name them with --poses.")
+            raise FreeOccError("Per-frame Gaussians need true poses: name them with --poses.")
         scenes = [score_frames(asked.frames, truths[0], classes, poses[0], asked.overrides)]
     else:
         raise FreeOccError("There is nothing to score: give a map, or --gaussians, --grid or --frames.")
@@ -89,35 +89,35 @@ def evaluate_scenes(asked: ScoringRequest) -> Evaluation:
 
 
 def name_scene(scan_map: Map) -> str:
-    """A map's scene: the name of the capture's folder."""
+    """Returns a map's scene: the name of the capture's folder."""
     return Path(scan_map.manifest.capture.path).name
 
 
 def _in_split(maps: list[Map], split: Path) -> list[Map]:
-    """The maps of the scenes that a split lists, in its order. Raises FreeOccError if one is missing."""
+    """Returns the maps of the scenes in a split, in its order. Raises FreeOccError if a map is missing."""
     by_name = {name_scene(scan_map): scan_map for scan_map in maps}
     scenes = read_split(split)
     missing = [name for name in scenes if name not in by_name]
     if missing:
         raise FreeOccError(
-            f"{split} lists {len(missing)} scenes of which no map is given, the first is {missing[0]}: a score over "
-            "part of a split is not that split's."
+            f"{split} lists {len(missing)} scenes without a map, the first is {missing[0]}: give a map for each scene, "
+            "because a score over a part of a split is not the score of the split."
         )
     return [by_name[name] for name in scenes]
 
 
 def _truths(captures: Sequence[str], paths: Sequence[Path], count: int, classes: ClassMap | None) -> list[GroundTruth]:
-    """The truth of each scene. captures: their folders, whose own truths are taken if no paths are given.
+    """Returns the truth of each scene. captures: their folders, which hold the truths if no paths are given.
 
-    classes: the class file's, which names the labels of packages that do not.
+    classes: those of the class file, which names the labels of packages without names.
     """
     if len(paths) == 1 and paths[0].is_dir():
         paths = [find_package(paths[0], Path(capture).name) for capture in captures]
     elif not paths:
         paths = [Path(capture) / "ground_truth.npz" for capture in captures if not Path(capture).is_file()]
         if not paths or not all(path.is_file() for path in paths):
-            absent = f"there is no {paths[0]}" if paths else "no capture is named that could bring it"
-            raise FreeOccError(f"The truth is lacking, {absent}: name it with --ground-truth.")
+            absent = f"{paths[0]} does not exist" if paths else "no capture holds it"
+            raise FreeOccError(f"The ground truth is missing, because {absent}: name it with --ground-truth.")
     if len(paths) != count:
         raise FreeOccError(f"{len(paths)} ground truths are given for {count} scenes: give one for each.")
     names = None if classes is None else ("free", *classes.classes)
@@ -125,7 +125,7 @@ def _truths(captures: Sequence[str], paths: Sequence[Path], count: int, classes:
 
 
 def collect_common_classes(truths: Sequence[GroundTruth]) -> ClassMap:
-    """All classes that some truths name, each for itself."""
+    """Returns all classes that the truths name, each mapped to itself."""
     names = dict.fromkeys(name for truth in truths for name in truth.classes[1:])
     return map_each_to_itself(("", *names))
 
@@ -134,8 +134,8 @@ def collect_common_classes(truths: Sequence[GroundTruth]) -> ClassMap:
 class Evaluation:
     """Scores over all scenes, pooled by voxels. how: "se3", "sim3" or "none".
 
-    Which classes make up mIoU: those that the truth holds, or, where a class file was given (``listed``), all that it
-    lists, as EmbodiedOcc counts them, absent ones as 0.
+    mIoU is over the classes that the truth holds. With a class file (``listed``), it is over all classes of the file,
+    and absent classes count 0, as in EmbodiedOcc.
     """
 
     scenes: tuple[ScoredScene, ...]
@@ -145,7 +145,7 @@ class Evaluation:
 
     @cached_property
     def by_mask(self) -> dict[str, Scores]:
-        """Scores under "label" and, where every scene has masks of its frames, under "frames"."""
+        """Scores under the mask "label" and, if every scene has masks of its frames, under "frames"."""
         masks = [scene.truth.masks() for scene in self.scenes]
         return {
             name: Scores(
@@ -164,17 +164,17 @@ class Evaluation:
 
     @property
     def scores(self) -> Scores:
-        """Under the primary mask."""
+        """The scores under the primary mask."""
         return self.by_mask[PRIMARY_MASK]
 
     @property
     def has_classes(self) -> bool:
-        """Whether every claim names classes; without, there is no mIoU."""
+        """Whether every prediction has classes; without them, there is no mIoU."""
         return all(scene.predicted.labels is not None for scene in self.scenes)
 
     @property
     def classes_in_miou(self) -> tuple[str, ...]:
-        """The classes whose mean is mIoU."""
+        """The classes that mIoU is the mean of."""
         return self.classes if self.listed else self.scores.present
 
     @property
@@ -184,7 +184,7 @@ class Evaluation:
 
     @cached_property
     def miou_over(self) -> dict[str, tuple[str, ...] | None]:
-        """Lists of classes over which mIoU is usually given; None for one that does not apply to these classes."""
+        """The usual lists of classes for mIoU; None for a list that does not fit these classes."""
         known = {name.lower() for name in self.classes}
         lists: dict[str, tuple[str, ...] | None] = {"present": self.scores.present, "listed": self.classes}
         for name, wanted in (("shared_8", SHARED), ("embodiedocc_11", EMBODIEDOCC)):
@@ -197,10 +197,10 @@ class Evaluation:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What should be known when the figures are read."""
+        """Sentences that a reader of the figures should know."""
         apart = [
-            f"{scene.name} claims no voxel inside the truth: if they are not in one frame, name true poses in the "
-            "truth's frame with --poses."
+            f"{scene.name} has no occupied voxel inside the truth: if they are not in one frame, name true poses in "
+            "the truth's frame with --poses."
             for scene in self.scenes
             if not count_confusion(
                 scene.truth.labels, scene.predicted, scene.truth.masks()[PRIMARY_MASK], len(self.classes)
@@ -210,16 +210,16 @@ class Evaluation:
 
     @property
     def ate_rmse_m(self) -> float | None:
-        """Mean over the scenes, None where one has no trajectory."""
+        """Mean ATE over the scenes, meters; None if a scene has no trajectory."""
         errors = [scene.errors.ate_rmse_m for scene in self.scenes if scene.errors is not None]
         return float(np.mean(errors)) if len(errors) == len(self.scenes) else None
 
     def miou(self, names: Sequence[str] | None = None, mask: str = PRIMARY_MASK) -> float | None:
-        """Mean IoU over some classes, by default ``classes_in_miou``; None where no classes were claimed."""
+        """Returns the mean IoU over some classes, by default ``classes_in_miou``; None without predicted classes."""
         names = self.classes_in_miou if names is None else names
         return self.by_mask[mask].miou(names) if self.has_classes and names else None
 
     @property
     def by_scene(self) -> list[Evaluation]:
-        """Each scene alone."""
+        """An evaluation of each scene alone."""
         return [Evaluation((scene,), self.classes, self.how, self.listed) for scene in self.scenes]

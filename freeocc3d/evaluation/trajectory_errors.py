@@ -1,8 +1,8 @@
-"""Errors of a trajectory after its alignment: absolute (ATE) and relative by traveled distance (RPE).
+"""Measures the errors of a trajectory after its alignment: absolute (ATE) and relative by traveled distance (RPE).
 
-Sources: J. Sturm et al., IROS 2012, Sec. IV; pairs of frames as evo's ``--all_pairs --pairs_from_reference -u m``
-chooses them (M. Grupp, evo, https://github.com/MichaelGrupp/evo), so that figures compare: from each frame to the one
-whose traveled distance along the true path is nearest to the asked one, within a tenth of it.
+Sources: J. Sturm et al., IROS 2012, Sec. IV; pairs of frames as in evo's ``--all_pairs --pairs_from_reference -u m``
+(M. Grupp, evo, https://github.com/MichaelGrupp/evo), so that figures compare. Each frame pairs with the frame whose
+traveled distance along the true path is nearest to the given distance, within a tenth of it.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from ..core.transforms import invert
 from ..tracking.trajectory_alignment import Poses, TrajectoryAlignment
 
 DISTANCES_M = (0.1, 0.5, 1.0, 2.0)
-"""Traveled distances of the relative errors."""
+"""Traveled distances for the relative errors, meters."""
 
 _TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
 class RelativeError:
-    """Root mean square over pairs of frames that are ``distance_m`` of path apart: meters and degrees."""
+    """Root mean square over pairs of frames with ``distance_m`` of path between them: meters and degrees."""
 
     distance_m: float
     pairs: int
@@ -36,10 +36,10 @@ class RelativeError:
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """What is left after the alignment, over the M frames that have a pose in both.
+    """The errors after the alignment, over the M frames with a pose in both trajectories.
 
     timestamps: (M,) of the estimate.  true, aligned: (M, 3) camera centers in the true world, meters.
-    relative: one per distance that some pair of frames is apart.
+    relative: one for each distance that some pair of frames has.
     """
 
     timestamps: NDArray[np.float64]
@@ -58,7 +58,7 @@ class TrajectoryErrors:
         return float(np.sqrt((self.errors_m**2).mean()))
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values; lengths in meters, angles in degrees."""
+        """Returns plain values; lengths in meters, angles in degrees."""
         errors = self.errors_m
         return {
             "frames_matched": len(errors),
@@ -75,11 +75,11 @@ class TrajectoryErrors:
 def measure_trajectory_errors(
     estimated: Poses, true: Poses, alignment: TrajectoryAlignment, distances_m: tuple[float, ...] = DISTANCES_M
 ) -> TrajectoryErrors:
-    """Raises FreeOccError if no frame has a pose in both."""
+    """Measures all errors. Raises FreeOccError if no frame has a pose in both trajectories."""
     rows_est, rows_true = associate(estimated.timestamps, true.timestamps)
     if not len(rows_est):
         raise FreeOccError(
-            "No frame has both an estimated and a true pose: do the timestamps belong to the same recording? "
+            "No frame has both an estimated and a true pose: check that the timestamps belong to the same recording. "
             f"Estimated: {_span(estimated)}; true: {_span(true)}."
         )
     T_est = alignment.poses(estimated.T_world_cam[rows_est])
@@ -91,14 +91,14 @@ def measure_trajectory_errors(
 def measure_relative_error(
     T_est: NDArray[np.float64], T_true: NDArray[np.float64], distance_m: float
 ) -> RelativeError | None:
-    """Of (M, 4, 4) matched poses; None if no two frames are that far apart."""
+    """Measures (M, 4, 4) matched poses; returns None if no two frames are that far apart."""
     first, second = pair_by_path(T_true[:, :3, 3], distance_m)
     if not len(first):
         return None
     moved_true = invert(T_true[first]) @ T_true[second]
     moved_est = invert(T_est[first]) @ T_est[second]
     error = invert(moved_true) @ moved_est
-    # The angle by its sine and cosine: near zero the cosine alone loses half of the digits.
+    # The angle comes from its sine and cosine: near zero, the cosine alone loses half of the digits.
     R = error[:, :3, :3]
     sine = 0.5 * np.linalg.norm(
         np.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), axis=1), axis=1
@@ -114,11 +114,12 @@ def measure_relative_error(
 
 
 def pair_by_path(centers: NDArray[np.float64], distance_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows (P,), (P,) of the (M, 3) centers between which the path is ``distance_m`` long, within a tenth of it."""
+    """Returns the rows (P,), (P,) of the (M, 3) centers with a path of ``distance_m`` between them, within a tenth."""
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(centers, axis=0), axis=1))))
     first = np.arange(len(path) - 1)
     beyond = np.maximum(np.searchsorted(path, path[first] + distance_m), first + 1)
-    # Of the last point before the distance and the first beyond it the nearer; of a camera that rests, its first frame.
+    # Takes the nearer of the last point before the distance and the first beyond it; for a resting camera, its first
+    # frame.
     before = np.maximum(np.searchsorted(path, path[np.maximum(beyond - 1, 0)]), first + 1)
     beyond = np.minimum(beyond, len(path) - 1)
     off_before, off_beyond = (np.abs(path[end] - path[first] - distance_m) for end in (before, beyond))

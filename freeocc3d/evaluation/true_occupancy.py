@@ -1,4 +1,4 @@
-"""The truth about a scene: a labeled voxel grid with what was observed of it."""
+"""The truth about a scene: a labeled voxel grid with the observed voxels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class GroundTruth:
     labels: (X, Y, Z) uint8, 0 free, k = ``classes[k]``, 255 not observed.
     origin: (3,) float64 lower corner of voxel (0, 0, 0) in the frame of the true poses, meters.
     voxel_size: edge of a voxel, meters.  classes: names of the labels; ``classes[0]`` is not used.
-    frames_mask: (X, Y, Z) bool, the union of the frames' own masks, where the data set has such masks.
+    frames_mask: (X, Y, Z) bool, the union of the frames' own masks, if the data set has such masks.
     """
 
     labels: NDArray[np.uint8]
@@ -33,14 +33,14 @@ class GroundTruth:
         return x, y, z
 
     def centers(self) -> NDArray[np.float64]:
-        """(X, Y, Z, 3) voxel centers in the frame of the true poses, meters."""
+        """Returns the (X, Y, Z, 3) voxel centers in the frame of the true poses, meters."""
         return self.origin + (np.moveaxis(np.indices(self.shape), 0, -1) + 0.5) * self.voxel_size
 
     def masks(self) -> dict[str, NDArray[np.bool_]]:
-        """What may be scored, (X, Y, Z) bool each: "label", where the truth is known (label != 255), and, where the
-        data set has masks of its frames, "frames", the known voxels of their union.
+        """Returns the masks for scoring, (X, Y, Z) bool each: "label", the voxels with known truth (label != 255), and,
+        if the data set has masks of its frames, "frames", the known voxels of their union.
 
-        EmbodiedOcc scores the second, FreeOcc's release the first.
+        EmbodiedOcc scores with "frames", FreeOcc's release with "label".
         """
         known = self.labels != UNKNOWN
         return {"label": known} | ({} if self.frames_mask is None else {"frames": known & self.frames_mask})

@@ -214,7 +214,7 @@ def test_a_room_of_nothing_and_several_rooms(tmp_path: Path) -> None:
         truth=replace(empty.truth, labels=np.zeros((3, 3, 3), np.uint8)),
         predicted=Prediction(np.zeros((3, 3, 3), bool), np.zeros((3, 3, 3), np.uint8)),
     )
-    assert "neither the truth nor the prediction holds an occupied voxel" in written(tmp_path / "r.html", nothing).text
+    assert "neither the truth nor the prediction has occupied voxels" in written(tmp_path / "r.html", nothing).text
     both = written(tmp_path / "r.html", room("first <i>", way=True), room("second"))
     assert len(both.pictures()) == 6
     assert [row[0] for row in both.rows if row[0] in ("first <i>", "second")] == ["first <i>", "second"]
