@@ -26,9 +26,9 @@ _LARGEST_FILE = 1 << 30
 _MOST_OPERATIONS = 1_000_000
 _MOST_TUPLES = 10_000
 _MOST_SHARED_TUPLES = 16
-"""Most operations, tuples, and tuples that are used again. A package has some thousand operations and a few tuples. As a key, a
-tuple that is nested too deep overflows the stack when it is hashed, and a tuple that uses each part twice takes time
-that doubles with every level."""
+"""Most operations, tuples, and tuples that are used again. A package has some thousand operations and a few tuples. As
+a key, a tuple that is nested too deep overflows the stack when it is hashed, and a tuple that uses each part twice
+takes time that doubles with every level."""
 
 _NO_TUPLE = frozenset({
     "UNICODE", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8", "STRING", "BINSTRING", "SHORT_BINSTRING",
