@@ -99,7 +99,7 @@ def bent(axis: int) -> np.ndarray:
         ({"global_pts": None}, "has no 'global_pts'; it holds scene_dim, global_labels"),
         ({"global_mask": None, "global_labels": None, "a\n\x1b[2J" * 99: 1}, "has no 'global_labels'"),
         ({"global_pts": [1, 2]}, "must be an array, got a list"),
-        ({"global_labels": np.zeros((4, 3, 2), int)}, r"'global_labels'.*must be numbers \(3, 4, 2\)"),
+        ({"global_labels": np.zeros((4, 3, 2), int)}, r"'global_labels'.*must be numbers of shape \(3, 4, 2\)"),
         ({"global_labels": np.full(SHAPE, 256)}, "whole numbers from 0 to 255"),
         ({"global_labels": np.full(SHAPE, -1)}, "whole numbers from 0 to 255"),
         ({"global_labels": np.full(SHAPE, 1.5)}, "whole numbers from 0 to 255"),
