@@ -58,7 +58,7 @@ def test_every_class_stands_for_itself_without_a_file() -> None:
         ("classes: [no, floor]\n", "list of names"),
         ("classes: []\n", "list of names"),
         ("classes: [floor, Floor]\n", "different names"),
-        ("classes: [floor]\nmap: {carpet: rug}\n", "'rug', which is none"),
+        ("classes: [floor]\nmap: {carpet: rug}\n", "'rug', which is not one of its classes"),
         ("classes: [floor]\nmap: [carpet]\n", "'map' of"),
         ("3\n", "must hold 'classes'"),
     ],
