@@ -29,7 +29,7 @@ from ..tracking.trajectory_alignment import (
 from . import predictions
 from .confusion import Prediction
 from .scored_classes import ClassMap
-from .trajectory_errors import TrajectoryErrors, measure_trajectory_errors
+from .trajectory_errors import TrajectoryErrors, describe_few_matches, measure_trajectory_errors
 from .true_occupancy import GroundTruth
 
 
@@ -78,7 +78,7 @@ def score_map(
                 raise
     alignment = TrajectoryAlignment.identity() if poses is None else align_trajectories(estimated, poses, how)
     predicted, note = predictions.predict_from_map(scan_map, settings, alignment, truth, classes)
-    notes = [note] if note else []
+    notes = [*([note] if note else []), *([] if poses is None else describe_few_matches(estimated, poses))]
     if not scan_map.metric and how != "sim3":
         notes.append("The map's scale is unknown: use --align sim3 to compare it at the true scale.")
     return ScoredScene(
@@ -181,7 +181,7 @@ def _other(
         frames=None if poses is None else len(poses),
         frames_with_pose=None if trajectory is None else len(trajectory),
         up=_up(truth, poses),
-        notes=tuple(notes),
+        notes=(*notes, *(describe_few_matches(trajectory, poses) if trajectory and poses else ())),
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import associate
+from ..capture.trajectory_files import SAME_TIME_S
 from ..core.errors import FreeOccError
 from ..core.transforms import invert
 from ..tracking.trajectory_alignment import Poses, TrajectoryAlignment
@@ -22,6 +23,9 @@ DISTANCES_M = (0.1, 0.5, 1.0, 2.0)
 """Traveled distances for the relative errors, meters."""
 
 _TOLERANCE = 0.1
+
+_FEWEST_MATCHES, _LEAST_SHARE = 10, 0.2
+"""Frames with a true pose, and their share of all estimated ones, below which an alignment is doubtful."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,18 @@ def measure_trajectory_errors(
     T_true = true.T_world_cam[rows_true]
     relative = tuple(error for d in distances_m if (error := measure_relative_error(T_est, T_true, d)) is not None)
     return TrajectoryErrors(estimated.timestamps[rows_est], T_true[:, :3, 3], T_est[:, :3, 3], relative)
+
+
+def describe_few_matches(estimated: Poses, true: Poses) -> list[str]:
+    """A note if so few frames have a pose in both that the alignment is doubtful."""
+    matched, count = len(associate(estimated.timestamps, true.timestamps)[0]), len(estimated)
+    if matched >= max(min(_FEWEST_MATCHES, count), _LEAST_SHARE * count):
+        return []
+    return [
+        f"Only {matched} of {count} estimated poses have a true pose within {SAME_TIME_S:g} s, so the scores are "
+        f"doubtful. Check that the timestamps belong to the same recording. Estimated: {_span(estimated)}; true: "
+        f"{_span(true)}."
+    ]
 
 
 def measure_relative_error(

@@ -40,11 +40,6 @@ def to_point_cloud(gaussians: Gaussians) -> o3d.t.geometry.PointCloud:
     return cloud
 
 
-def from_point_cloud(cloud: o3d.t.geometry.PointCloud) -> Gaussians:
-    """The inverse of ``to_point_cloud``. Raises MapError if an attribute is missing."""
-    return _from_columns({name: cloud.point[name].numpy() for name in cloud.point})
-
-
 def _from_columns(columns: dict[str, np.ndarray]) -> Gaussians:
     fields = {"means": _take(columns, "positions", 3, np.float32), "colors": _take(columns, "colors", 3, np.uint8)}
     for name, (field, width, dtype) in _ATTRIBUTES.items():

@@ -13,12 +13,15 @@ from small_captures import data_folder
 import freeocc3d
 from freeocc3d.cli.scores import scores_document, scores_text
 from freeocc3d.core.errors import FreeOccError
+from freeocc3d.core.tum_files import write_tum
+from freeocc3d.core.types import Trajectory
 from freeocc3d.evaluation.confusion import Prediction
 from freeocc3d.evaluation.ground_truth import load_ground_truth, save_ground_truth
 from freeocc3d.evaluation.scene_scoring import ScoredScene
 from freeocc3d.evaluation.scored_classes import map_each_to_itself
 from freeocc3d.evaluation.scoring import Evaluation, ScoringRequest, evaluate_scenes
 from freeocc3d.evaluation.true_occupancy import GroundTruth
+from freeocc3d.query.scan_map import load_map
 from freeocc3d.tracking.trajectory_alignment import TrajectoryAlignment
 
 CLASSES = Path(__file__).parents[2] / "configs" / "classes" / "house_to_embodiedocc.yaml"
@@ -224,6 +227,17 @@ def test_a_map_that_misses_the_truth_altogether_says_so(bedroom: Path, tmp_path:
     assert not any(
         "no voxel inside the truth" in note for note in evaluate_scenes(ScoringRequest(maps=[bedroom])).notes
     )
+
+
+def test_a_map_whose_timestamps_rarely_match_says_so(bedroom: Path, tmp_path: Path) -> None:
+    estimated = load_map(bedroom).trajectory
+    rows = np.flatnonzero(estimated.has_pose)
+    times = np.where(np.arange(len(rows)) < 4, estimated.timestamps[rows], 1e4 + np.arange(len(rows)))
+    n = len(rows)
+    written = Trajectory(times, estimated.T_world_cam[rows], np.zeros(0, np.int32), np.full(n, "tracked"), np.ones(n))
+    write_tum(tmp_path / "poses.txt", written)
+    notes = evaluate_scenes(ScoringRequest(maps=[bedroom], poses=[str(tmp_path / "poses.txt")])).notes
+    assert any(f"Only 4 of {n} estimated poses" in note for note in notes)
 
 
 def test_the_threshold_can_be_swept_without_mapping_again(bedroom: Path) -> None:

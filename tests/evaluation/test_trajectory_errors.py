@@ -12,7 +12,12 @@ from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.transforms import quats_to_rotations
 from freeocc3d.core.tum_files import write_tum
 from freeocc3d.core.types import Trajectory
-from freeocc3d.evaluation.trajectory_errors import measure_relative_error, measure_trajectory_errors, pair_by_path
+from freeocc3d.evaluation.trajectory_errors import (
+    describe_few_matches,
+    measure_relative_error,
+    measure_trajectory_errors,
+    pair_by_path,
+)
 from freeocc3d.tracking.trajectory_alignment import Poses, TrajectoryAlignment, align_trajectories, read_poses
 
 
@@ -120,6 +125,17 @@ def test_the_order_of_frames_does_not_count() -> None:
     shuffled = align_trajectories(Poses(times, estimated[order]), Poses(times, true[order]))
     np.testing.assert_allclose(shuffled.rotation, align_trajectories(a, b).rotation, atol=1e-12)
     np.testing.assert_allclose(shuffled.translation, align_trajectories(a, b).translation, atol=1e-12)
+
+
+def test_few_matching_timestamps_are_reported_with_both_time_ranges() -> None:
+    true = Poses(np.arange(300.0), walk(300, seed=0))
+    video = Poses(np.arange(300) / 30, walk(300, seed=0))
+    (note,) = describe_few_matches(video, true)
+    assert note.startswith("Only 10 of 300 estimated poses")
+    assert "300 from 0 to 9.96667 s; true: 300 from 0 to 299 s" in note
+    assert len(describe_few_matches(Poses(np.arange(12) * 1.5, walk(12, seed=0)), true)) == 1
+    assert describe_few_matches(true, true) == []
+    assert describe_few_matches(Poses(np.arange(8.0), walk(8, seed=0)), true) == []
 
 
 def test_trajectories_of_other_recordings_are_refused() -> None:

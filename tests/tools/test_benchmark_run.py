@@ -110,6 +110,10 @@ def test_the_ablations_of_the_paper_are_there_by_name() -> None:
     ("arguments", "said"),
     [
         (("--variants", "rgdb"), "unknown variants rgdb"),
+        (
+            ("--variants", "rgbd_no_initialisation", "--frames", "2"),
+            "'rgbd_no_initialisation' is now called 'rgbd_no_initialization'",
+        ),
         (("--captures", "/nowhere"), "there is no capture /nowhere"),
         (("--captures", ".", "--frames", "2"), "at least 3"),
     ],

@@ -18,7 +18,13 @@ from freeocc3d.core.errors import DependencyError, FrameError
 from freeocc3d.core.transforms import invert
 from freeocc3d.core.types import Frame
 
-PEERS = [peers.tsdf_occupied, peers.back_projected_occupied, peers.octomap_occupied]
+
+def tsdf_occupied(capture: Capture, T_world_cam: np.ndarray, lattice: peers.Lattice, every: int = 2) -> tuple:
+    area, seconds = peers.surface_area(capture, T_world_cam, lattice, every)
+    return area >= peers.TSDF_MIN_AREA_M2, seconds
+
+
+PEERS = [tsdf_occupied, peers.back_projected_occupied, peers.octomap_occupied]
 DISTANCE_M = 2.0
 STEP_M = 0.03
 VOXEL_M = 0.08
@@ -132,7 +138,7 @@ def test_without_a_pose_nothing_is_occupied(peer) -> None:
 
 
 def test_a_single_look_is_too_little_for_the_tsdf() -> None:
-    occupied, _ = peers.tsdf_occupied(Wall(), poses(), LATTICE, every=FRAMES)
+    occupied, _ = tsdf_occupied(Wall(), poses(), LATTICE, every=FRAMES)
     assert not occupied.any()
 
 

@@ -69,7 +69,7 @@ def parse_arguments() -> argparse.Namespace:
     captures, names = SUITES[given.suite]
     given.captures = given.captures or [DATA / name for name in captures]
     known = list_names()
-    given.variants = given.variants or list(names or known)
+    given.variants = [_current_name(name) for name in given.variants or names or known]
     if unknown := [name for name in given.variants if name not in known]:
         parser.error(f"unknown variants {', '.join(unknown)}: --list names all")
     if not given.inside and not given.list:
@@ -79,6 +79,14 @@ def parse_arguments() -> argparse.Namespace:
     if given.frames is not None and given.frames < 3:
         parser.error("--frames needs at least 3, since fewer cannot be aligned")
     return given
+
+
+def _current_name(variant: str) -> str:
+    """Of a variant that may be given by the name that it had before; says so on stderr."""
+    current = variant.replace("initialisation", "initialization")
+    if current != variant:
+        print(f"benchmark.py: the variant '{variant}' is now called '{current}'", file=sys.stderr)
+    return current
 
 
 def main() -> None:

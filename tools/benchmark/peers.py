@@ -1,7 +1,7 @@
 """The strongest peers that run on a CPU, for comparison with our own map on the same frames and poses.
 
     dense_slam               Open3D's dense SLAM (``t.pipelines.slam``): color and depth to poses
-    tsdf_occupied            Open3D's TSDF (``t.geometry.VoxelBlockGrid``): the surface at given poses
+    surface_area             Open3D's TSDF (``t.geometry.VoxelBlockGrid``): the surface at given poses
     back_projected_occupied  the plainest baseline: depth pixels added up in the voxels that they fall in
     octomap_occupied         OctoMap (A. Hornung et al., OctoMap, Autonomous Robots 2013) through pyoctomap
 
@@ -134,17 +134,6 @@ def dense_slam(capture: Capture, frames: Sequence[int]) -> tuple[NDArray[np.floa
 def frames_with_pose(T_world_cam: NDArray[np.float64], every: int) -> NDArray[np.int64]:
     """Every n-th frame with a finite pose in (N, 4, 4): the frames that the occupancy peers use."""
     return np.flatnonzero(np.isfinite(T_world_cam).all(axis=(1, 2)))[::every]
-
-
-def tsdf_occupied(
-    capture: Capture, T_world_cam: NDArray[np.float64], lattice: Lattice, every: int = 2
-) -> tuple[NDArray[np.bool_], Seconds]:
-    """Voxels (X, Y, Z) of the lattice that hold enough of the TSDF's surface, and the seconds of each step.
-
-    T_world_cam: (N, 4, 4) poses in the lattice's frame, NaN for frames without one.
-    """
-    area, seconds = surface_area(capture, T_world_cam, lattice, every)
-    return area >= TSDF_MIN_AREA_M2, seconds
 
 
 def surface_area(

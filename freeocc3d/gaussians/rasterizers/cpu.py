@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import get_num_threads
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...core.threads import count_threads
 from ...core.types import Intrinsics
 from ..splat_projection import Z, project_backward, project_splats
 from ..tile_compositing import TILE, composite, composite_backward, list_by_tile, sort_nearest_first
@@ -17,8 +17,9 @@ from .base import Rendered, Splats, compute_slope_limits
 
 REQUIRES: tuple[str, ...] = ()
 
-
 Array = NDArray[np.float32]
+
+_THREADS = count_threads()
 
 
 class CpuRasterizer:
@@ -57,7 +58,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         means, scales, quats, T, pinhole, limits, rows, splats, box, start, listed, out = ctx.saved
-        parts = composite_backward(splats, box, start, listed, out, _array(gradient), get_num_threads())
+        parts = composite_backward(splats, box, start, listed, out, _array(gradient), _THREADS)
         found = project_backward(means, scales, quats, T, pinhole, limits, rows, parts)
         return *(torch.from_numpy(array) for array in found), None, None
 
