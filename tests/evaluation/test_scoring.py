@@ -119,7 +119,7 @@ def test_the_command_scores_a_map_against_its_captures_truth(bedroom: Path, tmp_
     written = page.read_text()
     assert f"{100 * document['iou']:.1f} %" in written
     assert written.count("data:image/png;base64,") == 3
-    assert f"{page} exists" in refused("evaluate", bedroom, "--html", page)
+    assert f"{page} already exists" in refused("evaluate", bedroom, "--html", page)
     assert page.read_text() == written
     truth = data_folder() / "house" / "bedroom" / "ground_truth.npz"
     mapped = run("evaluate", bedroom, "--ground-truth", truth, "--classes", CLASSES).stdout
