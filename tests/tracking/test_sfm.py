@@ -9,6 +9,7 @@ import pytest
 from freeocc3d.capture.lenses import Lens
 from freeocc3d.core.errors import MapError
 from freeocc3d.core.types import Intrinsics
+from freeocc3d.core.warnings import Notice
 from freeocc3d.tracking.sfm.reconstruction import Reconstruction
 
 
@@ -21,7 +22,7 @@ def reconstruction() -> Reconstruction:
     return Reconstruction(
         T, Lens(Intrinsics(64, 48, 50.0, 51.0, 31.5, 23.5), (0.1, 0.0, 0.0, 0.0)), points,
         np.array([0, 0, 2, 2], np.int32), np.array([0, 1, 1, 2], np.int32), False,
-        np.array([False, True, False]), np.ones(3, bool), ("it fell into two",),
+        np.array([False, True, False]), np.ones(3, bool), (Notice("models-apart", "it fell into two"),),
     )  # fmt: skip
 
 

@@ -147,7 +147,7 @@ def test_pose_files_are_read_in_their_usual_forms(tmp_path: Path, columns: int) 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "1 2 3\n", "a b c d e f g h\n", "2 " * 16, "1 2\n" * 3 + "1\n"])
 def test_files_that_are_no_trajectory_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "poses.txt").write_text(text)
-    with pytest.raises(FreeOccError, match=r"no (trajectory|rigid)|holds a matrix"):
+    with pytest.raises(FreeOccError, match=r"not a (trajectory|rigid)|holds a matrix"):
         read_poses(tmp_path / "poses.txt")
     with pytest.raises(FreeOccError, match="no file or capture"):
         read_poses(tmp_path / "absent.txt")
