@@ -120,5 +120,5 @@ def test_a_query_tells_of_an_unusable_target_before_it_answers(room, tmp_path, o
 
 def test_one_file_is_not_asked_for_twice(room, tmp_path) -> None:
     same = tmp_path / "answer.png"
-    assert "another name" in run("query", room, "red", "--picture", same, "--html", same, code=2).stderr
+    assert "different file names" in run("query", room, "red", "--picture", same, "--html", same, code=2).stderr
     assert not same.exists()

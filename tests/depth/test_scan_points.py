@@ -11,9 +11,9 @@ ROOM = [Rectangle((-3, -3, 3.0), (6, 0, 0), (0, 6, 0)), Rectangle((-0.3, -0.4, 1
 
 
 def _depth(x: float, scale: float = 1.0) -> DepthImage:
-    _, depth = render(ROOM, looking(x, towards=3.0))
+    _, depth = render(ROOM, looking(x, toward=3.0))
     inverse = (1.0 / (depth * scale)).astype(np.float32)
-    return DepthImage(inverse, np.full_like(inverse, 1e-3), CAMERA, looking(x, towards=3.0))
+    return DepthImage(inverse, np.full_like(inverse, 1e-3), CAMERA, looking(x, toward=3.0))
 
 
 def test_points_that_others_confirm_lie_on_the_surfaces() -> None:

@@ -216,7 +216,7 @@ def test_as_an_option_of_reconstruct_it_is_the_same_map(room: Map, tmp_path: Pat
     np.testing.assert_array_equal(made.occupancy.keys, later.occupancy.keys)
     agree = made.occupancy.state == later.occupancy.state
     assert agree.mean() > 0.999  # features decide where to look; a saved map's are coded
-    with pytest.raises((ConfigError, MapError), match="by halves"):
+    with pytest.raises((ConfigError, MapError), match="^Halving voxels of"):
         checks.check(config.resolve({"occupancy": {"finest": 0.03}}))
 
 
@@ -225,9 +225,9 @@ def test_what_cannot_be_refined(room: Map, fine: Map, tmp_path: Path) -> None:
         adaptive_voxels.refine_where_needed(fine, 0.005, tmp_path / "map")
     with pytest.raises(MapError, match="already"):
         adaptive_voxels.refine_where_needed(room, 0.08, tmp_path / "map")
-    with pytest.raises(MapError, match="own place"):
+    with pytest.raises(MapError, match="cannot replace it"):
         adaptive_voxels.refine_where_needed(room, 0.04, room.path, overwrite=True)
-    assert "by halves" in refused("refine", room.path, "--voxel", 0.03, "-o", tmp_path / "map")
+    assert "Halving voxels of" in refused("refine", room.path, "--voxel", 0.03, "-o", tmp_path / "map")
     assert not list(tmp_path.iterdir())
 
 

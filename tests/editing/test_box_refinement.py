@@ -92,7 +92,7 @@ def test_boxes_that_cannot_be_refined(room: Map, tmp_path: Path) -> None:
         box_refinement.refine_box(room, box_refinement.Box(np.full(3, -50.0), np.full(3, 50.0)), 0.01, tmp_path / "map")
     with pytest.raises(MapError, match="are not possible"):
         box_refinement.refine_box(room, box_refinement.Box(np.zeros(3), np.ones(3)), 0.2, tmp_path / "map")
-    with pytest.raises(MapError, match="own place"):
+    with pytest.raises(MapError, match="cannot replace it"):
         box_refinement.refine_box(
             room, box_refinement.Box(MIDDLE - REACH, MIDDLE + REACH), 0.01, room.path, overwrite=True
         )

@@ -214,7 +214,7 @@ def test_the_commands_say_what_the_unit_is(room: Map, half: Map, tmp_path: Path)
     shown = run("scale", half.path, "-o", tmp_path / "meters", "--camera-height", "1.5").stdout
     assert "scale      meters, by the cameras' height, 2" in shown
     assert "exists" in refused("scale", half.path, "-o", tmp_path / "meters", "--factor", "2")
-    assert "own place" in refused("scale", half.path, "-o", half.path, "--factor", "2", "--overwrite")
+    assert "cannot replace it" in refused("scale", half.path, "-o", half.path, "--factor", "2", "--overwrite")
     wrong = run("scale", half.path, "-o", tmp_path / "two", "--factor", "2", "--camera-height", "1.5", code=2)
     assert "give one of --factor" in wrong.stderr
 

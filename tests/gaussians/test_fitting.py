@@ -85,11 +85,11 @@ def test_what_lies_beyond_the_depth_does_not_make_gaussians_grow() -> None:
 
 
 @pytest.mark.parametrize("means", ["anchored", "free"])
-@pytest.mark.parametrize("case", ["one colour", "no depth in a frame", "one keyframe", "duplicates", "outliers", "far"])
+@pytest.mark.parametrize("case", ["one color", "no depth in a frame", "one keyframe", "duplicates", "outliers", "far"])
 def test_nothing_runs_away(case: str, means: str) -> None:
     frames, poses = walls()
     rng = np.random.default_rng(0)
-    if case == "one colour":
+    if case == "one color":
         frames = [replace(frame, color=np.full_like(frame.color, 200)) for frame in frames]
     elif case == "no depth in a frame":
         frames[1] = replace(frames[1], depth_m=np.zeros_like(frames[1].depth_m))

@@ -35,8 +35,8 @@ class Rectangle:
         place = origin + distance[..., None] * directions - c
         s, t = place @ a / (a @ a), place @ b / (b @ b)
         hit = (distance > 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-        grey = _noise(s * np.linalg.norm(a), t * np.linalg.norm(b), self.seed)
-        return np.where(hit, distance, np.inf), np.where((s >= self.blank[0]) & (s <= self.blank[1]), 0.5, grey)
+        gray = _noise(s * np.linalg.norm(a), t * np.linalg.norm(b), self.seed)
+        return np.where(hit, distance, np.inf), np.where((s >= self.blank[0]) & (s <= self.blank[1]), 0.5, gray)
 
 
 def render(
@@ -46,19 +46,19 @@ def render(
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack(((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)), axis=-1)
     found = [r.seen(T_world_cam[:3, 3], rays @ T_world_cam[:3, :3].T) for r in rectangles]
-    depths, greys = np.stack([d for d, _ in found]), np.stack([g for _, g in found])
+    depths, grays = np.stack([d for d, _ in found]), np.stack([g for _, g in found])
     first = depths.argmin(axis=0)[None]
     depth = np.take_along_axis(depths, first, 0)[0]
-    grey = 255.0 * np.take_along_axis(greys, first, 0)[0]
+    gray = 255.0 * np.take_along_axis(grays, first, 0)[0]
     rng = np.random.default_rng(int(1e6 * abs(T_world_cam[0, 3])) + 1)
-    grey = np.clip(np.where(np.isfinite(depth), grey, 128.0) + noise * rng.normal(size=grey.shape), 0, 255)
-    color = np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
+    gray = np.clip(np.where(np.isfinite(depth), gray, 128.0) + noise * rng.normal(size=gray.shape), 0, 255)
+    color = np.repeat(np.rint(gray).astype(np.uint8)[..., None], 3, axis=2)
     return StereoView(color, camera, T_world_cam), np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
 
 
-def looking(x: float, y: float = 0.0, z: float = 0.0, towards: float = 2.0) -> NDArray[np.float64]:
+def looking(x: float, y: float = 0.0, z: float = 0.0, toward: float = 2.0) -> NDArray[np.float64]:
     """A camera at (x, y, z) that looks at (0, 0, toward)."""
-    forward = np.array((0.0, 0.0, towards)) - (x, y, z)
+    forward = np.array((0.0, 0.0, toward)) - (x, y, z)
     forward /= np.linalg.norm(forward)
     right = np.cross((0.0, 1.0, 0.0), forward)
     right /= np.linalg.norm(right)

@@ -92,8 +92,8 @@ def test_class_numbers_are_certain(tmp_path: Path) -> None:
 def test_images_are_normalized_and_channels_put_in_order(tmp_path: Path) -> None:
     mean, std = (0.1, 0.2, 0.3), (0.5, 0.6, 0.7)
     color = picture()
-    normalised = (color.astype(np.float32) / 255 - np.float32(mean)) / np.float32(std)
-    for channels, given in (("rgb", normalised), ("bgr", normalised[..., ::-1])):
+    normalized = (color.astype(np.float32) / 255 - np.float32(mean)) / np.float32(std)
+    for channels, given in (("rgb", normalized), ("bgr", normalized[..., ::-1])):
         made = encoder(tmp_path, options={"mean": mean, "std": std, "channels": channels})
         scores = made.network.posteriors(frame(color), *color.shape[:2])
         odds = np.exp(logits(given))

@@ -25,7 +25,7 @@ def copy(saved, tmp_path):
 
 
 def test_not_a_map(tmp_path, copy) -> None:
-    with pytest.raises(MapError, match="no map folder"):
+    with pytest.raises(MapError, match="nothing does not exist"):
         SavedMap.open(tmp_path / "nothing")
     (copy / "map.yaml").unlink()
     with pytest.raises(MapError, match="not a map"):
