@@ -49,8 +49,8 @@ def parse_avoided(entries: Sequence[str]) -> list[Avoided]:
     parts = [TOGETHER, *(avoided.file_part for avoided in found)]
     if len(set(parts)) < len(parts):
         raise ConfigError(
-            "'avoid' names two words with the same mask file name, or a word with the file name of the mask of all "
-            f"words, '{TOGETHER}': leave one word out."
+            "'avoid' names two words whose masks get the same file name, or a word whose mask gets the same file name "
+            f"as the mask of all words, '{TOGETHER}': leave one word out."
         )
     return found
 

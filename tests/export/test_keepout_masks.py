@@ -129,7 +129,7 @@ def test_entries_are_words_meters_and_costs(entry, expected) -> None:
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
-        (["glass:near"], "whole and 1 to 100, got 'glass:near'"),
+        (["glass:near"], "whole costs from 1 to 100; got 'glass:near'"),
         (["glass:-1"], "got 'glass:-1'"),
         (["glass:nan"], "got 'glass:nan'"),
         (["glass:1e9"], "got"),

@@ -148,6 +148,6 @@ def test_what_cannot_be_written_is_reported(tmp_path) -> None:
     with pytest.raises(ExportError, match="no tree"):
         export_map(map_of(nothing), "octomap", tmp_path / "map.bt", {"frame": "map"})
     (tmp_path / "map.bt.json").write_text("mine")
-    with pytest.raises(ExportError, match=r"map.bt.json exists"):
+    with pytest.raises(ExportError, match=r"map.bt.json already exists"):
         export_map(scan_map, "octomap", tmp_path / "map.bt")
     assert [path.name for path in tmp_path.iterdir()] == ["map.bt.json"]
