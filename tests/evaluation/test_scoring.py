@@ -205,7 +205,7 @@ def test_truth_and_maps_that_do_not_fit_are_reported_in_a_sentence(bedroom: Path
     shutil.copytree(bedroom, moved)
     manifest = (moved / "map.yaml").read_text()
     (moved / "map.yaml").write_text(manifest.replace("house/bedroom", "house/gone"))
-    assert "Name the true poses with --poses" in refused("evaluate", moved, "--ground-truth", truth)
+    assert "no longer exists. Name the true poses with --poses" in refused("evaluate", moved, "--ground-truth", truth)
     assert "name it with --ground-truth" in refused("evaluate", moved)
     assert run("evaluate", bedroom, "--grid", truth, code=2).stderr
     assert run("evaluate", code=2).stderr
