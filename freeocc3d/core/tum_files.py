@@ -17,7 +17,8 @@ from .types import Trajectory
 NUMBERS = 8
 """Numbers per line."""
 
-_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes, meters, seconds)"
+_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes, metres, seconds)"
+"""Spelled as in every earlier map, so that equal trajectories give equal files."""
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:

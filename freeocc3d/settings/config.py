@@ -166,11 +166,11 @@ def load_saved(path: Path, overrides: Iterable[str] = ()) -> Settings:
         saved = _resolve(read_yaml(path), saved=True)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-    values: dict[Any, Any] = {}
+    values: dict[Any, Any] = saved.to_dict()
+    overrides = list(overrides)
     for override in overrides:
         apply_override(values, override)
-    changed = {section: {**saved.to_dict()[section], **_section(values, section)} for section in values}
-    return saved if not values else resolve({**saved.to_dict(), **changed})
+    return resolve(values) if overrides else saved
 
 
 def resolve(values: Mapping[str, Any] | Settings) -> Settings:

@@ -242,9 +242,10 @@ def test_a_saved_configuration_is_read_without_what_it_does_not_choose(tmp_path:
     )
     settings = config.load_saved(path)
     assert settings.backends == {"language": {"color": {"stride": 2}}, "tracking": {"rgbd": {"refine": False}}}
-    changed = config.load_saved(path, ["occupancy.threshold=0.4", "language.color.stride=3"])
+    white = "language.color.white=[200, 200, 200]"
+    changed = config.load_saved(path, ["occupancy.threshold=0.4", white])
     assert changed.occupancy.threshold == 0.4
-    assert changed.given("language", "color") == {"stride": 3}
+    assert changed.given("language", "color") == {"stride": 2, "white": (200, 200, 200)}  # what is not overridden stays
     assert changed.given("tracking", "rgbd") == {"refine": False}
     with pytest.raises(ConfigError, match=r"'occupancy\.treshold' \(did you mean 'threshold'\?\)"):
         config.load_saved(path, ["occupancy.treshold=0.4"])
