@@ -1,12 +1,10 @@
-"""The built-in room: furniture as triangles, each with a class and a material, and the color of a surface point."""
+"""The built-in room: furniture as triangles, each with a class and a material."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 SIZE = (5.2, 4.2, 2.5)
@@ -30,8 +28,6 @@ Point = tuple[float, float, float]
 Color = tuple[int, int, int]
 Triangles = NDArray[np.float64]
 """(T, 3, 3) corners, world, meters, counter-clockwise as seen from outside."""
-
-_LIGHT = (0.34, -0.24, 0.91)  # unit vector toward the light, the same for all points, as for a distant lamp
 
 
 @dataclass(frozen=True)
@@ -285,115 +281,3 @@ def _picture(room: _Builder, low: Point, high: Point, color: Color, second: Colo
     inset = np.where(extent == extent.min(), -0.005, 0.03)
     canvas = box(np.add(low, inset), np.subtract(high, inset))
     room.add("picture", (box(low, high), _DARK_WOOD), (canvas, Material(color, PAINTING, second, scale)))
-
-
-@njit(nogil=True, cache=True)  # on one core: the tracker uses the others while frames are read ahead
-def shade(
-    points: NDArray[np.float32],
-    triangle: NDArray[np.int32],
-    footprint: NDArray[np.float32],
-    textures: NDArray[np.int32],
-    colors: NDArray[np.float32],
-    scales: NDArray[np.float32],
-    normals: NDArray[np.float32],
-) -> NDArray[np.uint8]:
-    """(P, 3) RGB of P surface points: a mix of the material's two colors, times a fixed light. A point looks the same
-    from every direction. Detail finer than a pixel fades out.
-
-    points: (P, 3) world, meters.  triangle: (P,) row in the arrays of ``Room``; -1 = nothing, which is black.
-    footprint: (P,) size of a pixel on the surface, meters.
-    """
-    image = np.zeros((len(points), 3), np.uint8)
-    for p in range(len(points)):
-        t = triangle[p]
-        if t < 0:
-            continue
-        x, y, z = float(points[p, 0]), float(points[p, 1]), float(points[p, 2])
-        scale, pixel = float(scales[t]), float(footprint[p])
-        fade = min(1.0, scale / (3.0 * pixel + 1e-6))
-        mix = _texture(textures[t], x, y, z, normals[t], scale, pixel)
-        mix = 0.5 + (mix - 0.5) * fade if textures[t] != PLAIN else 0.0
-        coarse = _noise(x / (0.35 * scale), y / (0.35 * scale), z / (0.35 * scale), 23) - 0.5
-        fine = _noise(x / 0.013, y / 0.013, z / 0.013, 29) - 0.5
-        grain = 0.14 * coarse * min(1.0, 0.35 * scale / (2.0 * pixel)) + 0.10 * fine * min(1.0, 0.013 / (2.0 * pixel))
-        light = _lighting(x, y, z, normals[t])
-        for channel in range(3):
-            value = colors[t, 0, channel] + mix * (colors[t, 1, channel] - colors[t, 0, channel])
-            value = (value * (1.0 + grain) + 24.0 * grain) * light
-            image[p, channel] = np.uint8(min(max(value, 0.0), 255.0))
-    return image
-
-
-@njit(cache=True)
-def _texture(kind: int, x: float, y: float, z: float, normal: NDArray[np.float32], scale: float, pixel: float) -> float:
-    """Mixing weight of a material's two colors, mostly in 0…1."""
-    # Surface coordinates: the two axes that are not along the normal.
-    nx, ny, nz = abs(normal[0]), abs(normal[1]), abs(normal[2])
-    if nz >= nx and nz >= ny:
-        a, b = x, y
-    elif nx >= ny:
-        a, b = y, z
-    else:
-        a, b = x, z
-    if kind == WOOD:
-        wobble = _noise(a / (6 * scale), b / (2 * scale), 0.5, 3)
-        grain = math.sin(2 * math.pi * (b / scale + 1.5 * wobble))
-        return 0.1 + 0.15 * grain + 0.4 * wobble + 0.5 * _bands(b, 3 * scale, 0, pixel)
-    if kind == CHECKER:
-        wave = math.sin(math.pi * a / scale) * math.sin(math.pi * b / scale)
-        return min(max(0.5 + wave * scale / (math.pi * pixel + 1e-6), 0.0), 1.0)  # edges one pixel soft
-    if kind == BOOKS:  # each book has its own color, between the two and beyond
-        return 1.6 * _bands(a, scale, math.floor(z / 0.4), pixel) - 0.3
-    if kind == PATCHES:
-        return 1.5 * _noise(a / scale, b / scale, 0.5, 11) - 0.25
-    if kind == PLASTER:
-        return _noise(x / scale, y / scale, z / scale, 17)
-    if kind == STRIPES:
-        return _bands(a, scale, 1, pixel)
-    if kind == PAINTING:  # flat areas of five tones
-        return 0.35 * math.floor(5.0 * _noise(a / scale, b / scale, 0.5, 31)) - 0.2
-    return 0.0
-
-
-@njit(cache=True)
-def _bands(a: float, width: float, row: int, pixel: float) -> float:
-    """Bands across ``a``, each with its own tone in 0…1, so that features do not match another band. Soft edges."""
-    edge = math.floor(a / width + 0.5)
-    before, after = _hash(edge - 1, row, 7, 5), _hash(edge, row, 7, 5)
-    return before + (after - before) * min(max((a - edge * width) / (pixel + 1e-6) + 0.5, 0.0), 1.0)
-
-
-@njit(cache=True)
-def _lighting(x: float, y: float, z: float, normal: NDArray[np.float32]) -> float:
-    """Ambient and Lambertian light in 0…1, darker near the room's edges, where surfaces block more of the light."""
-    lambert = normal[0] * _LIGHT[0] + normal[1] * _LIGHT[1] + normal[2] * _LIGHT[2]
-    light = 0.87 + 0.13 * lambert
-    to_walls = (SIZE[0] / 2 - abs(x), SIZE[1] / 2 - abs(y), min(z, SIZE[2] - z))
-    for axis in range(3):
-        if abs(normal[axis]) < 0.9:  # a wall does not darken itself or what lies on it
-            light *= 1.0 - 0.22 * math.exp(-max(to_walls[axis], 0.0) / 0.15)
-    return light
-
-
-@njit(cache=True)
-def _hash(i: int, j: int, k: int, seed: int) -> float:
-    """A pseudorandom number in 0…1 for each lattice point."""
-    h = (i * 374761393 + j * 668265263 + k * 2147483647 + seed * 1274126177) & 0xFFFFFFFF
-    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
-    h = ((h ^ (h >> 16)) * 2246822519) & 0xFFFFFFFF
-    return float((h ^ (h >> 15)) & 0xFFFF) / 65535.0
-
-
-@njit(cache=True)
-def _noise(x: float, y: float, z: float, seed: int) -> float:
-    """Value noise in 0…1: smoothly interpolated lattice numbers."""
-    i, j, k = math.floor(x), math.floor(y), math.floor(z)
-    u, v, w = x - i, y - j, z - k
-    u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
-    total = 0.0
-    for a in range(2):
-        for b in range(2):
-            for c in range(2):
-                weight = (u if a else 1 - u) * (v if b else 1 - v) * (w if c else 1 - w)
-                total += weight * _hash(i + a, j + b, k + c, seed)
-    return total

@@ -20,6 +20,9 @@ AXIAL_NOISE = (0.0012, 0.0019, 0.4)
 NOT_STATED = np.zeros((0, 0), np.float32)
 """Stands for a missing image of standard deviations: those of the sensor model apply."""
 
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a Gaussian over the median of its absolute value, 1 / Phi^-1(3/4)."""
+
 _A, _B, _NEAREST = AXIAL_NOISE
 
 

@@ -14,6 +14,10 @@ from ..core.transforms import invert
 from ..core.types import Intrinsics
 from .photo_consistency import compute_rays
 
+_TINY = 1e-6  # 1 / meters for inverse depths, meters for depths: avoids division by 0
+_TINY_VARIANCE = 1e-12  # its square
+_NEAREST_M = 1e-3  # smallest depth of a point; it avoids division by 0 for points behind the camera
+
 
 @dataclass(frozen=True)
 class DepthImage:
@@ -45,8 +49,8 @@ def confirm_depth(
     than the ``tolerance`` (relative) or two standard deviations, whichever is larger."""
     inverse, sigma = (torch.from_numpy(a).to(device) for a in (view.inverse, view.sigma))
     there = inverse > 0
-    points = compute_rays(view.camera, device) / inverse.clamp_min(1e-6)
-    variance = sigma.square().clamp_min(1e-12)
+    points = compute_rays(view.camera, device) / inverse.clamp_min(_TINY)
+    variance = sigma.square().clamp_min(_TINY_VARIANCE)
     weight, total = 1.0 / variance, inverse / variance
     square = inverse.square() / variance
     agreeing, through = torch.zeros_like(inverse), torch.zeros_like(inverse)
@@ -55,15 +59,15 @@ def confirm_depth(
         moved = _moved(T_other_view, points)
         found, found_sigma = _sampled(other, moved, device)
         seen = there & (found > 0)
-        back = _moved(invert(T_other_view), moved * (1.0 / (found * moved[2]).clamp_min(1e-6)))[2]
+        back = _moved(invert(T_other_view), moved * (1.0 / (found * moved[2]).clamp_min(_TINY)))[2]
         ratio = back * inverse  # its depth over ours
-        here = 1.0 / back.clamp_min(1e-3)
-        spread = torch.sqrt(variance + (found_sigma * (here / found.clamp_min(1e-6)) ** 2) ** 2)
+        here = 1.0 / back.clamp_min(_NEAREST_M)
+        spread = torch.sqrt(variance + (found_sigma * (here / found.clamp_min(_TINY)) ** 2) ** 2)
         within = torch.maximum(2.0 * spread, tolerance * inverse)
         agrees = seen & (back > 0) & ((here - inverse).abs() <= within)
         through += seen & ~agrees & (ratio > 1.0)
         agreeing += agrees
-        own = agrees / (found_sigma * (here / found.clamp_min(1e-6)) ** 2).square().clamp_min(1e-12)
+        own = agrees / (found_sigma * (here / found.clamp_min(_TINY)) ** 2).square().clamp_min(_TINY_VARIANCE)
         weight, total, square = weight + own, total + own * here, square + own * here.square()
     mean = total / weight
     scatter = (square / weight - mean.square()).clamp_min(0.0)
@@ -80,10 +84,10 @@ def _moved(T: NDArray[np.float64], points: Tensor) -> Tensor:
 def _sampled(image: DepthImage, points: Tensor, device: str) -> tuple[Tensor, Tensor]:
     """Inverse depth and sigma of ``image`` at the nearest pixels of (3, H, W) points; inverse depth is 0 outside."""
     camera = image.camera
-    z = points[2].clamp_min(1e-6)
+    z = points[2].clamp_min(_TINY)
     u = torch.round(points[0] / z * camera.fx + camera.cx)
     v = torch.round(points[1] / z * camera.fy + camera.cy)
-    inside = (points[2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    inside = (points[2] > _TINY) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     place = (v.clamp(0, camera.height - 1) * camera.width + u.clamp(0, camera.width - 1)).long()
     inverse, sigma = (torch.from_numpy(a).to(device).reshape(-1)[place] for a in (image.inverse, image.sigma))
     return inverse * inside, sigma

@@ -13,14 +13,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.depth_noise import MAD_TO_SIGMA
 from ..core.errors import ModelError
 from ..core.onnx_session import load_session
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, the training data of the encoders
-_FREE_SIZE = 518
-_PATCH = 14
-_LEAST_PIXELS = 200
+_FREE_SIZE, _PATCH = 518, 14
+"""Pixels on the longer side of an input of free size, and of a patch: those of DINOv2, the base of Depth Anything."""
+
+_LEAST_PIXELS = 200  # smallest number of pixels with a depth from stereo for the fit
+_ROUNDS = 5  # fits, each without the outliers of the one before
 _OUTLIERS = 2.5  # robust standard deviations
+_BEYOND = 1.5  # a prediction counts up to this many times the largest inverse depth from stereo, and down to 1 / this
+_NEAREST_M = 1e-3  # avoids division by a depth of 0
+_TINY = 1e-9  # 1 / meters: avoids division by a standard deviation of 0
 _LEAST_RELATIVE = 0.02  # smallest relative standard deviation of a predicted inverse depth
 _METRIC = {"depth": True, "inverse": False}
 
@@ -55,7 +61,7 @@ class DepthNetwork:
             raise ModelError(
                 f"{self._path} is not a depth network: its output of shape {output.shape} is not a depth map."
             )
-        inverse = 1.0 / np.maximum(found, 1e-3) if self._is_depth else found
+        inverse = 1.0 / np.maximum(found, _NEAREST_M) if self._is_depth else found
         return np.asarray(cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
     def _size(self, color: NDArray[np.uint8]) -> tuple[int, int]:
@@ -84,18 +90,18 @@ def fuse_guess(
         return inverse, sigma
     x, y = guess[known].astype(np.float64), inverse[known].astype(np.float64)
     rows, inside = np.stack((x, np.ones_like(x)), axis=1), np.ones(len(x), bool)
-    for _ in range(5):
+    for _ in range(_ROUNDS):
         fit = np.linalg.lstsq(rows[inside], y[inside], rcond=None)[0]
         off = np.abs(rows @ fit - y)
-        deviation = 1.4826 * float(np.median(off))
-        inside = off <= max(_OUTLIERS * deviation, 1e-9)
+        deviation = MAD_TO_SIGMA * float(np.median(off))
+        inside = off <= max(_OUTLIERS * deviation, _TINY)
     if fit[0] <= 0:
         return inverse, sigma
     placed = np.asarray(fit[0] * guess + fit[1], np.float32)
-    nearest, farthest = y.max() * 1.5, y.min() / 1.5
+    nearest, farthest = y.max() * _BEYOND, y.min() / _BEYOND
     usable = (placed > farthest) & (placed < nearest)
     spread = np.sqrt(deviation**2 + (_LEAST_RELATIVE * placed) ** 2).astype(np.float32)
-    own = np.where(known, 1.0 / np.maximum(sigma, 1e-9) ** 2, 0.0)
+    own = np.where(known, 1.0 / np.maximum(sigma, _TINY) ** 2, 0.0)
     theirs = np.where(usable, 1.0 / spread**2, 0.0)
     total = own + theirs
     mean = np.divide(own * inverse + theirs * placed, total, out=np.zeros_like(total), where=total > 0)

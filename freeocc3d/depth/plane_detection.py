@@ -44,6 +44,20 @@ _TILT = 0.003  # radians: prior standard deviation of a plane's normal
 _DEPENDENT = 50.0  # points per independent measurement
 _BEHIND = 0.01  # largest share of the points behind an outermost wall
 _OUTERMOST = 60  # smallest number of squares with points on an outermost plane
+_SAMPLE, _SAMPLE_NORMALS = 40_000, 4000  # largest number of points and normals for the search for directions
+_SAME_DIRECTION = 0.99  # smallest cosine between normals of one surface: 8 degrees
+_FIRST_TURN_DEG = 2  # step between the azimuths of the first search
+_SEARCH = ((1.0, 2.0), (0.5, 2.0), (0.25, 1.0), (0.1, 1.0))
+"""Step of a turn in degrees and thickness of the layers in cells, from coarse to fine."""
+
+_SEARCHED = 4  # largest number of turns with each step
+_AZIMUTHS_DEG = np.arange(-3.0, 3.01, 0.125)  # turns about the normal in the last search
+_SURROUNDINGS = 15  # layers around a layer; its count is compared with their mean
+_FITTED_WITHIN = (1.5, 1.5, 1.5, 1.0, 1.0, 1.0)  # cells: largest distance of a point from the plane, fit after fit
+_TILTED = 4  # rounds of the fit with a prior normal
+_SUREST = 0.25  # cells: smallest standard deviation of a point, because neighbors share errors
+_STRAY = 0.5  # percent of a plane's points to ignore at either end of each axis, for its bounds
+_BRIDGED = 5  # squares: pieces less than half of this apart become one
 
 
 @dataclass(frozen=True)
@@ -73,10 +87,10 @@ def find_directions(points: ScanPoints, normals: NDArray[np.float64]) -> NDArray
     """(3, 3) orthogonal directions, as rows, along which points lie in layers. The first one belongs to the layer with
     most points, usually the floor, and is fitted to its points."""
     X, cell = points.points - points.points.mean(axis=0), points.cell_m
-    some = X[np.random.default_rng(0).permutation(len(X))[:40_000]]
+    some = X[np.random.default_rng(0).permutation(len(X))[:_SAMPLE]]
     axes = _coarse(some, _commonest(normals), cell)
-    for step, thickness in ((1.0, 2.0), (0.5, 2.0), (0.25, 1.0), (0.1, 1.0)):
-        for _ in range(4):
+    for step, thickness in _SEARCH:
+        for _ in range(_SEARCHED):
             turned = [axes] + [axes @ _turn(axes[k], by * step).T for k in range(3) for by in (-2, -1, 1, 2)]
             best = int(np.argmax([_layered(some, rows, thickness * cell) for rows in turned]))
             axes = turned[best]
@@ -90,14 +104,13 @@ def find_directions(points: ScanPoints, normals: NDArray[np.float64]) -> NDArray
     across /= np.linalg.norm(across)
     axes = np.stack((normal, across, np.cross(normal, across)))
     sure = X[points.sigma_m <= np.median(points.sigma_m)]
-    angles = np.arange(-3.0, 3.01, 0.125)
-    sharp = [sum(_peaks(sure, row, 0.5 * cell) for row in (axes @ _turn(normal, by).T)[1:]) for by in angles]
-    return np.asarray(axes @ _turn(normal, float(angles[int(np.argmax(sharp))])).T)
+    sharp = [sum(_peaks(sure, row, 0.5 * cell) for row in (axes @ _turn(normal, by).T)[1:]) for by in _AZIMUTHS_DEG]
+    return np.asarray(axes @ _turn(normal, float(_AZIMUTHS_DEG[int(np.argmax(sharp))])).T)
 
 
 def _commonest(normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    some = normals[np.random.default_rng(0).permutation(len(normals))[:4000]]
-    alike = np.abs(some @ some.T) > 0.99
+    some = normals[np.random.default_rng(0).permutation(len(normals))[:_SAMPLE_NORMALS]]
+    alike = np.abs(some @ some.T) > _SAME_DIRECTION
     best = int(np.argmax(alike.sum(axis=1)))
     held = some[alike[best]]
     mean = (held * np.sign(held @ some[best])[:, None]).sum(axis=0)
@@ -107,7 +120,7 @@ def _commonest(normals: NDArray[np.float64]) -> NDArray[np.float64]:
 def _coarse(X: NDArray[np.float64], normal: NDArray[np.float64], cell: float) -> NDArray[np.float64]:
     across = np.linalg.svd(normal[None])[2][1]
     axes = np.stack((normal, across, np.cross(normal, across)))
-    turned = [axes @ _turn(normal, by).T for by in range(0, 90, 2)]
+    turned = [axes @ _turn(normal, by).T for by in range(0, 90, _FIRST_TURN_DEG)]
     return turned[int(np.argmax([_layered(X, rows, 2.0 * cell) for rows in turned]))]
 
 
@@ -128,13 +141,14 @@ def _peaks(X: NDArray[np.float64], axis: NDArray[np.float64], thickness: float) 
     """The same for one axis, counting only peaks above their surroundings: a floor seen edge-on gives no azimuth."""
     count = np.bincount(_layer(X @ axis, thickness)).astype(float)
     count += np.append(count[1:], 0.0)
-    around = np.convolve(count, np.full(15, 1 / 15.0))[7 : 7 + len(count)]  # same length, even with few layers
+    around = np.convolve(count, np.full(_SURROUNDINGS, 1 / _SURROUNDINGS))[_SURROUNDINGS // 2 :]
+    around = around[: len(count)]  # same length, even with few layers
     return float((np.maximum(count - around, 0.0) ** 2).sum())
 
 
 def _fitted(X: NDArray[np.float64], normal: NDArray[np.float64], offset: float, cell: float) -> NDArray[np.float64]:
     """Fit a plane to the points near a given plane. Returns its normal."""
-    for within in (1.5, 1.5, 1.5, 1.0, 1.0, 1.0):
+    for within in _FITTED_WITHIN:
         held = X[np.abs(X @ normal - offset) < within * cell]
         if len(held) < _LEAST_POINTS:
             break
@@ -196,11 +210,11 @@ def _tilted(
     """Fit a plane to the points near a given plane. The normal has a prior of a few milliradians, so points along a
     single edge cannot turn it. Returns (normal, offset), or None with too few points."""
     normal, across = start, np.linalg.svd(start[None])[2][1:]
-    for _ in range(4):
+    for _ in range(_TILTED):
         held = left & (np.abs(X @ normal - offset) < _WITHIN * cell)
         if np.count_nonzero(held) < _LEAST_POINTS:
             return None
-        weight = 1.0 / np.maximum(sigma_m[held], 0.25 * cell) ** 2
+        weight = 1.0 / np.maximum(sigma_m[held], _SUREST * cell) ** 2
         mean = (X[held] * weight[:, None]).sum(axis=0) / weight.sum()
         moved = X[held] - mean
         weight /= weight.max() * _DEPENDENT * (0.5 * _WITHIN * cell) ** 2
@@ -224,8 +238,8 @@ def _bounded(
     place = X[on] @ axes.T
     if len(place) < _LEAST_POINTS:
         return None
-    corner = np.percentile(place, 0.5, axis=0) - _REACH * square
-    shape = np.ceil((np.percentile(place, 99.5, axis=0) + _REACH * square - corner) / square).astype(np.int64)
+    corner = np.percentile(place, _STRAY, axis=0) - _REACH * square
+    shape = np.ceil((np.percentile(place, 100 - _STRAY, axis=0) + _REACH * square - corner) / square).astype(np.int64)
     if shape.prod() > _MOST_SQUARES:
         return None
 
@@ -271,7 +285,9 @@ def _bounded(
 
 def _pieces(held: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Remove small pieces."""
-    _, labels, sizes, _ = cv2.connectedComponentsWithStats(cv2.dilate(held.astype(np.uint8), np.ones((5, 5), np.uint8)))
+    _, labels, sizes, _ = cv2.connectedComponentsWithStats(
+        cv2.dilate(held.astype(np.uint8), np.ones((_BRIDGED, _BRIDGED), np.uint8))
+    )
     return held & np.isin(labels, np.flatnonzero(sizes[:, cv2.CC_STAT_AREA] >= _PIECE))
 
 

@@ -13,6 +13,8 @@ BEHIND = 3.0
 """Standard deviations behind a point at which space is full."""
 
 _CERTAIN = 7.0  # standard deviations before a point at which space is certainly free
+_TINY_AREA = 1e-300  # avoids division by the area of a facet without area
+_ALONG = 1e-9  # sine of an angle; a ray that leaves through a facet at less may do so by rounding alone
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ def compute_facet_planes(vertices, corners):  # type: ignore[no-untyped-def]
             a = vertices[corners[cell, (facet + 1) & 3]]
             u, v = vertices[corners[cell, (facet + 2) & 3]] - a, vertices[corners[cell, (facet + 3) & 3]] - a
             normal = np.cross(u, v)
-            normal /= max(np.sqrt((normal * normal).sum()), 1e-300)
+            normal /= max(np.sqrt((normal * normal).sum()), _TINY_AREA)
             if (normal * (vertices[corners[cell, facet]] - a)).sum() > 0.0:
                 normal = -normal
             out[cell, facet, :3] = normal
@@ -148,7 +150,7 @@ def _way_out(facets, cell, entered, start, way):  # type: ignore[no-untyped-def]
 def _first_cell(corners, facets, first, around, point, way):  # type: ignore[no-untyped-def]
     """The cell at a vertex that a ray enters, and the corner of the cell that the vertex is. If a ray runs along a
     facet, rounding may place it outside the tetrahedra on both sides; the one that it leaves least is taken."""
-    best, which, least = len(corners), 0, 1e-9
+    best, which, least = len(corners), 0, _ALONG
     for row in range(first[point], first[point + 1]):
         cell = around[row]
         worst, own = -np.inf, 0

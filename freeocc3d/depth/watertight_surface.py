@@ -27,6 +27,7 @@ _SOFT = 3.0  # standard deviations around a point within which rays may cross th
 _QUALITY = 1.0  # weight of the worst facet shape, in rays per side
 _STEPS = 50.0  # integer flow units per ray
 _LARGEST = (1 << 30) - 1  # the solver adds two capacities in 32 bits
+_TINY = 1e-12  # largest length of the normal of a triangle without area
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class WatertightSurface:
         edge_m, sigma_m = self._of_triangles
         normals = found["primitive_normals"].numpy()
         lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(directions, axis=-1)
-        cosine = (np.abs((normals * directions).sum(axis=-1)) / np.maximum(lengths, 1e-12)).astype(np.float32)
+        cosine = (np.abs((normals * directions).sum(axis=-1)) / np.maximum(lengths, _TINY)).astype(np.float32)
         return RayHits(*(np.where(hit, a, 0.0) for a in (times, edge_m[triangle], sigma_m[triangle], cosine)))
 
     def normals(self) -> NDArray[np.float64]:
@@ -73,7 +74,7 @@ class WatertightSurface:
         a, b, c = np.moveaxis(self.vertices[self.triangles[near]].astype(np.float64), 1, 0)
         normals = np.cross(b - a, c - a)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return np.asarray((normals / np.maximum(length, 1e-12))[length[:, 0] > 1e-12])
+        return np.asarray((normals / np.maximum(length, _TINY))[length[:, 0] > _TINY])
 
     @cached_property
     def _scene(self) -> Any:

@@ -22,6 +22,13 @@ from ..settings.stages import GaussianOptions as Options
 from . import denoising
 from .surface_cells import Cells, CellSums
 
+_COLUMNS = 320
+"""Smallest number of columns to take from a depth image; all if it has fewer. More pixels per cell add little."""
+
+_SAMPLED = 4  # step between the pixels for a frame's median depth
+_BACKWARD = 1e-6  # smallest 1 + z of a ray, so that a ray exactly backward gives a quaternion
+_LEAST_RADIUS_M = 1e-4  # of Gaussians whose neighbors are at the same place
+
 
 def compute_least_scale(options: Options, cell_size: float, voxel_size: float) -> float:
     """The smallest standard deviation, in meters, that lets voxels of ``voxel_size`` show Gaussians of cells of
@@ -92,11 +99,11 @@ class AnchoredCells:
             return self.options.pixel_stride
         if frame.depth_sigma_m is not None:
             return 1
-        measured = frame.depth_m[::4, ::4]
+        measured = frame.depth_m[::_SAMPLED, ::_SAMPLED]
         measured = measured[measured > 0]
         usual = float(np.median(measured)) if len(measured) else 1.0
         fine = int(0.5 * self.cell_size * frame.intrinsics.fx / usual)
-        return max(1, min(frame.intrinsics.width // 320, fine))
+        return max(1, min(frame.intrinsics.width // _COLUMNS, fine))
 
 
 def align_to_rays(
@@ -112,7 +119,7 @@ def align_to_rays(
     ray = anchor_cam / np.linalg.norm(anchor_cam, axis=1, keepdims=True)
     # The shortest rotation from +z to the ray. A point from a frame near the keyframe may be behind the keyframe; the
     # rotation exists for it, too, except exactly backward. There none is needed: an ellipsoid has no sign.
-    quats_cam = np.stack((np.maximum(1 + ray[:, 2], 1e-6), -ray[:, 1], ray[:, 0], np.zeros(len(ray))), axis=1)
+    quats_cam = np.stack((np.maximum(1 + ray[:, 2], _BACKWARD), -ray[:, 1], ray[:, 0], np.zeros(len(ray))), axis=1)
     quats_cam /= np.linalg.norm(quats_cam, axis=1, keepdims=True)
     quats_keyframe = rotations_to_quats(T_world_keyframe[:, :3, :3])
     n = len(anchor_cam)
@@ -136,7 +143,7 @@ def make_isotropic(gaussians: Gaussians) -> Gaussians:
     if others < 1:
         return gaussians
     distances = cKDTree(gaussians.means).query(gaussians.means, k=others + 1, workers=-1)[0][:, 1:]
-    radius = np.maximum(distances.mean(axis=1), 1e-4).astype(np.float32)
+    radius = np.maximum(distances.mean(axis=1), _LEAST_RADIUS_M).astype(np.float32)
     quats = np.tile(np.array((1, 0, 0, 0), np.float32), (len(gaussians), 1))
     return replace(gaussians, scales=np.repeat(radius[:, None], 3, axis=1), quats_wxyz=quats)
 

@@ -33,6 +33,9 @@ _REACH_M, _REACH_PER_M = 0.03, 0.01
 This covers noise and pose errors. Half or twice either value changes IoU by less than one point on the shipped
 captures."""
 
+_NEAREST_M = 1e-3
+"""Smallest depth of a point that a camera shows, meters: projection divides by the depth."""
+
 
 @dataclass
 class DenoisedPoints:
@@ -98,7 +101,7 @@ def _look(
         x = R[0, 0] * points[n, 0] + R[0, 1] * points[n, 1] + R[0, 2] * points[n, 2] + t[0]
         y = R[1, 0] * points[n, 0] + R[1, 1] * points[n, 1] + R[1, 2] * points[n, 2] + t[1]
         z = R[2, 0] * points[n, 0] + R[2, 1] * points[n, 1] + R[2, 2] * points[n, 2] + t[2]
-        if z < 1e-3:
+        if z < _NEAREST_M:
             continue
         column, line = math.floor(fx * x / z + cx + 0.5), math.floor(fy * y / z + cy + 0.5)
         if column < 0 or line < 0 or column >= width or line >= height:
@@ -138,7 +141,7 @@ def look_reference(
     depth_m = np.where(mask_away_from_edges(depth_m, edge), depth_m, 0)
     T = invert(posed.T_world_cam)
     p = points @ T[:3, :3].T + T[:3, 3]
-    z = np.where(p[:, 2] < 1e-3, np.nan, p[:, 2])
+    z = np.where(p[:, 2] < _NEAREST_M, np.nan, p[:, 2])
     ray = points - posed.T_world_cam[:3, 3]
     with np.errstate(invalid="ignore"):
         pixel = np.floor(p[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy) + 0.5)

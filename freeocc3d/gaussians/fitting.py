@@ -32,6 +32,8 @@ _RATES = {"outline": 1e-2, "turn": 1e-2, "shape": 1e-2, "quats": 5e-3, "means": 
 """Adam's step for each parameter: natural logarithms, radians, meters, logits, 0…1."""
 _DECAY, _DECAY_FROM = 0.1, 0.3
 """Steps shrink to the first share of their size; they start to shrink after the second share of all steps."""
+_ADAM_EPSILON = 1e-15  # as in the authors' code of 3D Gaussian Splatting: gradients are small
+_OPACITY_MARGIN = 1e-3  # smallest distance of initial opacities from 0 and 1, where logits are infinite
 _LARGEST_LOGIT = 6.0
 _LARGEST_CHANGE = math.log(4.0)
 """Largest change of a scale, natural logarithm. It limits growth where images show nothing, as in a frame of one
@@ -76,7 +78,7 @@ def _fitted(
 ) -> Gaussians:
     parameters = (_Free if options.means == "free" else _Anchored)(gaussians, options, rasterizer.device)
     groups = [{"params": [tensor], "lr": _RATES[name]} for name, tensor in parameters.optimized.items()]
-    optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+    optimizer = torch.optim.Adam(groups, eps=_ADAM_EPSILON, fused=True)
     generator = np.random.default_rng(0)
     steps = passes * len(views)
     order = np.concatenate([generator.permutation(len(views)) for _ in range(passes)])
@@ -113,7 +115,7 @@ class _Parameters:
         self.log_scales = tensor(np.log(gaussians.scales))
         self.quats = tensor(gaussians.quats_wxyz)
         self.optimized = {
-            "logits": torch.logit(tensor(gaussians.opacities), 1e-3),
+            "logits": torch.logit(tensor(gaussians.opacities), _OPACITY_MARGIN),
             "colors": tensor(gaussians.colors) / 255,
         }
 

@@ -17,7 +17,8 @@ from ..core.types import PosedFrame
 from ..core.voxel_keys import pack_voxels
 from .depth_edges import is_at_edge, mask_away_from_edges
 
-"""Number of cells on either side of the world's origin along each axis."""
+_SUMS = 7
+"""Columns of a cell's sums: of weights, of weighted positions, of weighted colors."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class CellSums:
         self._used = 0
         self._table, self._rows = build_table(np.zeros(0, np.int64), 0)
         self._key = np.zeros(0, np.int64)
-        self._sums = np.zeros((0, 7))  # of weights, weighted positions, weighted colors
+        self._sums = np.zeros((0, _SUMS))
         self._pixels = np.zeros(0, np.int64)
         self._best = np.zeros(0)
         self._keyframe = np.zeros(0, np.int32)

@@ -15,6 +15,8 @@ TILE = 16
 """Edge of a tile in pixels, as in the 3D Gaussian Splatting paper."""
 
 _VALUES = 5  # composited values of a Gaussian: red, green, blue, z, 1
+_DIGIT = 11  # bits per pass of the sort: three passes see all 32
+_SLACK = 0.01  # pixels added to an ellipse, so that rounding cuts nothing off
 _SHORT = 5  # columns: for a shorter row of a splat, finding the ends of the ellipse costs more than it saves
 
 Array = NDArray[np.float32]
@@ -24,15 +26,15 @@ Array = NDArray[np.float32]
 def sort_nearest_first(rows: NDArray[np.int64], bits: NDArray[np.uint32]) -> NDArray[np.int64]:
     """Sorts rows by the floats with the given bits. Positive floats sort like integers; ties keep their order. Three
     passes of a radix sort; np.argsort takes ten times as long."""
-    for shift in (0, 11, 22):
-        place = np.zeros(2049, np.int64)
+    for shift in (0, _DIGIT, 2 * _DIGIT):
+        place = np.zeros((1 << _DIGIT) + 1, np.int64)
         for n in range(len(bits)):
-            place[((bits[n] >> shift) & 2047) + 1] += 1
-        for digit in range(2048):
+            place[((bits[n] >> shift) & ((1 << _DIGIT) - 1)) + 1] += 1
+        for digit in range(1 << _DIGIT):
             place[digit + 1] += place[digit]
         sorted_rows, sorted_bits = np.empty_like(rows), np.empty_like(bits)
         for n in range(len(bits)):
-            digit = (bits[n] >> shift) & 2047
+            digit = (bits[n] >> shift) & ((1 << _DIGIT) - 1)
             sorted_rows[place[digit]], sorted_bits[place[digit]] = rows[n], bits[n]
             place[digit] += 1
         rows, bits = sorted_rows, sorted_bits
@@ -135,7 +137,7 @@ def _span(
     half = b * b * dv * dv - a * (c * dv * dv + np.float32(2) * least)
     if half <= 0:
         half = np.float32(0)
-    half = math.sqrt(half) / a + np.float32(0.01)
+    half = math.sqrt(half) / a + np.float32(_SLACK)
     middle = u - b * dv / a
     return max(low, math.ceil(middle - half)), min(high, math.floor(middle + half))
 

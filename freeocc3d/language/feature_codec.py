@@ -28,6 +28,10 @@ _STEPS = {4: 0.335, 2: 0.996}  # in standard deviations of a normal distribution
 _ERRORS = {8: 1.0e-4, 4: 0.01154, 2: 0.1188}  # the share of the variance that remains as error
 _HARDLY = 1e-4
 """Share of the energy that may be lost without a noticeable effect: 0.00005 of the cosine."""
+_NO_WORSE = 1.1
+"""A short code may leave up to this many times the energy that the best code leaves."""
+_TRIED = np.geomspace(0.5, 2.0, 9)  # steps to try, as multiples of the step for a normal distribution
+_TINY = 1e-6  # avoids a step of 0 where all values are equal
 _LEVELS = 254
 """8-bit codes 1…255 are levels; a code of zeros is the zero feature, whose meaning is unknown."""
 _MARGIN = 0.02
@@ -77,7 +81,7 @@ class Codec:
             low, high = np.zeros_like(low), np.ones_like(high)
         low = np.where(low >= 0, np.maximum(low - _MARGIN, 0.0), low - _MARGIN).astype(np.float32)
         high = np.where(high <= 0, np.minimum(high + _MARGIN, 0.0), high + _MARGIN).astype(np.float32)
-        scale = np.maximum(high - low, np.float32(1e-6)) / np.float32(_LEVELS)
+        scale = np.maximum(high - low, np.float32(_TINY)) / np.float32(_LEVELS)
         offset = low - scale  # level 1 is the lowest
         sample = features[known[:: max(1, len(known) // _SAMPLE)]].astype(np.float32) @ basis.T
         for row in np.flatnonzero(bits < 8):
@@ -255,7 +259,7 @@ def _fewest(energy: NDArray[np.float64], most_bytes: int) -> NDArray[np.uint8]:
     _, least = _shared_out(energy, most_bytes)
     for count in range(8, most_bytes, 8):
         bits, left = _shared_out(energy, count)
-        if left <= max(1.1 * least, _HARDLY * energy.sum()):
+        if left <= max(_NO_WORSE * least, _HARDLY * energy.sum()):
             return bits
     return _shared_out(energy, most_bytes)[0]
 
@@ -280,10 +284,10 @@ def _shared_out(energy: NDArray[np.float64], most_bytes: int) -> tuple[NDArray[n
 
 def _coarse(values: NDArray[np.float32], bits: int) -> tuple[float, float]:
     """Offset and step of the uniform quantizer with the least squared error, near Max's for a normal distribution."""
-    mean, deviation = float(values.mean()), max(float(values.std()), 1e-6)
+    mean, deviation = float(values.mean()), max(float(values.std()), _TINY)
     top = (1 << bits) - 1
     best, least = (0.0, 1.0), np.inf
-    for step in _STEPS[bits] * deviation * np.geomspace(0.5, 2.0, 9):
+    for step in _STEPS[bits] * deviation * _TRIED:
         offset = mean - 0.5 * top * step
         error = float(((np.clip(np.rint((values - offset) / step), 0, top) * step + offset - values) ** 2).mean())
         if error < least:

@@ -42,6 +42,8 @@ _NOTHING_LEFT = 1e-3
 """If all views of a Gaussian are removed, less than this share of its weight remains, from rounding."""
 _TIED = 1e-3
 """Regions whose disagreement differs by less than this are equal."""
+_LARGEST_CODE = 127
+"""Code of a feature's largest component. Codes are int8, so other components are off by at most half a step."""
 _IN_MEMORY = 512 << 20
 """Codes of views up to this many bytes are kept in memory; others are kept in a temporary file."""
 _LEAST_CONTRAST = 0.05
@@ -260,7 +262,7 @@ def _coded(features: NDArray[np.float32], used: NDArray[np.int64]) -> tuple[NDAr
         for d in range(len(own)):
             largest = max(largest, abs(own[d]))
         for d in range(len(own)):
-            level = np.rint(own[d] * (np.float32(127) / largest))
+            level = np.rint(own[d] * (np.float32(_LARGEST_CODE) / largest))
             codes[n, d] = np.int8(level)
             squared += level * level
         scales[n] = 1 / math.sqrt(squared)

@@ -31,6 +31,8 @@ _RENDERED_PIXELS = 4
 """Edge in pixels of the blocks of the rendered depth."""
 _NEAR = np.float32(0.05)
 """Meters; nearer Gaussians are not rendered."""
+_TINY_BORDER = 1e-6
+"""Pixels; avoids division by a border of 0, for which b is 1 everywhere."""
 _WIDEST = 16
 """Largest number of blocks, to each side, that one Gaussian covers."""
 
@@ -67,7 +69,7 @@ def find_visible(
     _see(
         gaussians.means, gaussians.scales, gaussians.quats_wxyz, T, pinhole, depth_m, rendered,
         np.float32(options.visible_within), np.float32(options.visible_share), np.float32(options.near),
-        np.float32(max(options.border * min(depth_m.shape), 1e-6)), pixels, weights,
+        np.float32(max(options.border * min(depth_m.shape), _TINY_BORDER)), pixels, weights,
     )  # fmt: skip
     rows = np.flatnonzero(weights).astype(np.int32)
     return VisibleGaussians(rows, pixels[rows], weights[rows], depth_m.shape)
@@ -103,7 +105,7 @@ def find_visible_reference(
     cosine = measured / np.where(normal_length > 0, normal_length * ray_length, 1.0)
     cosine = np.maximum(cosine, float(_MIN_COSINE))  # for unmeasured pixels, too
     margin = np.minimum(np.minimum(row, height - 1 - row), np.minimum(column, width - 1 - column)) + 0.5
-    inwards = np.minimum(1.0, margin / max(options.border * min(height, width), 1e-6))
+    inwards = np.minimum(1.0, margin / max(options.border * min(height, width), _TINY_BORDER))
     weight = cosine * (_EDGE + (1 - _EDGE) * inwards) / np.maximum(safe, options.near) ** 2
     return row * width + column, np.where(shown, weight, 0.0)
 

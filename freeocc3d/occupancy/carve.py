@@ -15,6 +15,10 @@ from ..core.voxel_keys import unpack_voxels
 from ..settings.stages import CarvingOptions as Options
 from .voxel_blocks import find_blocks_along_rays
 
+_SIGMAS = 3
+"""Standard deviations of a depth within which its surface lies: 99.7 % of Gaussian noise."""
+_NEAREST_M = 1e-3
+"""Meters; avoids division by 0 for an image without depth."""
 _NARROW = 64
 """Divides the image's width. A pixel without any depth within this part of the width lies in a wide empty patch, not in
 a small hole along the edge of a thing."""
@@ -93,15 +97,15 @@ class DepthEvidence:
             return self.within
         camera = frame.intrinsics
         reach = np.abs(frame.depth_m)
-        farthest = max(float(reach.max(initial=0.0)), 1e-3)
+        farthest = max(float(reach.max(initial=0.0)), _NEAREST_M)
         step = max(1, min(self.options.ray_step, int(0.5 * BLOCK * self.voxel_size * camera.fx / farthest)))
         rows, columns = (np.union1d(np.arange(0, n, step), n - 1) for n in frame.depth_m.shape)
         measured = reach[np.ix_(rows, columns)]
         v, u = np.nonzero(measured)
         pixels = np.stack((columns[u], rows[v]), axis=1)
-        spread = 3 * self.options.noise * measured[v, u] ** 2
+        spread = _SIGMAS * self.options.noise * measured[v, u] ** 2
         if frame.depth_sigma_m is not None:
-            spread = 3 * frame.depth_sigma_m[rows[v], columns[u]]
+            spread = _SIGMAS * frame.depth_sigma_m[rows[v], columns[u]]
         z = measured[v, u] + 0.5 * self.voxel_size + spread
         points = transform(T_world_cam, back_project(pixels, z.astype(np.float32), camera).astype(np.float64))
         return find_blocks_along_rays(points, T_world_cam[:3, 3], self.origin, self.voxel_size)
@@ -149,8 +153,8 @@ class DepthEvidence:
             np.zeros((0, 0), np.float32) if frame.depth_sigma_m is None else frame.depth_sigma_m,
             np.float32(self.voxel_size),
             np.float32(self.options.margin * self.voxel_size),
-            np.float32(3 * self.options.noise),
-            np.uint16(change % 65536),  # adding 65535 subtracts one
+            np.float32(_SIGMAS * self.options.noise),
+            np.uint16(change % (1 << 16)),  # adding 65535 subtracts one
             self._free,
             self._hits,
         )
@@ -179,9 +183,9 @@ def _count(
         row_of_block = rows[b]
         x0, y0, z0 = keys[b, 0] * BLOCK, keys[b, 1] * BLOCK, keys[b, 2] * BLOCK
         for voxel in range(BLOCK**3):
-            vx = x0 + voxel // 64 + np.float32(0.5)
-            vy = y0 + voxel // 8 % 8 + np.float32(0.5)
-            vz = z0 + voxel % 8 + np.float32(0.5)
+            vx = x0 + voxel // BLOCK**2 + np.float32(0.5)
+            vy = y0 + voxel // BLOCK % BLOCK + np.float32(0.5)
+            vz = z0 + voxel % BLOCK + np.float32(0.5)
             z = R[2, 0] * vx + R[2, 1] * vy + R[2, 2] * vz + t[2]
             if z < half:
                 continue
@@ -193,7 +197,7 @@ def _count(
             depth = depth_m[row, column]
             if depth == 0:
                 continue
-            spread = np.float32(3) * sigma_m[row, column] if len(sigma_m) else noise * z * z
+            spread = np.float32(_SIGMAS) * sigma_m[row, column] if len(sigma_m) else noise * z * z
             far = margin + spread
             if abs(depth) - z > far:
                 du, dv = int(fx * half / z), int(fy * half / z)

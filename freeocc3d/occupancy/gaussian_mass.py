@@ -24,7 +24,10 @@ from ..core.types import BLOCK
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _FAR = 5.0  # standard deviations: 6e-7 of the mass lies beyond
+_PER_PANEL = 5  # deviations across a panel: its eight nodes integrate that much exactly enough
 _MOST_PANELS = 12  # enough down to deviations of a twentieth of a voxel
+_ALIGNED = 1e-6  # largest ratio of the covariances to the variances for which axes count as independent
+_TINY_VARIANCE = 1e-12  # squared voxels: rounding may make a flat Gaussian's variance negative
 
 
 @njit(cache=True)
@@ -57,7 +60,7 @@ def integrate_boxes(
         local[axis] = np.float64(mean[axis]) - key[axis] * BLOCK
     first, end = (i0, j0, k0), (i1, j1, k1)
     mixed = abs(S[0, 1]) + abs(S[0, 2]) + abs(S[1, 2])
-    if mixed <= 1e-6 * (S[0, 0] + S[1, 1] + S[2, 2]):
+    if mixed <= _ALIGNED * (S[0, 0] + S[1, 1] + S[2, 2]):
         along = np.empty((3, BLOCK))
         for axis in range(3):
             deviation = math.sqrt(S[axis, axis])
@@ -96,10 +99,10 @@ def _integrated(
     x, y, z = order[0], order[1], order[2]
     sx = math.sqrt(S[x, x])
     slope_yx = S[x, y] / S[x, x]
-    sy = math.sqrt(max(S[y, y] - slope_yx * S[x, y], 1e-12))
+    sy = math.sqrt(max(S[y, y] - slope_yx * S[x, y], _TINY_VARIANCE))
     residual = S[y, z] - slope_yx * S[x, z]
     slope_zx, slope_zy = S[x, z] / S[x, x], residual / (sy * sy)
-    sz = math.sqrt(max(S[z, z] - slope_zx * S[x, z] - slope_zy * residual, 1e-12))
+    sz = math.sqrt(max(S[z, z] - slope_zx * S[x, z] - slope_zy * residual, _TINY_VARIANCE))
     # Panels are narrow: across one, the density and the inner integral move by a few deviations at most.
     panels_x = _panels(abs(slope_zx) / sz + abs(slope_yx) / sy + min(1 / sx, 2 * _FAR))
     panels_y = _panels(abs(slope_zy) / sz + min(1 / sy, 2 * _FAR))
@@ -135,7 +138,7 @@ def _integrated(
 @njit(cache=True)
 def _panels(deviations: float) -> int:
     """Returns the number of pieces of a voxel's edge. deviations: how far the integrand moves along the edge."""
-    return min(math.ceil(deviations / 5), _MOST_PANELS)
+    return min(math.ceil(deviations / _PER_PANEL), _MOST_PANELS)
 
 
 @njit(cache=True)

@@ -19,9 +19,13 @@ _BIN = 0.02  # meters
 _FLOOR_SHARE = 0.25  # of the largest level surface below the cameras: a smaller surface is not a floor
 _BAND = (0.08, 0.05, 0.03)  # meters around the floor: points within them fit the plane, band after band
 _LARGEST_TURN = np.deg2rad(3.0)
-_EXTENT = (
-    0.5  # meters: least standard deviation of a floor's points along its narrow side; a narrower floor shows no tilt
-)
+_BELOW_CAMERA = 0.2  # meters: least height of the camera above the floor
+_SMOOTHING = (0.25, 0.5, 1.0, 0.5, 0.25)  # smooths the histogram of heights, so that noise makes no peaks
+_LEAST_FLOOR = 10  # smallest number of points for the floor's plane
+_NEAR_PEAK_DEG = 3.0  # largest angle from the peak of the walls' directions for the median
+_STEEP = 0.95  # cosine, 18 degrees: a camera nearer to straight down or up has no heading
+_EXTENT = 0.5
+"""Meters: least standard deviation of a floor's points along its narrow side; a narrower floor shows no tilt."""
 
 
 def estimate_gravity_frame(T_map_cam: NDArray[np.float64], gaussians: Gaussians) -> NDArray[np.float64]:
@@ -78,12 +82,12 @@ def compute_first_camera_frame(
 def estimate_floor_height(heights: NDArray[np.float64], camera_height: float) -> float | None:
     """Returns the height of the floor from the (N,) heights of points on level surfaces. It is the lowest peak of their
     histogram below the cameras with at least a quarter of the largest peak's points. None without points there."""
-    below = heights[heights < camera_height - 0.2]
+    below = heights[heights < camera_height - _BELOW_CAMERA]
     if not len(below):
         return None
     low = float(below.min())
     count = np.bincount(((below - low) / _BIN).astype(np.int64), minlength=3).astype(np.float64)
-    smooth = np.convolve(count, (0.25, 0.5, 1.0, 0.5, 0.25), "same")
+    smooth = np.convolve(count, _SMOOTHING, "same")
     padded = np.pad(smooth, 1)
     is_peak = (smooth >= padded[:-2]) & (smooth >= padded[2:]) & (smooth >= _FLOOR_SHARE * smooth.max())
     return low + (int(np.flatnonzero(is_peak)[0]) + 0.5) * _BIN
@@ -96,7 +100,7 @@ def _fitted(up: NDArray[np.float64], height: float, level: NDArray[np.float64]) 
     normal = up
     for band in _BAND:
         near = level[np.abs(level @ normal - height) < band]
-        if len(near) < 10:
+        if len(near) < _LEAST_FLOOR:
             return up, height
         center = near.mean(axis=0)
         spread, axes = np.linalg.eigh(np.cov((near - center).T))
@@ -121,14 +125,14 @@ def _along_walls(
     piled = sum(np.roll(count, shift) for shift in range(-2, 3))
     peak = int(np.argmax(piled)) + 0.5
     off = (quarter - peak + 45.0) % 90.0 - 45.0
-    turn = np.deg2rad((peak + float(np.median(off[np.abs(off) < 3.0])) + 45.0) % 90.0 - 45.0)
+    turn = np.deg2rad((peak + float(np.median(off[np.abs(off) < _NEAR_PEAK_DEG])) + 45.0) % 90.0 - 45.0)
     return np.asarray(np.cos(turn) * x + np.sin(turn) * np.cross(up, x))
 
 
 def _heading(up: NDArray[np.float64], forward: NDArray[np.float64], above: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the (3,) level unit vector along a camera's view. If the camera looks straight down or up, it points to
     the top or bottom edge of its image."""
-    looks = forward if abs(forward @ up) < 0.95 else above * -np.sign(forward @ up)
+    looks = forward if abs(forward @ up) < _STEEP else above * -np.sign(forward @ up)
     flat = looks - (looks @ up) * up
     return np.asarray(flat / np.linalg.norm(flat))
 

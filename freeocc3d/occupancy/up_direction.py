@@ -7,6 +7,12 @@ from numpy.typing import NDArray
 
 _SAMPLES = 20_000
 _BIN = 0.05  # meters
+_ALL_ALIKE = 0.05
+"""Weight of the mean upward axis relative to the cameras' level axes. It is small: this axis decides only where all
+cameras look the same way."""
+_REACHES_DEG = (10.0, 3.0, 0.8)  # largest turn of up, round after round
+_TILTS = 11  # number of tilts to try along each axis
+_TINY = 1e-9  # avoids division by 0 where opposite axes cancel out
 _SIDEWAYS = 0.4
 """A camera counts as held sideways if the mean of its x axes is longer than that of its y axes by this much. A camera
 that nods from floor to ceiling without turning has a difference of 0.36."""
@@ -23,14 +29,13 @@ def estimate_up(T_world_cam: NDArray[np.float64], points_world: NDArray[np.float
     if len(T_world_cam) == 0:
         return np.array((0.0, -1.0, 0.0))
     level_axes, mean_up = _held(T_world_cam)
-    mean_up /= max(float(np.linalg.norm(mean_up)), 1e-9)
-    # Where all cameras look the same way, the mean upward axis decides: it has a small weight.
-    spread = level_axes.T @ level_axes / len(level_axes) + 0.05 * (np.eye(3) - np.outer(mean_up, mean_up))
+    mean_up /= max(float(np.linalg.norm(mean_up)), _TINY)
+    spread = level_axes.T @ level_axes / len(level_axes) + _ALL_ALIKE * (np.eye(3) - np.outer(mean_up, mean_up))
     up = np.linalg.eigh(spread)[1][:, 0]
     up = up if up @ mean_up >= 0 else -up
     step = max(1, len(points_world) // _SAMPLES)
     points = np.asarray(points_world[::step], np.float64)
-    for reach in (10.0, 3.0, 0.8):
+    for reach in _REACHES_DEG:
         up = _most_level(up, points, np.deg2rad(reach))
     return up
 
@@ -62,7 +67,7 @@ def _most_level(up: NDArray[np.float64], points: NDArray[np.float64], reach: flo
     a = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     a /= np.linalg.norm(a)
     b = np.cross(up, a)
-    tilts = np.stack(np.meshgrid(*[np.linspace(-reach, reach, 11)] * 2), axis=-1).reshape(-1, 2)
+    tilts = np.stack(np.meshgrid(*[np.linspace(-reach, reach, _TILTS)] * 2), axis=-1).reshape(-1, 2)
     tilts = tilts[np.linalg.norm(tilts, axis=1) <= reach * 1.001]
     directions = up + np.tan(tilts[:, :1]) * a + np.tan(tilts[:, 1:]) * b
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

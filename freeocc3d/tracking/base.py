@@ -23,6 +23,9 @@ from ..settings.typed_options import TypedOptions
 from .pose_graph import Edge, edges_to_arrays
 from .records import Records
 
+LEAST_COVERED = 0.05
+"""Smallest share of a frame's pixels with a surface to track."""
+
 
 class KeyframeOptions(TypedOptions, frozen=True):
     """Which frames become keyframes."""

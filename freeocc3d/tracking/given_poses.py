@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 from ..core.errors import TrackingError
 from ..core.transforms import invert, nearest_rigid
 from ..core.types import Frame
-from .base import Tracked, Tracker
+from .base import LEAST_COVERED, Tracked, Tracker
 from .overlap import DepthView, measure_mutual_overlap, sample_points
 from .records import Records
 
 _FARTHEST = 2000.0
-_LEAST_COVERED = 0.05  # share of the pixels with depth; with fewer, a frame shows nothing
+"""Largest distance from the world's origin, meters: beyond it, float32 positions are not exact to a tenth of a
+millimeter."""
+
+_OVERLAP_STEP = 16  # pixels between sampled points for the overlap
 
 
 class GivenTracker(Tracker):
@@ -43,7 +46,7 @@ class GivenTracker(Tracker):
                 "millimeter accuracy: subtract a common offset from all poses."
             )
         view = self._view(frame)
-        nothing_seen = np.count_nonzero(frame.depth_m) < _LEAST_COVERED * frame.depth_m.size
+        nothing_seen = np.count_nonzero(frame.depth_m) < LEAST_COVERED * frame.depth_m.size
         if nothing_seen and self._keyframe is None:
             self.records.add_lost(frame.index)
             return Tracked("lost", None, 0.0)
@@ -66,4 +69,6 @@ class GivenTracker(Tracker):
         self._keyframe = self._view(keyframes[-1]) if keyframes else None
 
     def _view(self, frame: Frame) -> DepthView:
-        return DepthView(frame.depth_m, frame.intrinsics, sample_points(frame.depth_m, frame.intrinsics, step=16))
+        return DepthView(
+            frame.depth_m, frame.intrinsics, sample_points(frame.depth_m, frame.intrinsics, step=_OVERLAP_STEP)
+        )

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from ..core.transforms import back_project, invert, project, transform
 from ..core.types import Intrinsics
 
+_SAME_DEPTH = 0.1  # largest relative difference of two depths of one surface, with drifting poses
+
 
 def sample_points(depth_m: NDArray[np.float32], intrinsics: Intrinsics, step: int = 8) -> NDArray[np.float32]:
     """Back-project every ``step``-th pixel with a depth to (P, 3) camera-frame points."""
@@ -46,5 +48,5 @@ def measure_overlap(points_a: NDArray[np.float32], T_b_a: NDArray[np.float64], b
         inside = (pixels > -0.5).all(axis=1) & (pixels < (width - 0.5, height - 0.5)).all(axis=1)
     u, v = np.rint(pixels[inside]).astype(int).T
     depth = b.depth_m[v, u]
-    agrees = (depth == 0) | (np.abs(depth - z[inside]) < 0.1 * z[inside])
+    agrees = (depth == 0) | (np.abs(depth - z[inside]) < _SAME_DEPTH * z[inside])
     return float(agrees.sum() / len(points_a))

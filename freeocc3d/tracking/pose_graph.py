@@ -12,8 +12,18 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 
 from ..core.transforms import invert, measure_pose_difference, nearest_rigid
 
-_SWEEPS = 6
+_SWEEPS = 6  # largest number of rounds that remove closures which do not hold
 _HELD_M, _HELD_DEG = 0.1, 5.0
+"""Largest difference between optimized poses and a closure that holds."""
+
+_DETOUR = 1000.0
+"""Weight of an uncertain edge in certain edges: more than there are between two closures, so that paths avoid it."""
+
+_CLOSURE_M = 0.05
+"""Largest distance between corresponding points of two keyframes, meters. It scales the penalty for switching off a
+closure (Choi et al., below). Open3D's default is 0.03."""
+
+_PRUNED = 0.25  # weight of the line process below which Open3D removes a closure; its default
 
 _AGREE_M, _AGREE_DEG = 0.3, 10.0
 """Largest disagreement of two closures about a submap's pose: the possible drift of its path between them."""
@@ -89,7 +99,7 @@ def _laid_out(poses: list[NDArray[np.float64]], edges: Sequence[Edge]) -> list[N
     for e in sorted(edges, key=lambda e: not e.uncertain):  # the certain edge of two keyframes wins
         measured[e.source, e.target] = (e.uncertain, e.T_target_source)
     ends = np.array(list(measured))
-    weights = [1000.0 if uncertain else 1.0 for uncertain, _ in measured.values()]
+    weights = [_DETOUR if uncertain else 1.0 for uncertain, _ in measured.values()]
     graph = coo_matrix((weights, (ends[:, 0], ends[:, 1])), shape=(len(poses), len(poses)))
     order, before = breadth_first_order(minimum_spanning_tree(graph.tocsr()), 0, directed=False)
     laid = [np.array(pose) for pose in poses]
@@ -145,8 +155,8 @@ def _optimized(poses: list[NDArray[np.float64]], edges: list[Edge]) -> list[NDAr
             registration.GlobalOptimizationLevenbergMarquardt(),
             registration.GlobalOptimizationConvergenceCriteria(),
             registration.GlobalOptimizationOption(
-                max_correspondence_distance=0.05,
-                edge_prune_threshold=0.25,
+                max_correspondence_distance=_CLOSURE_M,
+                edge_prune_threshold=_PRUNED,
                 preference_loop_closure=1.0,
                 reference_node=0,
             ),

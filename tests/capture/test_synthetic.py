@@ -5,6 +5,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -267,6 +268,38 @@ def test_truth_agrees_with_what_the_images_show(truth) -> None:
         assert np.mean((seen != FREE) & (seen != UNKNOWN)) > 0.99
         agreed, total = agreed + np.count_nonzero(seen == capture.labels(index)), total + seen.size
     assert agreed / total > 0.93
+
+
+@pytest.mark.parametrize("facing", [False, True])
+def test_points_that_a_depth_image_does_not_hide_are_those_of_a_plain_computation(facing: bool) -> None:
+    rng = np.random.default_rng(0)
+    height, width, focal = 24, 32, 30.0
+    K = np.array(((focal, 0, 15.7), (0, focal, 11.2), (0, 0, 1)))
+    T_cam_world = np.eye(4)
+    T_cam_world[:3, :3] = cv2.Rodrigues(np.array((0.3, -0.2, 0.1)))[0]
+    T_cam_world[:3, 3] = (0.1, 0.2, -0.3)
+    depth = rng.uniform(1.0, 3.0, (height, width)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    points = rng.uniform(-3.0, 3.0, (20_000, 3)).astype(np.float32)
+    normals = rng.standard_normal((20_000 if facing else 0, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    known = rng.random(len(points)) < 0.1
+    seen = known.copy()
+    synthetic._mark_seen(points, normals, T_cam_world, K, depth, seen)
+
+    p = points.astype(float) @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    column, row = np.rint(p[:, :2] / p[:, 2:] * focal + K[:2, 2]).astype(int).T
+    inside = (p[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    measured = depth[np.where(inside, row, 0), np.where(inside, column, 0)]
+    tolerance = np.zeros(len(points))
+    if facing:
+        cosine = -(p * (normals @ T_cam_world[:3, :3].T)).sum(axis=1) / np.linalg.norm(p, axis=1)
+        inside &= cosine > 0
+        tolerance = 0.75 * p[:, 2] / focal / np.maximum(cosine, 0.1)
+    expected = known | (inside & (measured > 0) & (p[:, 2] <= measured + tolerance))
+    np.testing.assert_array_equal(seen, expected)
+    assert (expected & ~known).sum() > 50
+    assert (inside & ~expected).sum() > 50
 
 
 def test_truth_is_of_the_used_frames_only(truth) -> None:

@@ -134,6 +134,19 @@ def test_points_near_blocks() -> None:
     np.testing.assert_array_equal(region.contains(points, 0.21), [True, True, True, True, True])
 
 
+@pytest.mark.parametrize("margin", [0.0, 0.2, 0.5])
+def test_near_blocks_is_within_the_margin_of_a_cube_along_all_axes(margin: float) -> None:
+    rng = np.random.default_rng(0)
+    origin, edge = np.array((0.3, -0.2, 0.1)), 0.25
+    corners = np.unique(rng.integers(-3, 3, (40, 3)), axis=0)
+    points = origin + rng.uniform(-0.8, 0.8, (500, 3))
+    local = ((points - origin) / edge)[:, None]
+    expected = ((local >= corners - margin) & (local <= corners + 1 + margin)).all(axis=2).any(axis=1)
+    found = adaptive_voxels.Blocks(voxel_keys.pack_voxels(corners), origin, edge).contains(points, margin * edge)
+    np.testing.assert_array_equal(found, expected)
+    assert 20 < found.sum() < 480
+
+
 def test_sizes_that_halving_reaches() -> None:
     assert adaptive_voxels.count_halvings(0.08, 0.08) == 0
     assert adaptive_voxels.count_halvings(0.08, 0.005) == 4

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -125,6 +126,32 @@ def test_the_builder_agrees_with_the_protocol_written_out(changes: dict) -> None
     np.testing.assert_allclose(built.origin, expected.origin)
     np.testing.assert_array_equal(built.labels, expected.labels)
     assert built.classes == ("free", "wall", "door", "post")
+
+
+def test_what_a_frame_observes_is_that_of_a_plain_computation() -> None:
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.5, 4.0, (CAMERA.height, CAMERA.width)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    frame = Frame(0, 0.0, np.zeros((*depth.shape, 3), np.uint8), depth, CAMERA)
+    options = replicaocc_truth.Options(voxel_size=0.2, max_range=3.0)
+    T_world_cam, origin, shape = np.eye(4), np.array((-2.0, -1.5, -0.5)), (20, 15, 20)
+    T_world_cam[:3, :3] = cv2.Rodrigues(np.array((0.2, -0.4, 0.1)))[0]
+    T_world_cam[:3, 3] = (0.1, -0.2, 0.3)
+    known = rng.random(shape) < 0.1
+    seen = known.copy()
+    replicaocc_truth.mark_observed(seen, frame, T_world_cam, origin, options)
+
+    centers = origin + (np.stack(np.indices(shape), axis=-1) + 0.5) * options.voxel_size
+    x, y, z = np.moveaxis((centers - T_world_cam[:3, 3]) @ T_world_cam[:3, :3], -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = np.floor(CAMERA.fx * x / z + CAMERA.cx + 0.5).astype(int)
+        v = np.floor(CAMERA.fy * y / z + CAMERA.cy + 0.5).astype(int)
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < CAMERA.width) & (v < CAMERA.height)
+    measured = depth[np.where(inside, v, 0), np.where(inside, u, 0)]
+    usable = inside & (measured > 0) & (measured <= options.max_range)
+    expected = known | (usable & (z <= measured + options.tolerance * options.voxel_size))
+    np.testing.assert_array_equal(seen, expected)
+    assert 0.02 < (expected & ~known).mean() < 0.9
 
 
 def test_within_fills_the_neighbors_of_what_a_point_lies_in() -> None:

@@ -12,7 +12,7 @@ from freeocc3d.core.depth_noise import compute_sensor_sigma
 from freeocc3d.core.transforms import invert, measure_pose_difference, quats_to_rotations
 from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.tracking.rgbd import dense_alignment, orb_features
-from freeocc3d.tracking.rgbd.alignment_views import prepare_alignment_view
+from freeocc3d.tracking.rgbd.alignment_views import fit_planes, prepare_alignment_view
 from freeocc3d.tracking.rgbd.dense_residuals import Weighting, linearize, make_equations
 
 
@@ -68,6 +68,58 @@ def test_fitting_takes_noise_away_and_keeps_edges() -> None:
     view = prepare_alignment_view(Frame(0, 0.0, np.zeros((120, 160, 3), np.uint8), depth, CAMERA))
     z = view.points[..., 2]
     assert set(np.unique(z.round(3)).tolist()) <= {0.0, 2.0, 3.0}
+
+
+def plane_at(depth: np.ndarray, i: int, j: int, step: int, window: int) -> np.ndarray | None:
+    """a, b, c of 1/z = a + b du + c dv around the middle of a square of pixels, by least squares; None where the depths
+    that belong to one surface are too few, too near each other, or of a surface seen edge-on."""
+    v0, u0 = (k * step + 0.5 * (step - 1) for k in (i, j))
+    every, (v, u) = 2 if window >= 4 else 1, np.indices(depth.shape)
+    square = (v // step == i) & (u // step == j) & (depth > 0)
+    if not square.any():
+        return None
+    inverse, du, dv = 1.0 / np.where(depth > 0, depth.astype(float), np.inf), u - u0, v - v0
+    near = inverse[square][np.argmin((du**2 + dv**2)[square])]
+    rows, columns = (np.arange(max(0, int(c) - window + 1), int(c) + window + 1, every) for c in (v0, u0))
+    around = np.isin(v, rows) & np.isin(u, columns) & (depth > 0)
+    plane = np.array((near, 0.0, 0.0))
+    for allowed in (0.04 * near, 0.012 * near):
+        held = around & (np.abs(inverse - (plane[0] + plane[1] * du + plane[2] * dv)) <= allowed)
+        if held.sum() < 8 or np.linalg.det(np.cov(du[held], dv[held], bias=True)) < 0.02 * window**4 / 9:
+            return None
+        rows_of = np.stack((np.ones(held.sum()), du[held], dv[held]), axis=1)
+        plane = np.linalg.lstsq(rows_of, inverse[held], rcond=None)[0]
+        if plane[0] <= 0:
+            return None
+    return plane
+
+
+@pytest.mark.parametrize(("step", "window"), [(1, 3), (2, 4), (3, 5)])
+def test_planes_are_those_of_least_squares_over_the_depths_of_one_surface(step: int, window: int) -> None:
+    rng = np.random.default_rng(step)
+    height, width, fx, fy, cx, cy = 24, 36, 30.0, 32.0, 17.3, 11.6
+    v, u = np.indices((height, width))
+    inverse = np.where(u < 14, 0.5 + 0.004 * v, 0.3 + 0.002 * (u - 14))  # two surfaces
+    inverse[:, 26:] += 0.05 * (u[:, 26:] - 26)  # and one that is nearly seen edge-on
+    depth = (1.0 / (inverse * (1 + 0.004 * rng.standard_normal(inverse.shape)))).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.3] = 0
+    depth[:8, :8] *= rng.random((8, 8)) < 0.15
+    points, normals = fit_planes(depth, step, window, fx, fy, cx, cy)
+    refused = 0
+    for i, j in np.ndindex(height // step, width // step):
+        plane = plane_at(depth, i, j, step, window)
+        expected, normal = np.zeros(3), np.zeros(3)
+        if plane is not None:
+            a, b, c = plane
+            x, y = ((j * step + 0.5 * (step - 1)) - cx) / fx, ((i * step + 0.5 * (step - 1)) - cy) / fy
+            across = np.array((b * fx, c * fy, a - b * fx * x - c * fy * y))  # n . X = 1 on the plane
+            point = np.array((x, y, 1.0)) / a
+            if 1.0 / (np.linalg.norm(across) * np.linalg.norm(point)) >= 0.12:
+                expected, normal = point, across / np.linalg.norm(across)
+        np.testing.assert_allclose(points[i, j], expected, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(normals[i, j], normal, atol=1e-4)
+        refused += expected[2] == 0
+    assert 0.03 < refused / points[..., 0].size < 0.9
 
 
 def test_holes_and_depth_that_is_missing_altogether() -> None:

@@ -19,7 +19,7 @@ from ...core.transforms import back_project, invert
 from ...core.types import FREE, UNKNOWN, Frame, Intrinsics
 from ...settings.option_types import NotNegativeInt, PositiveInt
 from ...settings.typed_options import TypedOptions
-from .. import base, builtin_room
+from .. import base, builtin_room, room_shading
 from ..camera_files import read_given_calibration
 
 REQUIRES: tuple[str, ...] = ("open3d",)
@@ -29,6 +29,15 @@ PATH = "builtin:room"
 _RATE_HZ = 30.0
 _FOCAL_PER_WIDTH = 0.82  # a field of view of 63 degrees
 _NEAREST_M = 0.3  # a depth camera measures nothing nearer
+_JAGGED = 0.2  # share of edge pixels that take a neighbor's depth, each way
+_EDGE_HOLES = 0.5  # share of edge pixels without depth
+_MILLIMETERS = 1000  # per meter: depth is rounded to whole ones
+_EXPOSURE, _EXPOSURE_RATE = 0.04, 0.05  # amplitude of the exposure, and its phase per frame, radians
+_GRAY_NOISE = 2.0  # standard deviation, gray levels
+_HALF_PIXEL, _FLATTEST = 0.75, 0.1
+"""Largest distance from a surface point to the center of its pixel, in pixels, rounded up from 0.71; and the cosine of
+the flattest view for which the change of depth over this distance is taken."""
+
 _EDGE = 0.05  # relative depth step at which the sensor's two views disagree
 _GRAZING = 0.10, 0.22  # cosines of incidence below which all, and the first, pixels are lost
 
@@ -199,7 +208,7 @@ class Reader(base.Capture):
         r = self._room
         footprint = view.depth_m / np.float32(self.camera.fx) / np.maximum(view.cosine, np.float32(0.3))
         flat = view.points.reshape(-1, 3), view.triangle.ravel(), footprint.ravel()
-        return builtin_room.shade(*flat, r.textures, r.colors, r.scales, r.normals).reshape(*view.depth_m.shape, 3)
+        return room_shading.shade(*flat, r.textures, r.colors, r.scales, r.normals).reshape(*view.depth_m.shape, 3)
 
     def _surface(self, spacing: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
         """Random points on all triangles, one per ``spacing``² m²: (P, 3) world points, (P, 3) normals, (P,) class
@@ -254,21 +263,21 @@ def disturbed_depth(
     """Add sensor errors to (H, W) exact depth: jagged edges, axial noise, rounding to millimeters, and holes (0) at
     edges, at grazing incidence and nearer than 0.3 m. cosine: (H, W) cosine of the angle of incidence."""
     height, width = depth_m.shape
-    shift = rng.integers(-1, 2, (2, height, width)) * (rng.random((2, height, width), np.float32) < 0.2)
+    shift = rng.integers(-1, 2, (2, height, width)) * (rng.random((2, height, width), np.float32) < _JAGGED)
     rows = np.clip(np.arange(height)[:, None] + shift[0], 0, height - 1)
     columns = np.clip(np.arange(width)[None] + shift[1], 0, width - 1)
     edges = _edges(depth_m)
     noisy = np.where(edges, depth_m[rows, columns], depth_m)
     noisy = noisy + compute_sensor_sigma(noisy) * rng.standard_normal(noisy.shape, np.float32)
-    chance = np.where(edges, 0.5, np.clip((_GRAZING[1] - cosine) / (_GRAZING[1] - _GRAZING[0]), 0, 1))
+    chance = np.where(edges, _EDGE_HOLES, np.clip((_GRAZING[1] - cosine) / (_GRAZING[1] - _GRAZING[0]), 0, 1))
     holes = (rng.random(depth_m.shape, np.float32) < chance) | (depth_m < _NEAREST_M)
-    return np.where(holes, 0, np.rint(noisy * 1000) / 1000).astype(np.float32)
+    return np.where(holes, 0, np.rint(noisy * _MILLIMETERS) / _MILLIMETERS).astype(np.float32)
 
 
 def _disturbed_color(color: NDArray[np.uint8], index: int, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Add noise of two gray levels, and an exposure that varies slowly by 4 %."""
-    exposure = np.float32(1.0 + 0.04 * math.sin(0.05 * index))
-    noisy = color * exposure + 2.0 * rng.standard_normal(color.shape, np.float32)
+    exposure = np.float32(1.0 + _EXPOSURE * math.sin(_EXPOSURE_RATE * index))
+    noisy = color * exposure + _GRAY_NOISE * rng.standard_normal(color.shape, np.float32)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
@@ -318,6 +327,7 @@ def _mark_seen(
             cosine = facing / math.sqrt(cx * cx + cy * cy + cz * cz)
             if cosine <= 0:
                 continue
-            tolerance = 0.75 * cz / K[0, 0] / max(cosine, 0.1)  # change of the surface's depth within a pixel
+            # the change of the surface's depth within a pixel
+            tolerance = _HALF_PIXEL * cz / K[0, 0] / max(cosine, _FLATTEST)
         if cz <= depth_m[row, column] + tolerance and depth_m[row, column] > 0:
             seen[p] = True

@@ -23,7 +23,25 @@ WIDTH = 160
 """Approximate width of views, pixels."""
 
 _LEVELS = 3
-_WINDOW = 6  # full-size pixels on each side of a center for the plane fit, at an image width of 640
+_SMOOTHED = 0.6  # pixels: standard deviation of the blur of the intensities
+_WINDOW, _WINDOW_WIDTH = 6, 640
+"""Full-size pixels on each side of a center for the plane fit, at this image width."""
+
+_SAME_SURFACE, _ON_PLANE = 0.04, 0.012
+"""Largest differences of inverse depths, as shares: from the depth nearest to the center for the first fit, and from
+the first plane for the second fit."""
+
+_LEAST_FITTED = 8
+"""Smallest number of depths for the plane fit, which has three unknowns."""
+
+_LEAST_SPREAD = 0.02
+"""Smallest determinant of the covariance of the fitted pixels, as a share of w^4 / 9, that of a full window. With
+less, pixels are in a corner of the window or nearly on a line, and do not determine the plane's tilt."""
+
+_LEAST_FACING = 0.12
+"""Smallest cosine between a plane's normal and the ray to it, 83 degrees: at a flatter angle, depth is mostly noise."""
+
+_FARTHER = 1e9  # squared pixels: more than any distance; finite, because ``fastmath`` excludes infinity
 
 
 @dataclass(frozen=True)
@@ -66,11 +84,11 @@ def prepare_alignment_view(frame: Frame) -> AlignmentView:
     small = Intrinsics(
         w, h, camera.fx / step, camera.fy / step, (camera.cx + 0.5) / step - 0.5, (camera.cy + 0.5) / step - 0.5
     )
-    window = max(2, round(_WINDOW * camera.width / 640))
+    window = max(2, round(_WINDOW * camera.width / _WINDOW_WIDTH))
     points, normals = fit_planes(frame.depth_m, step, window, camera.fx, camera.fy, camera.cx, camera.cy)
     gray = cv2.cvtColor(frame.color[: h * step, : w * step], cv2.COLOR_RGB2GRAY)
     gray = cv2.resize(gray, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
-    pyramid = [cv2.GaussianBlur(gray, (3, 3), 0.6)]
+    pyramid = [cv2.GaussianBlur(gray, (3, 3), _SMOOTHED)]
     for _ in range(_LEVELS - 1):
         pyramid.append(cv2.pyrDown(pyramid[-1]))
     return AlignmentView(small, points, normals, _average_sigma(frame, step), tuple(pyramid))
@@ -103,7 +121,7 @@ def fit_planes(
         for j in range(w):
             u0 = j * step + 0.5 * (step - 1)
             near = 0.0
-            best = 1e9
+            best = _FARTHER
             for v in range(i * step, min(i * step + step, H)):
                 for u in range(j * step, min(j * step + step, W)):
                     d = (u - u0) ** 2 + (v - v0) ** 2
@@ -115,7 +133,7 @@ def fit_planes(
             a, b, c = near, 0.0, 0.0
             good = False
             for sweep in range(2):
-                allowed = 0.04 * near if sweep == 0 else 0.012 * near
+                allowed = _SAME_SURFACE * near if sweep == 0 else _ON_PLANE * near
                 n = suu = svv = suv = su = sv = 0.0
                 sw = swu = swv = 0.0
                 for v in range(max(0, int(v0) - window + 1), min(H, int(v0) + window + 1), stride):
@@ -137,14 +155,14 @@ def fit_planes(
                         sw += inverse
                         swu += inverse * du
                         swv += inverse * dv
-                if n < 8:
+                if n < _LEAST_FITTED:
                     good = False
                     break
                 mu, mv, mw = su / n, sv / n, sw / n
                 uu, vv, uv = suu / n - mu * mu, svv / n - mv * mv, suv / n - mu * mv
                 wu, wv = swu / n - mw * mu, swv / n - mw * mv
                 det = uu * vv - uv * uv
-                if det < 0.02 * window**4 / 9:
+                if det < _LEAST_SPREAD * window**4 / 9:
                     good = False
                     break
                 b = (wu * vv - wv * uv) / det
@@ -158,7 +176,7 @@ def fit_planes(
             nx, ny, nz = b * fx, c * fy, a + b * (cx - u0) + c * (cy - v0)
             length = math.sqrt(nx * nx + ny * ny + nz * nz)
             grazing = 1.0 / (length * math.sqrt(x * x + y * y + z * z))  # n . X = 1
-            if grazing < 0.12:
+            if grazing < _LEAST_FACING:
                 continue
             points[i, j, 0], points[i, j, 1], points[i, j, 2] = x, y, z
             normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = nx / length, ny / length, nz / length

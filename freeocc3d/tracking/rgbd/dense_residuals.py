@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ...core.depth_noise import look_up_sigma
+from ...core.depth_noise import MAD_TO_SIGMA, look_up_sigma
 
 NEAREST_M = 0.1
 """Smallest distance of a point in front of the target's camera, meters. Nearer, projection is unstable."""
@@ -42,9 +42,6 @@ SAME_SURFACE = 6.0
 
 GRAY_SIGMA = 0.01
 """Expected standard deviation of intensities 0…1: noise and rounding of 8-bit images, two to three steps."""
-
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a Gaussian over the median of its absolute value, 1 / Phi^-1(3/4)."""
 
 LEAST_SPREAD = (0.5, 0.3)
 """Smallest s of the depth and intensity residuals; with smaller values, single pixels would decide."""

@@ -24,10 +24,17 @@ PAIRS = 36
 """Number of pairs of frames to compare."""
 
 _GAPS = (24, 12, 6, 3)
+"""Frames between the two of a pair, those that are tried first first: the longer the way, the more it tells."""
+
 _RATIOS = np.exp(np.linspace(np.log(0.8), np.log(1.25), 46))
+"""Ratios of the color and depth focal lengths to try: up to a quarter larger or smaller, in steps of 1 %."""
+
+_PAIR_PX = 6.0  # largest reprojection error of a match: twice the usual one, because the focal length may be wrong
+_PAIR_OVERLAP, _PAIR_INLIERS = 0.6, 0.75  # smallest overlap of a pair, and share of it on the other's surface
+_PAIR_MOVED = 0.02  # meters or degrees: without motion, the focal length has no effect
 _LEAST_CHANGE = 0.015  # relative change of the focal length; smaller ones are within the accuracy of a scan
 _LEAST_GAIN = 0.15  # relative decrease of the error; a clear minimum has more
-_LEAST_PAIRS, _LEAST_MATCHES = 8, 500
+_LEAST_PAIRS, _LEAST_MATCHES = 8, 500  # the smallest numbers; with fewer, the ratio is 1
 _FAR_PX = 3.0  # a match with a larger error counts as wrong
 
 
@@ -67,12 +74,13 @@ def _pair(capture: Capture, frames: range) -> _Pair | None:
         if target is None or source is None:
             continue
         found = match_keyframes(source, target)
-        guess = orb_features.estimate_pose(found.points_s, found.rays_t, 1.0 / target.camera.fx, threshold_px=6.0)
+        guess = orb_features.estimate_pose(found.points_s, found.rays_t, 1.0 / target.camera.fx, threshold_px=_PAIR_PX)
         if guess is None:
             continue
         aligned = dense_alignment.align_views(source.view, target.view, guess[0], photometric=0.0)
         moved = max(measure_pose_difference(np.eye(4), aligned.T_target_source))
-        if aligned.determined and aligned.overlap > 0.6 and aligned.inliers > 0.75 and moved > 0.02:
+        alike = aligned.determined and aligned.overlap > _PAIR_OVERLAP and aligned.inliers > _PAIR_INLIERS
+        if alike and moved > _PAIR_MOVED:
             return source, target, aligned.T_target_source, orb_features.match_binary(source.features, target.features)
     return None
 

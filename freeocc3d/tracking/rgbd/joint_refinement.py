@@ -28,7 +28,7 @@ from .dense_residuals import Weighting, linearize, make_equations
 from .keyframe_registration import FeatureMatches, KeyframeView, match_keyframes
 
 _STRIDE = 2  # step between source pixels: neighboring pixels carry nearly the same information
-_LEAST_SHARE, _LEAST_CORRELATION = 0.5, 0.5
+_LEAST_SHARE, _LEAST_CORRELATION = 0.5, 0.5  # of pixels on the surface, and of intensities; below them a pair disagrees
 _STILL, _FAR_M = 5e-5, 0.02  # a step that ends the iteration; a motion after which other pairs may overlap
 _PRIOR = 1.0  # information that holds a keyframe without pairs
 _DAMPING = 1e-4  # share of its own information that holds every keyframe, to bound a step
@@ -36,6 +36,8 @@ _FIXED = 1e15  # information of the first keyframe, which stays
 _FIRST_SPREADS = (3.0, 5.0)  # initial spreads of the residuals, after tracking has aligned the keyframes once
 _LEAST_IN_VIEW = 0.05  # share of the source's pixels that must lie in the target's view
 _AGREEMENT_POWER = 4  # exponent of the agreement in the weight of the intensities
+_CANDIDATES = 4  # number of candidates per chosen neighbor
+_UNKNOWNS = 6  # of a pose: rotation, translation
 
 
 @dataclass
@@ -94,7 +96,7 @@ def find_overlapping_pairs(
     centers = np.stack([_seen(keyframe, pose) for keyframe, pose in zip(keyframes, T, strict=True)])
     for n in range(1, len(T)):
         # If views overlap, the middles of their scenes are near each other: measure only these pairs.
-        near = np.argsort(np.linalg.norm(centers[:n] - centers[n], axis=1), kind="stable")[: 4 * neighbors]
+        near = np.argsort(np.linalg.norm(centers[:n] - centers[n], axis=1), kind="stable")[: _CANDIDATES * neighbors]
         T_n_world = invert(T[n])
         shared = [
             (measure_mutual_overlap(keyframes[m].overlap, keyframes[n].overlap, T_n_world @ T[m]), int(m)) for m in near
@@ -132,7 +134,7 @@ def _terms(
         agreement = (correlation - _LEAST_CORRELATION) / (1 - _LEAST_CORRELATION)
         pair.weighting = pair.weighting._replace(photometric=dense_alignment.PHOTOMETRIC * agreement**_AGREEMENT_POWER)
     damping = dense_alignment.BRIGHTNESS_DAMPING * np.eye(2)
-    pair.weighting.brightness[:] += np.linalg.solve(H8[6:, 6:] + damping, -g8[6:])
+    pair.weighting.brightness[:] += np.linalg.solve(H8[_UNKNOWNS:, _UNKNOWNS:] + damping, -g8[_UNKNOWNS:])
     H, g, _ = dense_alignment.remove_undetermined(*dense_alignment.eliminate_brightness(H8, g8))
     orb_features.add_reprojection(pair.matched.points_s, pair.matched.rays_t, T_ts, target.camera.fx, H, g)
     A = _adjoint(T_target_world)
@@ -144,28 +146,28 @@ def _solve(
 ) -> NDArray[np.float64]:
     """(K, 6) steps of all keyframes; the first keyframe stays."""
     if not pairs:
-        return np.zeros((count, 6))
+        return np.zeros((count, _UNKNOWNS))
     blocks = np.stack([H for H, _ in terms])
     source, target = (np.array([getattr(pair, end) for pair in pairs]) for end in ("source", "target"))
     row = np.concatenate((source, target, source, target))
     column = np.concatenate((source, target, target, source))
     values = np.concatenate((blocks, blocks, -blocks, -blocks))
-    inside = np.arange(6)
-    rows = np.broadcast_to(6 * row[:, None, None] + inside[:, None], values.shape)
-    columns = np.broadcast_to(6 * column[:, None, None] + inside[None, :], values.shape)
-    M = csc_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=(6 * count, 6 * count))
-    g = np.zeros((count, 6))
+    inside = np.arange(_UNKNOWNS)
+    rows = np.broadcast_to(_UNKNOWNS * row[:, None, None] + inside[:, None], values.shape)
+    columns = np.broadcast_to(_UNKNOWNS * column[:, None, None] + inside[None, :], values.shape)
+    M = csc_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=(_UNKNOWNS * count,) * 2)
+    g = np.zeros((count, _UNKNOWNS))
     np.add.at(g, source, np.stack([term for _, term in terms]))
     np.add.at(g, target, -np.stack([term for _, term in terms]))
     hold = _PRIOR + _DAMPING * M.diagonal()
-    hold[:6] = _FIXED
-    return np.asarray(spsolve(M + diags(hold), -g.ravel())).reshape(count, 6)
+    hold[:_UNKNOWNS] = _FIXED
+    return np.asarray(spsolve(M + diags(hold), -g.ravel())).reshape(count, _UNKNOWNS)
 
 
 def _adjoint(T: NDArray[np.float64]) -> NDArray[np.float64]:
     """(6, 6) with T exp(xi) T^-1 = exp(Ad(T) xi), rotation before translation."""
     R, t = T[:3, :3], T[:3, 3]
-    A = np.zeros((6, 6))
+    A = np.zeros((_UNKNOWNS, _UNKNOWNS))
     A[:3, :3] = A[3:, 3:] = R
     A[3:, :3] = np.cross(t, R, axisb=0, axisc=0)
     return A

@@ -14,7 +14,7 @@ from ..overlap import DepthView
 from . import dense_alignment, orb_features
 from .alignment_views import AlignmentView, prepare_alignment_view
 
-_OVERLAP_STEP = 5
+_OVERLAP_STEP = 5  # pixels of an alignment view between sampled points for the overlap
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,19 @@ CANDIDATES = 4
 """Number of most similar keyframes to compare each keyframe with."""
 
 _LEAST_SIMILAR = 0.15
+"""Smallest cosine between the histograms of visual words of two compared keyframes."""
+
 _BETWEEN = 3  # smallest number of keyframes on the path between two compared ones
-_FEATURES, _SAMPLE = 20, 300
+_FEATURES = 20
+"""Smallest number of features that agree on a pose: nearly twice what a pose needs, because a closure bends the map."""
+
+_SAMPLE = 300  # features of each frame for ranking keyframes: enough for an order
 _LEAST_OVERLAP, _LEAST_INLIERS, _LEAST_CORRELATION = 0.35, 0.75, 0.7
+"""Smallest values for the dense alignment of a closure: share of the view in common, share of it on the other's
+surface, and correlation of the intensities. Stricter than in tracking, where the frame before supports a pose."""
+
 _NEAR_M, _NEAR_DEG = 0.10, 4.0
+"""Largest motion by dense alignment of a pose from features, or of a neighbor's pose that the closure predicts."""
 
 
 def find_closures(

@@ -16,10 +16,32 @@ from numpy.typing import NDArray
 
 from ...core.types import Frame, Intrinsics
 from .alignment_views import AlignmentView
+from .dense_residuals import NEAREST_M
 
 COUNT = 800
-_MIN_INLIERS = 12
+"""Largest number of features of a frame."""
+
+_PYRAMID_SCALE, _PYRAMID_LEVELS = 1.2, 8
+"""Ratio of consecutive image sizes in the search for corners, and number of sizes: OpenCV's defaults."""
+
+_FAST_THRESHOLD = 10
+"""Steps of 8 bits by which a corner differs from the pixels around it: half of OpenCV's 20, for dim rooms."""
+
+_NEAREST_DESCRIPTORS = 64
+"""Descriptors of one point differ in fewer of their 256 bits; those of different points differ in about 128."""
+
+_ALONG_PLANE = 1e-6  # cosine times length: with less, a ray is parallel to the plane
+_OFF_CENTER = 0.05
+"""Largest difference between a plane's depth on a ray and that at the pixel's center, as a share of the latter. A
+plane with more is at grazing incidence."""
+
+_MIN_INLIERS = 12  # smallest number of matches that agree with a pose: a wrong pose has fewer
+_CONFIDENCE = 0.999  # that RANSAC has drawn a sample without wrong matches; it stops then
 _FARTHEST_PX, _AGREES_PX = 12.0, 4.0
+"""Reprojection errors, pixels: beyond the first, a match is wrong and does not count; below the second, it agrees."""
+
+_GEMAN_MCCLURE_PX = 3.0
+"""Reprojection error, pixels, at which a match's weight falls to a quarter (``dense_residuals``)."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +60,9 @@ class OrbFeatures:
 def detect_features(frame: Frame, count: int = COUNT) -> OrbFeatures:
     """Detect the strongest corners of a frame, spread over the image."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-    orb = cv2.ORB_create(nfeatures=count, scaleFactor=1.2, nlevels=8, fastThreshold=10)
+    orb = cv2.ORB_create(
+        nfeatures=count, scaleFactor=_PYRAMID_SCALE, nlevels=_PYRAMID_LEVELS, fastThreshold=_FAST_THRESHOLD
+    )
     points, descriptors = orb.detectAndCompute(gray, None)
     if descriptors is None:
         return OrbFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
@@ -55,9 +79,9 @@ def lift_rays(rays: NDArray[np.float32], view: AlignmentView) -> NDArray[np.floa
     q, n = view.points[v, u], view.normals[v, u]
     directions = np.concatenate((rays, np.ones((len(rays), 1), np.float32)), axis=1)
     along = (n * directions).sum(axis=1)
-    known = inside & (q[:, 2] > 0) & (np.abs(along) > 1e-6)
+    known = inside & (q[:, 2] > 0) & (np.abs(along) > _ALONG_PLANE)
     z = np.where(known, (n * q).sum(axis=1) / np.where(known, along, 1.0), 0.0)
-    z = np.where(np.abs(z - q[:, 2]) < 0.05 * q[:, 2], z, 0.0)  # a plane at grazing incidence is unreliable
+    z = np.where(np.abs(z - q[:, 2]) < _OFF_CENTER * q[:, 2], z, 0.0)  # a plane at grazing incidence is unreliable
     return (directions * z[:, None]).astype(np.float32)
 
 
@@ -66,7 +90,9 @@ def match_binary(a: OrbFeatures, b: OrbFeatures) -> NDArray[np.int64]:
     if not len(a.pixels) or not len(b.pixels):
         return np.zeros((0, 2), np.int64)
     found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(a.descriptors, b.descriptors)
-    return np.array([(m.queryIdx, m.trainIdx) for m in found if m.distance < 64], np.int64).reshape(-1, 2)
+    return np.array([(m.queryIdx, m.trainIdx) for m in found if m.distance < _NEAREST_DESCRIPTORS], np.int64).reshape(
+        -1, 2
+    )
 
 
 def estimate_pose(
@@ -83,7 +109,7 @@ def estimate_pose(
     cv2.setRNGSeed(1)
     good, rotation, translation, inliers = cv2.solvePnPRansac(
         points_s.astype(np.float64), rays_t.astype(np.float64), np.eye(3), None, iterationsCount=iterations,
-        reprojectionError=threshold_px * pixel, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
+        reprojectionError=threshold_px * pixel, confidence=_CONFIDENCE, flags=cv2.SOLVEPNP_AP3P,
     )  # fmt: skip
     if not good or inliers is None or len(inliers) < _MIN_INLIERS:
         return None
@@ -120,7 +146,7 @@ def add_reprojection(
         x = T[0, 0] * points_s[m, 0] + T[0, 1] * points_s[m, 1] + T[0, 2] * points_s[m, 2] + T[0, 3]
         y = T[1, 0] * points_s[m, 0] + T[1, 1] * points_s[m, 1] + T[1, 2] * points_s[m, 2] + T[1, 3]
         z = T[2, 0] * points_s[m, 0] + T[2, 1] * points_s[m, 1] + T[2, 2] * points_s[m, 2] + T[2, 3]
-        if z < 0.1:
+        if z < NEAREST_M:
             continue
         eu = focal * (x / z - rays_t[m, 0])
         ev = focal * (y / z - rays_t[m, 1])
@@ -129,7 +155,7 @@ def add_reprojection(
             continue
         if off < _AGREES_PX:
             agree += 1
-        weight = 1.0 / (1.0 + (off / 3.0) ** 2) ** 2
+        weight = 1.0 / (1.0 + (off / _GEMAN_MCCLURE_PX) ** 2) ** 2
         f = focal / z
         du0, du2 = f, -f * x / z
         dv1, dv2 = f, -f * y / z

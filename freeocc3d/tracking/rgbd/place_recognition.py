@@ -15,6 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 _WORDS, _SAMPLE, _ROUNDS = 512, 20_000, 6
+"""Largest number of visual words, number of descriptors to learn them from, and rounds of k-means."""
+
+_TINY = 1e-9  # avoids division by the length of a zero vector
 
 
 class Vocabulary:
@@ -30,7 +33,7 @@ class Vocabulary:
             order = np.argsort(nearest, kind="stable")
             used, first = np.unique(nearest[order], return_index=True)
             words[used] = np.add.reduceat(sample[order], first, axis=0)
-            words /= np.maximum(np.linalg.norm(words, axis=1, keepdims=True), 1e-9)
+            words /= np.maximum(np.linalg.norm(words, axis=1, keepdims=True), _TINY)
         self._words = words
 
     def histogram(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -45,7 +48,7 @@ def compare_histograms(histograms: NDArray[np.float32]) -> NDArray[np.float32]:
     """(K, K) cosine of K keyframes' (K, W) histograms, square-rooted and weighted by inverse document frequency."""
     occurs = np.maximum((histograms > 0).sum(axis=0), 1)
     weighted = np.sqrt(histograms) * np.log(1 + len(histograms) / occurs)
-    weighted /= np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-9)
+    weighted /= np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), _TINY)
     return np.asarray(weighted @ weighted.T, np.float32)
 
 

@@ -14,7 +14,10 @@ from ...core.errors import FrameError
 from ...core.progress import Progress
 
 _WIDTH = 320  # motion and sharpness are measured in images of this width
-_CORNERS, _LEAST_FOLLOWED = 150, 20
+_CORNERS, _CORNER_QUALITY, _CORNER_DISTANCE = 150, 0.01, 8
+"""Largest number of corners; smallest strength relative to the strongest; smallest distance between two, pixels."""
+
+_LEAST_FOLLOWED, _LEAST_FOLLOWED_SHARE = 20, 0.3  # smallest number and share of tracked corners; below, tracking fails
 _LOST = 0.25  # of the width: the motion that counts if tracking fails
 _ASTRAY_PX = 1.0  # largest error of a corner that is tracked forth and back
 _CREEP = 1e-4  # of the width: least motion, so that a resting camera advances too
@@ -57,14 +60,14 @@ def measure_sharpness(gray: NDArray[np.uint8]) -> float:
 
 def measure_motion(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
     """Median motion of corners from one (H, W) gray image to the next, as a share of the width."""
-    corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 8)
+    corners = cv2.goodFeaturesToTrack(before, _CORNERS, _CORNER_QUALITY, _CORNER_DISTANCE)
     if corners is None or len(corners) < _LEAST_FOLLOWED:
         return _LOST
     followed, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, followed, None)
     astray = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
     found = (found.ravel() == 1) & (returned.ravel() == 1) & (astray < _ASTRAY_PX)
-    if found.sum() < max(_LEAST_FOLLOWED, 0.3 * len(corners)):
+    if found.sum() < max(_LEAST_FOLLOWED, _LEAST_FOLLOWED_SHARE * len(corners)):
         return _LOST
     way = np.linalg.norm((followed - corners).reshape(-1, 2)[found], axis=1)
     return min(float(np.median(way)) / before.shape[1], _LOST)

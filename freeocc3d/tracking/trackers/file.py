@@ -23,7 +23,10 @@ from ..rgbd.keyframe_registration import decode_keyframe_view
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 
-_PAIRS, _LEAST_PAIRS = 24, 6
+_PAIRS, _LEAST_PAIRS = 24, 6  # pairs of frames to measure the scale with, and the smallest number that gives one
+_GAPS = (12, 6, 3, 1)  # frames between the two of a pair, in the order to try them
+_LEAST_MATCHES = 20  # smallest number of a pair's matches with depth on both sides
+_AGREES, _AGREEING = 0.5, 0.5  # largest error of a match, relative to a pair's motion; smallest share of such matches
 _LEAST_STEP = 0.05  # of the depth: frames that are nearer to each other give no reliable scale
 _TOLERATED = 1.1  # largest ratio of the stated and the measured scale, either way
 _CELL = 8  # pixels: within a cell, a cloud's points hide those behind them
@@ -151,7 +154,7 @@ def estimate_depth_scale(T_world_cam: NDArray[np.float64], capture: Capture) -> 
 
 def _pair_scale(T_world_cam: NDArray[np.float64], capture: Capture, frames: NDArray[np.int64]) -> float | None:
     target = decode_keyframe_view(capture, int(frames[0]))
-    for gap in (12, 6, 3, 1):
+    for gap in _GAPS:
         source = decode_keyframe_view(capture, int(frames[gap])) if target is not None and gap < len(frames) else None
         if target is None or source is None:
             continue
@@ -161,12 +164,12 @@ def _pair_scale(T_world_cam: NDArray[np.float64], capture: Capture, frames: NDAr
         T = invert(T_world_cam[frames[0]]) @ T_world_cam[frames[gap]]
         t = T[:3, 3]
         moved = p_t[known] - p_s[known] @ T[:3, :3].T  # scale * t, where poses and matches are right
-        if len(moved) < 20 or t @ t == 0:
+        if len(moved) < _LEAST_MATCHES or t @ t == 0:
             continue
         along = moved @ t / (t @ t)
         scale = float(np.median(along))
         far = scale * np.linalg.norm(t) > _LEAST_STEP * np.median(p_t[known, 2])
-        agrees = np.linalg.norm(moved - scale * t, axis=1) < 0.5 * abs(scale) * np.linalg.norm(t)
-        if scale > 0 and far and agrees.mean() > 0.5:
+        agrees = np.linalg.norm(moved - scale * t, axis=1) < _AGREES * abs(scale) * np.linalg.norm(t)
+        if scale > 0 and far and agrees.mean() > _AGREEING:
             return scale
     return None

@@ -16,12 +16,18 @@ from ...core.transforms import invert, nearest_rigid
 from ...core.types import Frame, Intrinsics
 from ...settings.option_types import Advanced, Finite, NotNegativeInt, Positive, PositiveInt
 from .. import pose_graph
-from ..base import KeyframeOptions, Tracked, Tracker
+from ..base import LEAST_COVERED, KeyframeOptions, Tracked, Tracker
 from ..overlap import DepthView, measure_mutual_overlap, sample_points
 from ..pose_graph import Edge
 from ..records import Records
 
 REQUIRES: tuple[str, ...] = ("open3d",)
+
+_DEPTH_SCALE, _FARTHEST_M = 1.0, 1000.0
+"""Units of the depth images per meter, and Open3D's largest depth: beyond all depths, which the reader limits."""
+
+_HUBER_DEPTH, _HUBER_INTENSITY = 0.05, 0.1
+"""Residuals, meters and intensities 0…1, above which Huber's loss is linear: Open3D's defaults."""
 
 
 class Options(KeyframeOptions, frozen=True):
@@ -113,7 +119,7 @@ class OdometryTracker(Tracker):
         self.records.T_world_keyframe = pose_graph.optimize(self.records.T_world_keyframe, self.edges)
 
     def _start(self, index: int, view: _View) -> Tracked:
-        if np.count_nonzero(view.depth_m) < 0.05 * view.depth_m.size:
+        if np.count_nonzero(view.depth_m) < LEAST_COVERED * view.depth_m.size:
             self.records.add_lost(index)
             return Tracked("lost", None, 0.0)
         self.records.add_keyframe(index, np.eye(4), 1.0)
@@ -138,15 +144,15 @@ class OdometryTracker(Tracker):
         odometry = o3d.t.pipelines.odometry
         failed = _Match(T_target_source, np.eye(6), 0.0, ok=False)
         valid = np.count_nonzero(source.depth_m) / source.depth_m.size
-        if valid < 0.05:
+        if valid < LEAST_COVERED:
             return failed
         K = o3d.core.Tensor(source.intrinsics.matrix)
         try:
             result = odometry.rgbd_odometry_multi_scale(
-                source.rgbd, target.rgbd, K, o3d.core.Tensor(T_target_source), 1.0, 1000.0,
+                source.rgbd, target.rgbd, K, o3d.core.Tensor(T_target_source), _DEPTH_SCALE, _FARTHEST_M,
                 [odometry.OdometryConvergenceCriteria(n) for n in self.options.iterations],
                 odometry.Method.Hybrid,
-                odometry.OdometryLossParams(self.options.depth_difference, 0.05, 0.1),
+                odometry.OdometryLossParams(self.options.depth_difference, _HUBER_DEPTH, _HUBER_INTENSITY),
             )  # fmt: skip
         except RuntimeError:  # a singular system: there is nothing to align
             return failed
@@ -156,7 +162,7 @@ class OdometryTracker(Tracker):
             return failed
         information = odometry.compute_odometry_information_matrix(
             source.rgbd.depth, target.rgbd.depth, K, result.transformation,  # type: ignore[attr-defined]
-            self.options.depth_difference, 1.0, 1000.0,
+            self.options.depth_difference, _DEPTH_SCALE, _FARTHEST_M,
         ).cpu().numpy()  # fmt: skip
         weakest = np.linalg.eigvalsh(information)[0] / max(information[5, 5], 1.0)
         return _Match(nearest_rigid(T), information, fitness, ok=bool(weakest >= self.options.min_information))

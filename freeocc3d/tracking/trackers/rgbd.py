@@ -14,7 +14,7 @@ from ...core.transforms import invert, measure_pose_difference
 from ...core.types import Frame
 from ...settings.option_types import Advanced, Positive, PositiveInt
 from .. import pose_graph
-from ..base import KeyframeOptions, Tracked, Tracker
+from ..base import LEAST_COVERED, KeyframeOptions, Tracked, Tracker
 from ..overlap import DepthView, measure_mutual_overlap
 from ..pose_graph import Edge
 from ..records import Records
@@ -30,16 +30,17 @@ from ..rgbd.keyframe_registration import (
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 
-_LEAST_COVERED = 0.05  # smallest share of pixels with a surface to track
 _LEAST_OVERLAP, _LEAST_INLIERS, _LEAST_CORRELATION = 0.3, 0.6, 0.5  # the smallest; below them the frame is lost
 _CONFIRMED_OVERLAP, _CONFIRMED_M, _CONFIRMED_DEG = 0.15, 0.15, 8.0  # features and surfaces agree
-_RECOGNIZED_OVERLAP = 0.5
+_RECOGNIZED_OVERLAP = 0.5  # smallest overlap at which a sure alignment alone recovers a lost frame
 _SURE_INLIERS, _SURE_CORRELATION = 0.75, 0.96  # below them features are matched too
-_LIKELY_CORRELATION = 0.8
+_LIKELY_CORRELATION = 0.8  # smallest correlation of a likely pose
 _JUMP_M, _JUMP_DEG = 0.10, 6.0  # from the predicted pose; beyond it features are matched too
-_FEATURES = 20
+_FEATURES = 20  # smallest number of features that agree on one pose
 _DRAWS = 1000  # of RANSAC for a lost frame, which deserves more draws
 _RECENT = 4  # last keyframes to compare a lost frame with, besides similar ones
+_OLDER = 40  # approximate number of older keyframes, spread over the path, among which to look for similar ones
+_LEAST_SCORED = 0.1  # smallest correlation in a pose's score: uniform surfaces have none
 
 
 class Options(KeyframeOptions, frozen=True):
@@ -99,7 +100,7 @@ class RgbdTracker(Tracker):
 
     def track(self, frame: Frame) -> Tracked:
         view = prepare_alignment_view(frame)
-        if view.covered < _LEAST_COVERED:
+        if view.covered < LEAST_COVERED:
             return self._lose(frame.index)
         seen = _Seen(frame, view, sample_surface(view))
         if not self.keyframes:
@@ -173,7 +174,7 @@ class RgbdTracker(Tracker):
         if not len(described.pixels):
             return recent
         older = [row for row in range(last + 1) if row not in recent and row != self._current]
-        step = max(1, len(older) // 40)
+        step = max(1, len(older) // _OLDER)
         scored = [
             (loop_closures.count_common_features(described, self.keyframes[row].features), row) for row in older[::step]
         ]
@@ -252,7 +253,7 @@ def _likely(aligned: dense_alignment.ViewAlignment) -> bool:
 
 
 def _score(aligned: dense_alignment.ViewAlignment) -> float:
-    return aligned.inliers * max(np.nan_to_num(aligned.correlation), 0.1)
+    return aligned.inliers * max(np.nan_to_num(aligned.correlation), _LEAST_SCORED)
 
 
 def _confidence(aligned: dense_alignment.ViewAlignment) -> float:
