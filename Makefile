@@ -24,10 +24,9 @@ help:  ## list the targets
 quick: setup lint  ## style, types and the fast tests, in less than two minutes
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q $(QUICK)
 
-test: setup lint  ## style, types, all tests (which build the documentation), and the wheel
+test: setup lint  ## style, types and all tests, which build the documentation
 	@sh tools/test_clients.sh
 	$(BIN)/python -m pytest -n 2 --dist loadfile
-	$(BIN)/python tools/check_wheel.py
 
 lint: setup
 	$(BIN)/ruff check .
