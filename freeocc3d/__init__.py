@@ -42,6 +42,11 @@ os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
 __all__ = ["Map", "__version__", "load_map", "reconstruct"]
 
 
+def __dir__() -> list[str]:
+    """The names that completion offers; ``__getattr__`` alone would hide those that are not used yet."""
+    return sorted({*globals(), *__all__})
+
+
 def __getattr__(name: str) -> Any:
     """Each is imported when first used, so that asking for the version imports nothing."""
     if name == "reconstruct":

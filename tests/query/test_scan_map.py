@@ -67,3 +67,7 @@ def test_a_place_to_stand_is_reported_where_lengths_are_meters(saved, monkeypatc
     monkeypatch.setattr(loaded, "manifest", structs.replace(loaded.manifest, scale=MapScale(metric=False, by="none")))
     assert loaded.stand_of(region) is None
     assert loaded.stands_of([region, region]) == [None, None]
+
+
+def test_the_package_lists_its_names_before_they_are_used() -> None:
+    assert {"Map", "load_map", "reconstruct"} <= set(dir(freeocc3d))
