@@ -175,7 +175,14 @@ def load_saved(path: Path, overrides: Iterable[str] = ()) -> Settings:
 
 def resolve(values: Mapping[str, Any] | Settings) -> Settings:
     """Checks ``values`` and fills in all defaults. Raises ConfigError."""
-    return values if isinstance(values, Settings) else _resolve(values, saved=False)
+    if isinstance(values, Settings):
+        return values
+    if not isinstance(values, Mapping):
+        raise ConfigError(
+            f"Settings are a mapping of sections, such as {{'occupancy': {{'voxel_size': 0.05}}}}, got {values!r}. "
+            "freeocc3d.settings.config.load reads a file or a preset."
+        )
+    return _resolve(values, saved=False)
 
 
 def dump(settings: Settings) -> str:

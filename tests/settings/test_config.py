@@ -97,6 +97,12 @@ def test_what_is_wrong_is_named(values: dict[Any, Any], message: str) -> None:
         config.resolve(values)
 
 
+@pytest.mark.parametrize("given", ["mono", None, [], 5])
+def test_settings_that_are_no_mapping_are_refused(given: Any) -> None:
+    with pytest.raises(ConfigError, match="Settings are a mapping of sections"):
+        config.resolve(given)
+
+
 def test_values_come_from_the_file_and_overrides_win(tmp_path: Path) -> None:
     path = write(tmp_path / "c.yaml", "occupancy:\n  voxel_size: 0.05\n  cutoff: 4\ntracking:\n  backend: known\n")
     loaded = config.load(path, ["occupancy.voxel_size=0.1", "tracking.odometry.width=160", "capture.stop=null"])
