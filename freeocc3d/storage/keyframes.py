@@ -111,6 +111,11 @@ class Keyframes(Sequence[Frame]):
     def __iter__(self) -> Iterator[Frame]:
         return map(self._read, list(self._entries))
 
+    @property
+    def frames(self) -> list[int]:
+        """The capture's frame of each keyframe."""
+        return [int(entry["frame"]) for entry in self._entries]
+
     def views(self) -> list[tuple[Path, Intrinsics]]:
         """The color image's path and the camera of each keyframe. Decodes nothing."""
         return [(self._paths(int(entry["frame"]))[0], _camera(entry)) for entry in self._entries]

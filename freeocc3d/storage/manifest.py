@@ -217,6 +217,8 @@ def _problem(manifest: Manifest, folder: Path) -> str:
     lengths = np.array((manifest.voxel_size_m, manifest.finest_m, *manifest.origin, *manifest.up))
     if not np.isfinite(lengths).all():
         return "'voxel_size_m', 'finest_voxel_m', 'origin' or 'up' holds a number that is not finite"
+    if not 0 < manifest.scale.factor < np.inf:
+        return "'scale.factor' is not a finite number greater than 0"
     for name in ("T_world_map", "T_gravity_map"):
         T = getattr(manifest, name)
         if T is not None and not is_rigid(np.array(T)):

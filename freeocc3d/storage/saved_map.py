@@ -18,7 +18,7 @@ from ..core.tum_files import read_tum
 from ..core.types import Gaussians, Occupancy, Trajectory
 from ..settings import registry
 from .manifest import Manifest, read_manifest
-from .map_files import CONFIG, GAUSSIANS, KEYFRAMES, REPORT, TRAJECTORY
+from .map_files import CONFIG, GAUSSIANS, KEYFRAMES, MANIFEST, REPORT, TRAJECTORY
 from .occupancy_file import read_features, read_occupancy
 
 if TYPE_CHECKING:
@@ -138,7 +138,10 @@ class SavedMap:
         """The keyframes' images."""
         from .keyframes import Keyframes
 
-        return Keyframes.load(self.path / KEYFRAMES)
+        loaded = Keyframes.load(self.path / KEYFRAMES)
+        if loaded.frames != list(self.manifest.keyframes):
+            raise MapError(f"{self.path} is damaged: {MANIFEST} and the folder {KEYFRAMES} list different keyframes.")
+        return loaded
 
     @functools.cached_property
     def encoder(self) -> Encoder:
@@ -157,7 +160,13 @@ class SavedMap:
     def text_encoder(self) -> TextEncoder:
         """The text encoder that the map was made with."""
         encoder = self.manifest.encoder
-        restored: TextEncoder = registry.load("language.encoders", encoder.name).load_text(encoder.state)
+        module = registry.load("language.encoders", encoder.name)
+        try:
+            restored: TextEncoder = module.load_text(encoder.state)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise MapError(
+                f"{self.path / MANIFEST} is damaged: 'encoder.state' is not what the encoder '{encoder.name}' saves."
+            ) from error
         return restored
 
     @property

@@ -70,6 +70,8 @@ def test_a_map_from_before_scales_and_gravity_frames_is_read(tmp_path: Path) -> 
         ("files", {"../../secret": 1}, "secret, which lies outside"),
         ("T_world_map", (2 * np.eye(4)).tolist(), "'T_world_map' is not a rigid transform"),
         ("scale", {"factor": 2.0}, "'scale' lacks 'metric'"),
+        ("scale", {"metric": True, "factor": float("nan")}, r"'scale\.factor' is not a finite number"),
+        ("scale", {"metric": True, "factor": -1.0}, r"'scale\.factor' is not a finite number"),
         ("vocabulary", {"keyframes": [], "names": {"sofa": 3}}, "'vocabulary.names"),
     ],
 )

@@ -89,6 +89,19 @@ def test_a_damaged_manifest(copy) -> None:
         SavedMap.open(copy)
 
 
+@pytest.mark.parametrize("state", [None, "red", [], {}])
+def test_a_damaged_state_of_the_encoder_is_reported(copy, state) -> None:
+    edit(copy, encoder={"name": "labels", "state": state})
+    with pytest.raises(MapError, match=r"map\.yaml is damaged: 'encoder\.state'"):
+        _ = SavedMap.open(copy).text_encoder
+
+
+def test_a_manifest_with_other_keyframes_than_the_folder_is_reported(copy) -> None:
+    edit(copy, keyframes=[])
+    with pytest.raises(MapError, match="list different keyframes"):
+        _ = SavedMap.open(copy).keyframes
+
+
 def test_files_outside_the_folder_are_refused(copy) -> None:
     manifest = yaml.safe_load((copy / "map.yaml").read_text())
     edit(copy, files={**manifest["files"], "../../etc/passwd": 1})
