@@ -117,7 +117,10 @@ def _truths(captures: Sequence[str], paths: Sequence[Path], count: int, classes:
         paths = [Path(capture) / "ground_truth.npz" for capture in captures if not Path(capture).is_file()]
         if not paths or not all(path.is_file() for path in paths):
             absent = f"{paths[0]} does not exist" if paths else "no capture holds it"
-            raise FreeOccError(f"The ground truth is missing, because {absent}: name it with --ground-truth.")
+            raise FreeOccError(
+                f"The ground truth is missing, because {absent}: name it with "
+                "--ground-truth. 'freeocc3d ground-truth' builds it from a capture with poses."
+            )
     if len(paths) != count:
         raise FreeOccError(f"{len(paths)} ground truths are given for {count} scenes: give one for each.")
     names = None if classes is None else ("free", *classes.classes)
