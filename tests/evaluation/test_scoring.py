@@ -223,9 +223,9 @@ def test_a_map_that_misses_the_truth_altogether_says_so(bedroom: Path, tmp_path:
     np.savez(tmp_path / "away.npz", **{**arrays, "origin": arrays["origin"] + 1000})
     result = evaluate_scenes(ScoringRequest(maps=[bedroom], ground_truths=[tmp_path / "away.npz"]))
     assert result.scores.iou == 0
-    assert any("no voxel inside the truth" in note for note in result.notes)
+    assert any("no occupied voxel inside the truth" in note for note in result.notes)
     assert not any(
-        "no voxel inside the truth" in note for note in evaluate_scenes(ScoringRequest(maps=[bedroom])).notes
+        "no occupied voxel inside the truth" in note for note in evaluate_scenes(ScoringRequest(maps=[bedroom])).notes
     )
 
 
