@@ -78,7 +78,7 @@ def test_bad_frames_are_reported(tmp_path) -> None:
     scan_map = map_of(occupancy_of(VOXELS))
     with pytest.raises(ConfigError, match="map, gravity or first-camera, got 'robot'"):
         export_map(scan_map, "npz", tmp_path / "a.npz", {"frame": "robot"})
-    with pytest.raises(ExportError, match="no voxel"):
+    with pytest.raises(ExportError, match="no known voxels"):
         place_voxels(map_of(occupancy_of([])), "gravity")
     scan_map.trajectory.has_pose[:] = False
     with pytest.raises(ExportError, match="no first camera"):

@@ -46,7 +46,7 @@ def test_a_map_is_made_asked_and_outlives_its_model(
     assert result.scores == pytest.approx(features @ text, abs=0.01)
     with pytest.raises(FreeOccError, match="10000 characters"):
         loaded.query("x" * 10_000)
-    with pytest.raises(FreeOccError, match="An empty word"):
+    with pytest.raises(FreeOccError, match="A word is empty"):
         loaded.query(" ")
 
     shutil.rmtree(model)
