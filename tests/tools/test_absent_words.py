@@ -53,5 +53,5 @@ def test_a_map_of_class_images_is_not_asked_in_vain() -> None:
 
 def test_a_capture_of_which_nothing_is_known_is_reported(tmp_path: Path) -> None:
     models_folder()
-    with pytest.raises(PartFailed, match="name it in SEEN"):
+    with pytest.raises(PartFailed, match="add them to SEEN"):
         absent_words.measure_absent_words(str(tmp_path))
