@@ -40,5 +40,5 @@ def test_rows_name_what_falls_short() -> None:
     lines = present_words.present_words_lines([row])
     assert lines[0][1] == "1 of 2, 50%; fan: IoU 0.30, 40% of its voxels are occupied"
     assert lines[1] == ("room, `labels`: bathtub that return a region", "1", "0")
-    assert lines[2][1] == "10.0, 20.0 ms (5.0 ms of the processor)"
+    assert lines[2][1] == "10.0, 20.0 ms (5.0 ms processor time)"
     assert lines[3] == ("room, `labels`: cold start, text", "0.50 s", "≤ 1.5 s")
