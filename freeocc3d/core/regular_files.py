@@ -1,0 +1,79 @@
+"""Reads files that come from outside. Only regular files are opened, so that a pipe or device can neither block nor
+fill the memory; and no file is read that is larger than its kind can be."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+TEXT_BYTES = 256 << 20
+"""Largest text file that is read: the poses or the class names of millions of frames."""
+
+IMAGE_BYTES = 512 << 20
+"""Largest encoded image that is read."""
+
+_KINDS = (
+    (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)  # fmt: skip
+
+
+class UnusableFile(OSError):
+    """A file that must not be read: no regular file, or too large. ``strerror`` says which, as part of a sentence."""
+
+
+def check_regular(path: Path, limit: int | None = None) -> os.stat_result:
+    """The status of a regular file of at most ``limit`` bytes; links are followed.
+
+    Raises OSError: no such file, a loop of links, a name that no file can have; UnusableFile for any other kind of
+    file, or a larger one. Never blocks.
+    """
+    try:
+        found = path.stat()
+    except ValueError as error:  # a NUL in the name
+        raise OSError(errno.EINVAL, "the name of the file is invalid", str(path)) from error
+    _refuse(path, found, limit)
+    return found
+
+
+@contextlib.contextmanager
+def open_regular(path: Path, limit: int | None = None) -> Iterator[BinaryIO]:
+    """Open a regular file to read bytes. Raises what ``check_regular`` raises, also if the file is replaced
+    meanwhile."""
+    check_regular(path, limit)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as stream:
+        _refuse(path, os.fstat(stream.fileno()), limit)
+        yield stream
+
+
+def read_bytes(path: Path, limit: int) -> bytes:
+    """The content of a regular file of at most ``limit`` bytes. Raises OSError, as ``check_regular`` does."""
+    with open_regular(path, limit) as stream:
+        data = stream.read(limit + 1)
+    if len(data) > limit:  # it grew meanwhile, or it is one of the files whose size is not known before
+        raise _too_large(path, limit)
+    return data
+
+
+def read_text(path: Path, limit: int = TEXT_BYTES) -> str:
+    """The text of a regular file in UTF-8, with or without a byte order mark. Raises OSError as ``check_regular``
+    does, and UnicodeDecodeError, a ValueError."""
+    return read_bytes(path, limit).decode("utf-8-sig")
+
+
+def _refuse(path: Path, found: os.stat_result, limit: int | None) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        kind = next((name for test, name in _KINDS if test(found.st_mode)), "a special file")
+        raise UnusableFile(errno.EINVAL, f"it is {kind}, not a regular file", str(path))
+    if limit is not None and found.st_size > limit:
+        raise _too_large(path, limit)
+
+
+def _too_large(path: Path, limit: int) -> UnusableFile:
+    return UnusableFile(errno.EFBIG, f"it has more than the {limit >> 20} MB that such a file can have", str(path))
