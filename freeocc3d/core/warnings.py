@@ -19,6 +19,7 @@ Code = Literal[
     "scale-unknown",
     "vocabulary-incomplete",
     "vocabulary-empty-answers",
+    "checkpoint-damaged",
     "uncoded",
 ]
 """What a warning is about. "uncoded" is a warning of an older map, where warnings are plain texts."""

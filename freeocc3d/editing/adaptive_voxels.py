@@ -131,33 +131,33 @@ def refine_where_needed(
         raise MapError(f"{scan_map.path} already has voxels of several sizes: refine the map that it was made from.")
     if not count_halvings(base.voxel_size, finest):
         raise MapError(f"{scan_map.path} already has voxels of {finest:g} m: give a smaller size.")
-    work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
-    settings, trajectory = read_settings(scan_map).changed("occupancy", finest=finest), scan_map.trajectory
+    with WorkFolder.made_of(scan_map.path, Path(output), overwrite) as work:
+        settings, trajectory = read_settings(scan_map).changed("occupancy", finest=finest), scan_map.trajectory
 
-    def posed() -> Iterator[PosedFrame]:
-        for row, (frame, T) in enumerate(zip(scan_map.keyframes, trajectory.T_world_keyframe, strict=True)):
-            yield PosedFrame(frame, T, row)
+        def posed() -> Iterator[PosedFrame]:
+            for row, (frame, T) in enumerate(zip(scan_map.keyframes, trajectory.T_world_keyframe, strict=True)):
+                yield PosedFrame(frame, T, row)
 
-    def encode(gaussians: Gaussians) -> NDArray[np.float16]:
-        return lift_features_again(
-            scan_map, scan_map.keyframes, trajectory.T_world_keyframe, gaussians, settings, progress
+        def encode(gaussians: Gaussians) -> NDArray[np.float16]:
+            return lift_features_again(
+                scan_map, scan_map.keyframes, trajectory.T_world_keyframe, gaussians, settings, progress
+            )
+
+        occupancy = build_adaptive(
+            base, scan_map.gaussians, scan_map.gaussian_features, posed, trajectory.T_world_keyframe, encode, settings,
+            finest, progress,
+        )  # fmt: skip
+        progress.stage("saving")
+        refined = Refined(map=str(scan_map.path.absolute()))
+        parts = MapParts(
+            msgspec.structs.replace(scan_map.manifest, refined=refined),
+            settings,
+            lambda: scan_map.report,
+            occupancy,
+            Codec.fit(np.asarray(occupancy.features)),
+            scan_map.gaussian_features,
         )
-
-    occupancy = build_adaptive(
-        base, scan_map.gaussians, scan_map.gaussian_features, posed, trajectory.T_world_keyframe, encode, settings,
-        finest, progress,
-    )  # fmt: skip
-    progress.stage("saving")
-    refined = Refined(map=str(scan_map.path.absolute()))
-    parts = MapParts(
-        msgspec.structs.replace(scan_map.manifest, refined=refined),
-        settings,
-        lambda: scan_map.report,
-        occupancy,
-        Codec.fit(np.asarray(occupancy.features)),
-        scan_map.gaussian_features,
-    )
-    write_changed_map(scan_map, work, Path(output), parts)
+        write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)
 
 

@@ -91,40 +91,42 @@ def refine_box(
             f"The box holds {math.prod(blocks) * BLOCK**3:,} voxels of {voxel_size:g} m, which are too many: choose "
             f"edges of at most {edge:.1f} m, or larger voxels."
         )
-    work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
-    settings = read_settings(scan_map).changed("occupancy", voxel_size=voxel_size)
-    seeing, trajectory = _seeing(scan_map, box, AROUND * voxel_size, progress)
-    poses = trajectory.T_world_keyframe
+    with WorkFolder.made_of(scan_map.path, Path(output), overwrite) as work:
+        settings = read_settings(scan_map).changed("occupancy", voxel_size=voxel_size)
+        seeing, trajectory = _seeing(scan_map, box, AROUND * voxel_size, progress)
+        poses = trajectory.T_world_keyframe
 
-    def posed() -> Iterator[PosedFrame]:
-        for row, frame in enumerate(seeing):
-            yield PosedFrame(frame, poses[row], row)
+        def posed() -> Iterator[PosedFrame]:
+            for row, frame in enumerate(seeing):
+                yield PosedFrame(frame, poses[row], row)
 
-    gaussians = lift_gaussians(posed, box, voxel_size, settings, poses, progress)
-    if not len(gaussians):
-        raise MapError(f"No keyframe of {scan_map.path} shows a surface in the box: choose another box.")
-    features = lift_features_again(scan_map, seeing, poses, gaussians, settings, progress)
-    progress.stage("occupancy", len(seeing))
-    occupancy = build.build_occupancy(
-        gaussians,
-        features,
-        posed(),
-        settings.occupancy,
-        settings.carving,
-        origin=box.low,
-        blocks=(blocks[0], blocks[1], blocks[2]),
-        progress=progress.advance,
-    )
-    if not len(occupancy.colors):
-        raise MapError(f"No voxel of {voxel_size:g} m in the box is occupied: {scan_map.path} holds no surface there.")
-    progress.stage("saving")
-    corners = (*vector(box.low), *vector(box.high))
-    refined = Refined(map=str(scan_map.path.absolute()), box=corners)
-    parts = MapParts(
-        msgspec.structs.replace(scan_map.manifest, refined=refined), settings, lambda: scan_map.report, occupancy,
-        Codec.fit(features), features, gaussians, trajectory, seeing, draw=lambda folder: None,
-    )  # fmt: skip
-    write_changed_map(scan_map, work, Path(output), parts)
+        gaussians = lift_gaussians(posed, box, voxel_size, settings, poses, progress)
+        if not len(gaussians):
+            raise MapError(f"No keyframe of {scan_map.path} shows a surface in the box: choose another box.")
+        features = lift_features_again(scan_map, seeing, poses, gaussians, settings, progress)
+        progress.stage("occupancy", len(seeing))
+        occupancy = build.build_occupancy(
+            gaussians,
+            features,
+            posed(),
+            settings.occupancy,
+            settings.carving,
+            origin=box.low,
+            blocks=(blocks[0], blocks[1], blocks[2]),
+            progress=progress.advance,
+        )
+        if not len(occupancy.colors):
+            raise MapError(
+                f"No voxel of {voxel_size:g} m in the box is occupied: {scan_map.path} holds no surface there."
+            )
+        progress.stage("saving")
+        corners = (*vector(box.low), *vector(box.high))
+        refined = Refined(map=str(scan_map.path.absolute()), box=corners)
+        parts = MapParts(
+            msgspec.structs.replace(scan_map.manifest, refined=refined), settings, lambda: scan_map.report, occupancy,
+            Codec.fit(features), features, gaussians, trajectory, seeing, draw=lambda folder: None,
+        )  # fmt: skip
+        write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)
 
 

@@ -54,21 +54,21 @@ def scale_map(scan_map: Map, factor: float, by: str, output: str | Path, *, over
             f"Times {factor:g}, voxels would have an edge of {voxel:.2g} m and depth would reach {farthest:.3g} m. A "
             f"map holds edges from {_LEAST_VOXEL_M:g} m and depth up to {_MOST_DEPTH_M:.0f} m: check the length."
         )
-    work = WorkFolder.made_of(scan_map.path, Path(output), overwrite)
-    trajectory = _trajectory(scan_map.trajectory, factor)
-    gaussians = _gaussians(scan_map.gaussians, factor)
-    report = _report(scan_map, factor)
-    parts = MapParts(
-        _manifest(scan_map, factor, by),
-        _settings(scan_map, factor),
-        lambda: report,
-        gaussians=gaussians,
-        trajectory=trajectory,
-        keyframes=scan_map.keyframes,
-        depth_factor=factor,
-        draw=lambda folder: _draw(scan_map, folder, trajectory, gaussians, factor),
-    )
-    write_changed_map(scan_map, work, Path(output), parts)
+    with WorkFolder.made_of(scan_map.path, Path(output), overwrite) as work:
+        trajectory = _trajectory(scan_map.trajectory, factor)
+        gaussians = _gaussians(scan_map.gaussians, factor)
+        report = _report(scan_map, factor)
+        parts = MapParts(
+            _manifest(scan_map, factor, by),
+            _settings(scan_map, factor),
+            lambda: report,
+            gaussians=gaussians,
+            trajectory=trajectory,
+            keyframes=scan_map.keyframes,
+            depth_factor=factor,
+            draw=lambda folder: _draw(scan_map, folder, trajectory, gaussians, factor),
+        )
+        write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)
 
 

@@ -81,18 +81,18 @@ class Mapper:
         self.refined = True
 
     def state(self, done: int) -> dict[str, NDArray[Any]]:
-        """What ``restore`` needs after ``done`` frames, apart from the keyframes, whose index this writes."""
-        self.keyframes.save_index()
-        counts = {"done": done, "keyframes": len(self.keyframes), "refined": self.refined}
-        return {**{name: np.array(count) for name, count in counts.items()}, **self.tracker.state()}
+        """What ``restore`` needs after ``done`` frames, apart from the keyframes' images, which are on the disk
+        then."""
+        own = {"done": done, "refined": self.refined, "keyframes": self.keyframes.checkpoint()}
+        return {**{name: np.array(value) for name, value in own.items()}, **self.tracker.state()}
 
     def restore(self, state: dict[str, NDArray[Any]]) -> int:
-        """Continue from a ``state``, and empty it. Returns the number of frames that were added."""
-        keyframes = Keyframes.load(self.keyframes.folder)
-        keyframes.truncate(int(state.pop("keyframes")))
+        """Continue from a ``state``, to the same map as without a stop. Returns the number of frames that were added.
+        Reads keyframes from the capture: those on disk are compressed. Raises CaptureError if one is unreadable now."""
         done, self.refined = int(state.pop("done")), bool(state.pop("refined"))
-        self.keyframes = keyframes
-        self.tracker.restore(state, keyframes)
+        checkpoint = str(state.pop("keyframes"))
+        self.keyframes = Keyframes.resumed(self.keyframes.folder, checkpoint, self._read)
+        self.tracker.restore(state, self._read)
         return done
 
     def trajectory(self) -> Trajectory:
@@ -223,6 +223,10 @@ class Mapper:
             finest,
             progress,
         )
+
+    def _read(self, index: int) -> Frame:
+        """A frame of the capture as ``add`` tracks it."""
+        return self._complete(self.capture[index])
 
     def _complete(self, frame: Frame) -> Frame:
         """The frame with the camera as the tracker knows it, and with depth."""

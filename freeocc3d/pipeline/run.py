@@ -47,10 +47,13 @@ def reconstruct(
     work.warn(progress, *resolved.notices)
     try:
         opened = _open(capture, resolved, progress, work)
-        work.begin([absolute(opened.path), len(opened), __version__], resolved)
-        with work.timed("calibration"):
-            opened = _register_color(opened, resolved, progress, work)
-        return _run(opened, resolved, output, work, progress)
+        work.begin([absolute(opened.path), len(opened), __version__], resolved, progress)
+        if not work.complete:
+            with work.timed("calibration"):
+                opened = _register_color(opened, resolved, progress, work)
+            _run(opened, resolved, work, progress)
+        work.finish(output)
+        return load_map(output)
     except TrackingError:
         work.discard()  # it holds nothing useful
         raise
@@ -68,7 +71,7 @@ def reconstruct(
             "make room, then run the same command with --resume."
         ) from error
     finally:
-        work.drop_if_empty()
+        work.close()
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
@@ -76,13 +79,12 @@ def _is_interrupt(error: BaseException | None) -> bool:
     return isinstance(error, KeyboardInterrupt) or (error is not None and _is_interrupt(error.__cause__))
 
 
-def _run(capture: Capture, settings: Settings, output: Path, work: WorkFolder, progress: Progress) -> Map:
+def _run(capture: Capture, settings: Settings, work: WorkFolder, progress: Progress) -> None:
     encoder: Encoder = settings.load_backend("language", capture)
     run = Run(Mapper(settings, capture, work.folder), encoder, work, progress)
     for stage in STAGES.values():
         stage(run)
-    work.finish(output)
-    return load_map(output)
+    work.mark_complete()
 
 
 def _open(capture: str | Path, settings: Settings, progress: Progress, work: WorkFolder) -> Capture:

@@ -4,9 +4,10 @@ during tracking, and read one at a time."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import overload
 
@@ -14,7 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.atomic_files import is_temporary, replace_text
+from ..core.atomic_files import replace_text, sync
+from ..core.checksums import hash_bytes, hash_file
 from ..core.errors import MapError
 from ..core.types import Frame, Intrinsics
 
@@ -31,6 +33,8 @@ class Keyframes(Sequence[Frame]):
     def __init__(self, folder: Path):
         self.folder = folder
         self._entries: list[dict[str, float]] = []
+        self._checksums: dict[str, str] = {}  # of the images that this object wrote
+        self._unsynced: list[Path] = []
 
     @classmethod
     def load(cls, folder: Path) -> Keyframes:
@@ -46,10 +50,7 @@ class Keyframes(Sequence[Frame]):
     def append(self, frame: Frame) -> None:
         """Write a keyframe. Raises OSError."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        bgr = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
-        color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-        self._paths(frame.index)[0].write_bytes(color.tobytes())
-        self._write_depth(frame)
+        self._write_images(frame)
         camera = frame.intrinsics
         self._entries.append(
             {"frame": frame.index, "timestamp": frame.timestamp, "width": camera.width, "height": camera.height,
@@ -62,10 +63,10 @@ class Keyframes(Sequence[Frame]):
         folder.mkdir(parents=True, exist_ok=True)
         copied = Keyframes(folder)
         for entry in self._entries:
-            color_path, *depth_paths = self._paths(int(entry["frame"]))
+            color_path, *depth_paths = self._own_paths(entry)
             shutil.copyfile(color_path, folder / color_path.name)
             if depth_factor == 1:
-                for path in depth_paths[: 1 + (_SIGMA in entry)]:
+                for path in depth_paths:
                     shutil.copyfile(path, folder / path.name)
             else:
                 copied._write_depth(self._read(entry).scaled(depth_factor))
@@ -79,17 +80,33 @@ class Keyframes(Sequence[Frame]):
         chosen._entries = [entry for entry in self._entries if int(entry["frame"]) in wanted]
         return chosen
 
-    def truncate(self, length: int) -> None:
-        """Keep the first ``length`` keyframes. The same frames overwrite the files of the others when they come
-        again."""
-        del self._entries[length:]
+    def checkpoint(self) -> str:
+        """What ``resumed`` needs, when all images are on the disk. Raises OSError."""
+        for path in self._unsynced:
+            sync(path)
+        self._unsynced.clear()
+        return json.dumps({"entries": self._entries, "checksums": self._checksums})
 
-    def drop_unlisted(self) -> None:
-        """Remove images that the index does not list: an interrupted run wrote them after its last checkpoint."""
-        listed = {path for entry in self._entries for path in self._paths(int(entry["frame"]))}
-        for path in self.folder.iterdir():
-            if path not in listed and (path.match("*.color.jpg") or path.match("*.depth*.png") or is_temporary(path)):
-                path.unlink()
+    @classmethod
+    def resumed(cls, folder: Path, checkpoint: str, read: Callable[[int], Frame]) -> Keyframes:
+        """The keyframes of a ``checkpoint``. Images that are missing or damaged are written again.
+
+        read: gives a frame of the capture as ``append`` got it. Raises OSError, and what ``read`` raises.
+        """
+        kept, stated = cls(folder), json.loads(checkpoint)
+        kept._entries, kept._checksums = stated["entries"], stated["checksums"]
+        folder.mkdir(parents=True, exist_ok=True)
+        for entry in kept._entries:
+            index = int(entry["frame"])
+            if not all(kept._whole(path) for path in kept._own_paths(entry)):
+                kept._write_images(read(index))
+        return kept
+
+    def _whole(self, path: Path) -> bool:
+        try:
+            return hash_file(path) == self._checksums.get(path.name)
+        except OSError:
+            return False
 
     def save_index(self) -> None:
         """Write the index atomically. Raises OSError."""
@@ -120,6 +137,10 @@ class Keyframes(Sequence[Frame]):
         """The color image's path and the camera of each keyframe. Decodes nothing."""
         return [(self._paths(int(entry["frame"]))[0], _camera(entry)) for entry in self._entries]
 
+    def paths(self) -> list[Path]:
+        """The images of all keyframes."""
+        return [path for entry in self._entries for path in self._own_paths(entry)]
+
     def depth_m(self, row: int) -> NDArray[np.float32]:
         """(H, W) depth of a keyframe, meters; 0 = no measurement. Does not decode its color image."""
         return self._read_units(self._entries[row], 1) / np.float32(_UNITS_PER_METER)
@@ -142,12 +163,28 @@ class Keyframes(Sequence[Frame]):
             raise MapError(f"{path} does not have the size that {INDEX} states.")
         return units.astype(np.float32)
 
+    def _write_images(self, frame: Frame) -> None:
+        bgr = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
+        color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+        self._write(self._paths(frame.index)[0], color.tobytes())
+        self._write_depth(frame)
+
     def _write_depth(self, frame: Frame) -> None:
         _, depth_path, sigma_path = self._paths(frame.index)
-        depth_path.write_bytes(_encoded(frame.depth_m * _UNITS_PER_METER))
+        self._write(depth_path, _encoded(frame.depth_m * _UNITS_PER_METER))
         if frame.depth_sigma_m is not None:
             sigma = np.maximum(frame.depth_sigma_m * np.float32(_SIGMA_UNITS_PER_METER), 1)  # 0 would weigh infinitely
-            sigma_path.write_bytes(_encoded(np.where(frame.depth_m > 0, sigma, 0)))
+            self._write(sigma_path, _encoded(np.where(frame.depth_m > 0, sigma, 0)))
+
+    def _write(self, path: Path, data: bytes) -> None:
+        with contextlib.suppress(FileNotFoundError):
+            path.unlink()  # never through a link
+        path.write_bytes(data)
+        self._checksums[path.name] = hash_bytes(data)
+        self._unsynced.append(path)
+
+    def _own_paths(self, entry: dict[str, float]) -> tuple[Path, ...]:
+        return self._paths(int(entry["frame"]))[: 2 + (_SIGMA in entry)]
 
     def _paths(self, index: int) -> tuple[Path, Path, Path]:
         """The paths of a frame's color, depth and standard-deviation images."""

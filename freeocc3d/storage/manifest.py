@@ -145,6 +145,7 @@ class Manifest(MapFacts, frozen=True, kw_only=True):
     counts: Annotated[MapCounts, _key("numbers of Gaussians, voxels, frames and submaps")]
     keyframes: Annotated[tuple[Count, ...], _key("the capture's frames that are keyframes, ascending")]
     files: Annotated[dict[str, Count], _key("files of the folder with their sizes, bytes")]
+    checksums: Annotated[dict[str, str], _key("files of the folder with their checksums, XXH3 of 128 bits")] = {}
 
     @property
     def finest_m(self) -> float:

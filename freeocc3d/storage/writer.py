@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import msgspec
@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
+from ..core.atomic_files import sync
+from ..core.checksums import hash_file
+from ..core.errors import MapError
 from ..core.tum_files import write_tum
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Gaussians, Occupancy, Trajectory
 from ..gaussians.point_cloud import write_gaussian_ply
@@ -21,7 +24,7 @@ from ..language.feature_codec import Codec
 from ..settings import config
 from ..settings.config import Settings
 from . import map_files
-from .keyframes import Keyframes
+from .keyframes import INDEX, Keyframes
 from .manifest import Manifest, MapCounts, MapFacts, VoxelCounts, vector, write_manifest
 from .occupancy_file import write_features, write_occupancy
 from .saved_map import SavedMap
@@ -54,18 +57,18 @@ class MapParts:
 
 
 def write_changed_map(source: SavedMap, work: WorkFolder, output: Path, parts: MapParts) -> None:
-    """Write a map that is made from another one. Raises MapError if that fails; nothing is left then."""
-    with work.begun_anew(output):
-        write_map(work, parts, source)
-        work.finish(output)
+    """Write a map that is made from another one. Raises OSError, MapError."""
+    write_map(work, parts, source)
+    work.finish(output)
 
 
 def write_map(work: WorkFolder, parts: MapParts, source: SavedMap | None = None) -> None:
     """Write a whole map into the work folder, the manifest last. ``WorkFolder.finish`` then gives it its name.
     Gaussians and keyframes that a stage of the run has left there are not written again.
 
-    source: the map that this one is made from. Raises OSError, and MapError for a broken keyframe of the source."""
+    source: the map that this one is made from. Raises OSError, and MapError for a damaged file of the source."""
     folder = work.folder
+    (folder / map_files.MANIFEST).unlink(missing_ok=True)  # of an earlier try
     with work.timed("saving"):
         (folder / map_files.CONFIG).write_text(config.dump(parts.settings), encoding="utf-8")
         _write_arrays(folder, parts)
@@ -74,12 +77,15 @@ def write_map(work: WorkFolder, parts: MapParts, source: SavedMap | None = None)
         if parts.draw is not None:
             parts.draw(folder)
         if parts.keyframes is not None:
-            _write_keyframes(work, parts.keyframes, parts.depth_factor)
-        if source is not None:
-            _copy_missing(source.path, folder, pictures=parts.draw is None)
+            _write_keyframes(folder / map_files.KEYFRAMES, parts.keyframes, parts.depth_factor)
+        copied = [] if source is None else _copy_missing(source.path, folder, pictures=parts.draw is None)
     report = parts.report()
     (folder / map_files.REPORT).write_text(json.dumps(report), encoding="utf-8")
-    write_manifest(folder, _manifest(folder, parts, report))
+    manifest = _manifest(folder, parts, report)
+    if source is not None:
+        _require_equal(source, manifest, copied, parts.depth_factor)
+    write_manifest(folder, manifest)
+    sync(folder / map_files.MANIFEST)
 
 
 def _write_arrays(folder: Path, parts: MapParts) -> None:
@@ -90,24 +96,33 @@ def _write_arrays(folder: Path, parts: MapParts) -> None:
         write_gaussian_ply(parts.gaussians, folder / map_files.GAUSSIANS)
 
 
-def _write_keyframes(work: WorkFolder, keyframes: Keyframes, depth_factor: float) -> None:
-    folder = work.folder / map_files.KEYFRAMES
-    if keyframes.folder != folder:
+def _write_keyframes(folder: Path, keyframes: Keyframes, depth_factor: float) -> None:
+    if keyframes.folder == folder:
+        keyframes.save_index()
+    else:
         keyframes.copy_to(folder, depth_factor)
-        return
-    if len(keyframes) < len(Keyframes.load(folder)):
-        work.forget_tracking()  # its checkpoint counts the keyframes that are now left out
-    keyframes.save_index()
-    keyframes.drop_unlisted()
 
 
-def _copy_missing(source: Path, folder: Path, pictures: bool) -> None:
-    """Copy the files that were not written, except the report."""
+def _copy_missing(source: Path, folder: Path, pictures: bool) -> list[str]:
+    """Copy the files that were not written, except the report. Returns their names, without those of keyframes."""
+    copied = []
     for name in (*map_files.ALWAYS, *(map_files.PICTURES if pictures else ())):
         if name != map_files.REPORT and not (folder / name).exists() and (source / name).is_file():
             shutil.copy2(source / name, folder / name)
+            copied.append(name)
     if not (folder / map_files.KEYFRAMES).exists():
-        shutil.copytree(source / map_files.KEYFRAMES, folder / map_files.KEYFRAMES)
+        Keyframes.load(source / map_files.KEYFRAMES).copy_to(folder / map_files.KEYFRAMES)
+    return copied
+
+
+def _require_equal(source: SavedMap, made: Manifest, copied: list[str], depth_factor: float) -> None:
+    """Raise MapError if a copied file is not as the source map states it."""
+    images = "" if depth_factor == 1 else ".color.jpg"
+    copied = [*copied, *(name for name in made.checksums if PurePath(name).match(f"{map_files.KEYFRAMES}/*{images}"))]
+    stated = source.manifest.checksums
+    for name in copied:
+        if not name.endswith(INDEX) and stated.get(name, made.checksums[name]) != made.checksums[name]:
+            raise MapError(f"{source.path / name} is damaged: its checksum is not the stated one. Copy the map again.")
 
 
 def _manifest(folder: Path, parts: MapParts, report: Mapping[str, Any]) -> Manifest:
@@ -126,7 +141,9 @@ def _manifest(folder: Path, parts: MapParts, report: Mapping[str, Any]) -> Manif
     if (trajectory := parts.trajectory) is not None:
         said["keyframes"] = tuple(trajectory.keyframes.tolist())
         counts.update(frames=len(trajectory), frames_with_pose=int(trajectory.has_pose.sum()))
-    said.update(freeocc3d=__version__, counts=MapCounts(**counts), files=_file_sizes(folder))
+    names = _file_names(folder)
+    said.update(freeocc3d=__version__, counts=MapCounts(**counts), files=_file_sizes(folder, names))
+    said.update(checksums=_checksums(folder, names))
     return Manifest(**said)
 
 
@@ -136,8 +153,20 @@ def count_voxels(occupancy: Occupancy) -> VoxelCounts:
     return VoxelCounts(occupied=of[OCCUPIED], free=of[FREE], unknown=of[UNKNOWN])
 
 
-def _file_sizes(folder: Path) -> dict[str, int]:
+def _file_names(folder: Path) -> list[str]:
+    """The files of the map in the folder, but for the manifest. Other images of keyframes are not the map's."""
     pictures = [name for name in map_files.PICTURES if (folder / name).is_file()]
-    paths = [folder / name for name in (*map_files.ALWAYS, *pictures)]
-    paths += sorted((folder / map_files.KEYFRAMES).iterdir())
-    return {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
+    images = Keyframes.load(folder / map_files.KEYFRAMES).paths()
+    keyframes = [folder / map_files.KEYFRAMES / INDEX, *images]
+    return [*map_files.ALWAYS, *pictures, *sorted(path.relative_to(folder).as_posix() for path in keyframes)]
+
+
+def _file_sizes(folder: Path, names: list[str]) -> dict[str, int]:
+    return {name: (folder / name).stat().st_size for name in names}
+
+
+def _checksums(folder: Path, names: list[str]) -> dict[str, str]:
+    """The files' checksums, when they are on the disk."""
+    for name in names:
+        sync(folder / name)
+    return {name: hash_file(folder / name) for name in names}

@@ -7,7 +7,7 @@ A tracker is one file of ``trackers/`` with ``load(options, capture) -> Tracker`
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -115,8 +115,9 @@ class Tracker(ABC):
         trackers with given poses keep their own world frame."""
 
     @abstractmethod
-    def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
-        """Continue from a saved ``state``. keyframes: the frames of the keyframes, in order."""
+    def restore(self, state: dict[str, NDArray[np.generic]], read: Callable[[int], Frame]) -> None:
+        """Continue from a saved ``state``, to the same result as without a stop. read: gives a frame of the capture
+        as ``track`` got it."""
 
     def state(self) -> dict[str, NDArray[np.generic]]:
         """Everything needed to continue later, as plain arrays."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,9 +64,10 @@ class GivenTracker(Tracker):
     def optimize(self) -> None:
         """Given poses stay as they are."""
 
-    def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
+    def restore(self, state: dict[str, NDArray[np.generic]], read: Callable[[int], Frame]) -> None:
         self.records = Records.from_arrays(state)
-        self._keyframe = self._view(keyframes[-1]) if keyframes else None
+        keyframes = self.records.keyframe_index
+        self._keyframe = self._view(read(keyframes[-1])) if keyframes else None
 
     def _view(self, frame: Frame) -> DepthView:
         return DepthView(

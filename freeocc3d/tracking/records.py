@@ -141,11 +141,14 @@ class Records:
             "keyframe_index": np.array(self.keyframe_index, np.int64),
             "T_world_keyframe": np.array(self.T_world_keyframe, np.float64).reshape(-1, 4, 4),
             "submap": np.array(self.submap, np.int64),
+            "pieces": np.array([row for piece in self.pieces for row in piece], np.int64),
+            "piece_lengths": np.array([len(piece) for piece in self.pieces], np.int64),
         }
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[np.generic]]) -> Records:
         """The inverse of ``to_arrays``."""
+        ends = np.cumsum(arrays["piece_lengths"])[:-1]
         return cls(
             index=arrays["index"].tolist(),
             keyframe=arrays["keyframe"].tolist(),
@@ -155,6 +158,7 @@ class Records:
             keyframe_index=arrays["keyframe_index"].tolist(),
             T_world_keyframe=list(np.asarray(arrays["T_world_keyframe"], np.float64)),
             submap=arrays["submap"].tolist(),
+            pieces=[piece.tolist() for piece in np.split(arrays["pieces"], ends) if len(piece)],
         )
 
 

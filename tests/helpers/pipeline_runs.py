@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import yaml
+
 from freeocc3d.core.warnings import Notice, read_notices
 
 ROOM = {"capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "stop": 24}}
@@ -12,6 +14,17 @@ ROOM = {"capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "
 def notices(made) -> list[Notice]:
     """The warnings of a map's report."""
     return read_notices(made.report["warnings"])
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """What must be equal in two maps of one capture with one configuration: every file, but for the report, which
+    states times, and what the manifest says of the report."""
+    files = listing(folder)
+    del files["report.json"]
+    manifest = yaml.safe_load(files["map.yaml"])
+    for stated in ("files", "checksums"):
+        del manifest[stated]["report.json"]
+    return {**files, "map.yaml": repr(manifest).encode()}
 
 
 def listing(folder: Path) -> dict[str, bytes]:

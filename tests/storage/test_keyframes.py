@@ -48,13 +48,23 @@ def test_both_are_scaled(kept: Keyframes, tmp_path: Path) -> None:
     np.testing.assert_allclose(half.depth_sigma_m, 0.5 * frame.depth_sigma_m, atol=3e-4)
 
 
-def test_an_image_that_is_gone_is_named_and_one_that_no_index_lists_is_removed(kept: Keyframes) -> None:
-    (sigma,) = kept.folder.glob("*.depth_sigma.png")
-    kept.truncate(1)
-    kept.save_index()
-    kept.drop_unlisted()
-    assert not sigma.exists()
+def test_an_image_that_is_gone_is_named(kept: Keyframes) -> None:
     entries = json.loads((kept.folder / INDEX).read_text())
     (kept.folder / INDEX).write_text(json.dumps([{**entries[0], "sigma": 1.0}]))
     with pytest.raises(MapError, match=r"000000\.depth_sigma\.png"):
         _ = Keyframes.load(kept.folder)[0]
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:-9])])
+def test_a_resumed_run_writes_only_damaged_images_again_with_the_same_content(kept: Keyframes, damage) -> None:
+    frames = {0: wall_frame(2.0, 0), 7: with_sigma(wall_frame(1.5, 7))}
+    frames[7].depth_m[:50] = 0
+    checkpoint = kept.checkpoint()
+    before = {path: path.read_bytes() for path in kept.paths()}
+    damage(kept.paths()[-1])
+    asked: list[int] = []
+    resumed = Keyframes.resumed(kept.folder, checkpoint, lambda index: asked.append(index) or frames[index])
+    assert asked == [7]
+    assert {path: path.read_bytes() for path in resumed.paths()} == before
+    assert resumed.frames == [0, 7]
+    assert resumed.checkpoint() == checkpoint

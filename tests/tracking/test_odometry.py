@@ -135,10 +135,10 @@ def test_a_restored_tracker_goes_on_as_if_nothing_had_happened() -> None:
     for frame in frames[:7]:
         part.track(frame)
     rest = tracker()
-    rest.restore(part.state(), [kitchen[i] for i in part.records.keyframe_index])
+    rest.restore(part.state(), kitchen.__getitem__)
     for frame in frames[7:]:
         rest.track(frame)
-    np.testing.assert_allclose(
+    np.testing.assert_allclose(  # Open3D's parallel sums differ from call to call
         rest.trajectory(kitchen.timestamps).T_world_cam, whole.trajectory(kitchen.timestamps).T_world_cam, atol=1e-3
     )
     assert len(rest.edges) == len(whole.edges)

@@ -213,7 +213,7 @@ def test_the_tracker_gives_poses_points_and_what_became_of_frames(
         tracker.track(frame)
     state = tracker.state()
     later = tracked(altered, tmp_path)
-    later.restore(state, [two_meters_deep(later, int(i)) for i in state["keyframe_index"]])
+    later.restore(state, lambda index: two_meters_deep(later, index))
     for index in range(8, 16):
         later.track(two_meters_deep(later, index))
     trajectory = later.trajectory(later._capture.timestamps)

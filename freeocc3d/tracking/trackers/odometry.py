@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -231,9 +231,9 @@ class OdometryTracker(Tracker):
             "frames_lost": np.array(self._frames_lost),
         }
 
-    def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
+    def restore(self, state: dict[str, NDArray[np.generic]], read: Callable[[int], Frame]) -> None:
         self.records = Records.from_arrays(state)
-        self._keyframes = [self._view(frame) for frame in keyframes]
+        self._keyframes = [self._view(read(index)) for index in self.records.keyframe_index]
         self._T_keyframe_last, self._velocity = np.asarray(state["last"], np.float64)
         self._frames_lost = int(state["frames_lost"])
         self.edges = pose_graph.edges_from_arrays(state)

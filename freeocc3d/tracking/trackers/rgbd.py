@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -96,13 +96,12 @@ class RgbdTracker(Tracker):
         self._T_keyframe_last = np.eye(4)  # last tracked frame, in that keyframe
         self._velocity = np.eye(4)  # T_previous_last
         self._frames_lost = 0
-        self._last: _Seen | None = None  # not saved: keyframes are enough to continue
+        self._last: _Seen | None = None  # the last frame with a pose, unless it began a submap
 
     def track(self, frame: Frame) -> Tracked:
-        view = prepare_alignment_view(frame)
-        if view.covered < LEAST_COVERED:
+        seen = _see(frame)
+        if seen.view.covered < LEAST_COVERED:
             return self._lose(frame.index)
-        seen = _Seen(frame, view, sample_surface(view))
         if not self.keyframes:
             return self._begin_submap(seen)
         aligned = self._follow(seen)
@@ -218,14 +217,21 @@ class RgbdTracker(Tracker):
             **super().state(),
             "last": np.stack((self._T_keyframe_last, self._velocity)),
             "counters": np.array((self._current, self._frames_lost)),
+            "last_frame": np.array([] if self._last is None else [self._last.frame.index], np.int64),
         }
 
-    def restore(self, state: dict[str, NDArray[np.generic]], keyframes: Sequence[Frame]) -> None:
+    def restore(self, state: dict[str, NDArray[np.generic]], read: Callable[[int], Frame]) -> None:
         self.records = Records.from_arrays(state)
-        self.keyframes = [prepare_keyframe_view(frame) for frame in keyframes]
+        self.keyframes = [prepare_keyframe_view(read(index)) for index in self.records.keyframe_index]
         self._T_keyframe_last, self._velocity = np.asarray(state["last"], np.float64)
         self._current, self._frames_lost = state["counters"].tolist()
+        self._last = next((_see(read(index)) for index in state["last_frame"].tolist()), None)
         self.edges = pose_graph.edges_from_arrays(state)
+
+
+def _see(frame: Frame) -> _Seen:
+    view = prepare_alignment_view(frame)
+    return _Seen(frame, view, sample_surface(view))
 
 
 def _confirmed(found: FeatureRegistration) -> bool:
