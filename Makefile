@@ -13,7 +13,7 @@ QUICK  := tests/test_imports.py tests/core tests/settings tests/capture tests/oc
 	$(addprefix tests/evaluation/test_, confusion.py restricted_unpickler.py scored_classes.py trajectory_errors.py) \
 	$(addprefix tests/tools/test_, peers.py plots.py)
 
-.PHONY: help demo quick test lint docs wheel-test benchmark setup system clean
+.PHONY: help demo quick test lint fuzz docs wheel-test benchmark setup system clean
 
 demo: setup  ## map the built-in room, ask three words, write pictures to demo/
 	$(BIN)/freeocc3d demo -o demo --overwrite
@@ -32,6 +32,9 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+fuzz: setup  ## try 10,000 damaged inputs of all kinds, and count how they end
+	$(BIN)/python tests/fuzz/run.py
 
 docs: setup  ## build the documentation as a site in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
