@@ -16,7 +16,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from ..core.checksums import hash_bytes
 from ..core.errors import MapError
+from ..core.regular_files import read_bytes
 from ..core.transforms import is_rigid
 from .map_files import MANIFEST
 
@@ -25,6 +27,8 @@ FORMAT_VERSION = 3
 
 OLDEST_VERSION = 2
 """The oldest format that is read. Format 1 packed features in another way."""
+
+_MOST_BYTES = 64 << 20
 
 POSES = "camera to world"
 CODEC = "transform coding, 8, 4 and 2 bits a direction"
@@ -38,6 +42,7 @@ Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
 Count = Annotated[int, msgspec.Meta(ge=0)]
+Checksum = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{32}\Z")]
 
 
 def matrix(T: NDArray[np.float64]) -> Matrix:
@@ -145,6 +150,9 @@ class Manifest(MapFacts, frozen=True, kw_only=True):
     counts: Annotated[MapCounts, _key("numbers of Gaussians, voxels, frames and submaps")]
     keyframes: Annotated[tuple[Count, ...], _key("the capture's frames that are keyframes, ascending")]
     files: Annotated[dict[str, Count], _key("files of the folder with their sizes, bytes")]
+    checksums: Annotated[dict[str, Checksum] | None, _key("the same files with their checksums: XXH3 of 128 bits")] = (
+        None
+    )
 
     @property
     def finest_m(self) -> float:
@@ -175,11 +183,17 @@ def manifest_keys() -> Iterator[ManifestKey]:
         yield ManifestKey(field.name, field.required, meta.extra["since"], meta.description or "")
 
 
+_SEAL = b"\n# xxh3_128 "
+"""Before the checksum of all bytes of map.yaml that precede it: the last line, a comment. Who edits the file removes
+the line; earlier maps have none."""
+
+
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write map.yaml. Raises OSError."""
     content = {name: value for name, value in msgspec.to_builtins(manifest).items() if value is not None}
     text = yaml.safe_dump({"format_version": manifest.format_version, **content}, sort_keys=False)
-    (folder / MANIFEST).write_text(text, encoding="utf-8")
+    data = text.encode().rstrip(b"\n")
+    (folder / MANIFEST).write_bytes(data + _SEAL + hash_bytes(data).encode() + b"\n")
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -189,11 +203,18 @@ def read_manifest(folder: Path) -> Manifest:
     if not folder.is_dir():
         raise MapError(f"The map folder {folder} does not exist.")
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_SafeLoader)
+        data = read_bytes(path, _MOST_BYTES)
+        content = yaml.load(data.decode("utf-8-sig"), Loader=_SafeLoader)
     except FileNotFoundError as error:
         raise MapError(f"{folder} is not a map: it has no {MANIFEST}.") from error
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise MapError(f"{path} cannot be read: {' '.join(str(error).split())}.") from error
+    body, seal, stated = data.rpartition(_SEAL)
+    if seal and stated.strip() != hash_bytes(body).encode():
+        raise MapError(
+            f"{path} is damaged or was changed: its last line states another checksum. Copy the whole folder "
+            "again; who changed it on purpose removes that line."
+        )
     version = content.get("format_version") if isinstance(content, dict) else None
     if not isinstance(version, int):
         raise MapError(f"{path} is not the manifest of a map: it has no format_version.")
