@@ -13,7 +13,7 @@ QUICK  := tests/test_imports.py tests/core tests/settings tests/capture tests/oc
 	$(addprefix tests/evaluation/test_, confusion.py restricted_unpickler.py scored_classes.py trajectory_errors.py) \
 	$(addprefix tests/tools/test_, peers.py plots.py)
 
-.PHONY: help demo quick test lint fuzz docs wheel-test benchmark setup system clean
+.PHONY: help demo quick test lint fuzz docs wheel-test benchmark mutants setup system clean
 
 demo: setup  ## map the built-in room, ask three words, write pictures to demo/
 	$(BIN)/freeocc3d demo -o demo --overwrite
@@ -44,6 +44,9 @@ wheel-test: setup  ## build the wheel, install it into an empty environment, and
 
 benchmark: setup  ## measure maps, ablations and peers
 	$(BIN)/python tools/benchmark.py
+
+mutants: setup  ## make small changes, and see which of them the tests notice
+	$(BIN)/python tools/mutants.py
 
 setup: system $(STAMP)
 
