@@ -6,7 +6,6 @@ knows.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_type_hints
@@ -20,6 +19,8 @@ from ..core.checksums import hash_bytes
 from ..core.errors import MapError
 from ..core.regular_files import read_bytes
 from ..core.transforms import is_rigid
+from ..core.typed_documents import InvalidDocument, as_type
+from ..core.yaml_documents import InvalidYaml, parse_yaml
 from .map_files import MANIFEST
 
 FORMAT_VERSION = 3
@@ -204,11 +205,15 @@ def read_manifest(folder: Path) -> Manifest:
         raise MapError(f"The map folder {folder} does not exist.")
     try:
         data = read_bytes(path, _MOST_BYTES)
-        content = yaml.load(data.decode("utf-8-sig"), Loader=_SafeLoader)
+        content = parse_yaml(data.decode("utf-8-sig"))
     except FileNotFoundError as error:
         raise MapError(f"{folder} is not a map: it has no {MANIFEST}.") from error
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise MapError(f"{path} cannot be read: {' '.join(str(error).split())}.") from error
+    except OSError as error:
+        raise MapError(f"{path} cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise MapError(f"{path} is damaged: it holds bytes that are not text in UTF-8.") from error
+    except InvalidYaml as error:
+        raise MapError(f"{path} is damaged: {error}.") from error
     body, seal, stated = data.rpartition(_SEAL)
     if seal and stated.strip() != hash_bytes(body).encode():
         raise MapError(
@@ -225,9 +230,9 @@ def read_manifest(folder: Path) -> Manifest:
     if version < OLDEST_VERSION:
         raise MapError(f"The map {folder} has the old format {version}: map the capture again.")
     try:
-        manifest = msgspec.convert(content, Manifest)
-    except msgspec.ValidationError as error:
-        raise MapError(f"{path} is damaged: {_what_is_wrong(error)}.") from error
+        manifest = as_type(content, Manifest)
+    except InvalidDocument as error:
+        raise MapError(f"{path} is damaged: {error}.") from error
     if problem := _problem(manifest, folder):
         raise MapError(f"{path} is damaged: {problem}.")
     return manifest
@@ -247,33 +252,3 @@ def _problem(manifest: Manifest, folder: Path) -> str:
     root = folder.resolve()
     outside = next((name for name in manifest.files if not (folder / name).resolve().is_relative_to(root)), None)
     return "" if outside is None else f"'files' names {outside}, which lies outside the map's folder"
-
-
-_KINDS = {
-    "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false", "array": "a list",
-    "object": "a group of keys", "null": "nothing",
-}  # fmt: skip
-_SHAPES = (
-    (r"Object missing required field `(?P<key>\w+)`", "lacks '{key}'"),
-    (r"Expected `(?P<wanted>[^`]+)`, got `(?P<found>\w+)`", "has {found} instead of {wanted}"),
-    (r"Expected `array` of length (?P<wanted>\d+), got (?P<found>\d+)", "has {found} entries instead of {wanted}"),
-    (r"Expected `\w+` (?P<bound>[<>]=? \S+)", "has a number that is not {bound}"),
-)
-
-
-def _what_is_wrong(error: msgspec.ValidationError) -> str:
-    """A validation error as part of a sentence that names the field."""
-    message, _, where = str(error).partition(" - at `$")
-    field = where.strip("`.")
-    for pattern, sentence in _SHAPES:
-        if match := re.fullmatch(pattern, message):
-            said = {name: _in_words(value) for name, value in match.groupdict().items()}
-            return f"{repr(field) if field else 'it'} {sentence.format(**said)}"
-    return f"'{field}': {message}"
-
-
-def _in_words(kinds: str) -> str:
-    return " or ".join(_KINDS.get(kind, kind) for kind in kinds.split(" | "))
-
-
-_SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
