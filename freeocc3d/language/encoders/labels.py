@@ -15,7 +15,7 @@ from ...capture.class_files import read_class_names
 from ...core.errors import CaptureError
 from ...core.image_files import ImageFileError, read_image
 from ...core.types import Frame
-from ...settings.option_types import PositiveInt
+from ...settings.option_types import FilePath, Stride
 from ...settings.typed_options import TypedOptions
 from .. import synonyms
 from .base import Encoder, TextEncoder, TextFeatures
@@ -30,13 +30,13 @@ _ASPECT_TOLERANCE = 0.02
 class Options(TypedOptions, frozen=True):
     """The class images, if the capture has none."""
 
-    folder: str | None = None
+    folder: FilePath | None = None
     """Folder of class images, PNG with one channel. If their number equals that of the frames, they are used in order.
     Otherwise the last number in a file's name is the frame's index, from 0. null = use the capture's own."""
-    classes: str | None = None
+    classes: FilePath | None = None
     """File with the class names: JSON {"classes": [...]} or one name per line. The first (value 0) means nothing. null
     = classes.json or classes.txt in the folder, or the capture's own."""
-    stride: PositiveInt = 2
+    stride: Stride = 2
     """Use every n-th pixel of a class image."""
 
 
