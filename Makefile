@@ -13,7 +13,7 @@ QUICK  := tests/test_imports.py tests/core tests/settings tests/capture tests/oc
 	$(addprefix tests/evaluation/test_, confusion.py restricted_unpickler.py scored_classes.py trajectory_errors.py) \
 	$(addprefix tests/tools/test_, peers.py plots.py)
 
-.PHONY: help demo quick test lint docs wheel-test benchmark setup system clean
+.PHONY: help demo quick test lint fuzz docs wheel-test benchmark mutants setup system clean
 
 demo: setup  ## map the built-in room, ask three words, write pictures to demo/
 	$(BIN)/freeocc3d demo -o demo --overwrite
@@ -33,6 +33,9 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+fuzz: setup  ## try 10,000 damaged inputs of all kinds, and count how they end
+	$(BIN)/python tests/fuzz/run.py
+
 docs: setup  ## build the documentation as a site in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
@@ -41,6 +44,9 @@ wheel-test: setup  ## build the wheel, install it into an empty environment, and
 
 benchmark: setup  ## measure maps, ablations and peers
 	$(BIN)/python tools/benchmark.py
+
+mutants: setup  ## make small changes, and see which of them the tests notice
+	$(BIN)/python tools/mutants.py
 
 setup: system $(STAMP)
 

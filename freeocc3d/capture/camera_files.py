@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import CaptureError
+from ..core.image_files import Size
 from ..core.transforms import is_rigid
 from ..core.types import Intrinsics
 from .base import Options
-from .image_decoding import Size
 
 ASPECT_TOLERANCE = 0.02
 """Largest relative difference of the aspect ratios of two images that show the same view. ScanNet's color and depth

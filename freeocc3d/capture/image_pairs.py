@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, FrameError
+from ..core.image_files import Size
 from ..core.types import Frame
 from .base import Capture, Options
 from .depth_registration import PixelGrid
-from .image_decoding import Size, convert_to_meters, image_size, read_classes, read_color, read_depth
+from .image_decoding import convert_to_meters, image_size, read_classes, read_color, read_depth
 
 
 @dataclass(frozen=True)
@@ -85,12 +86,12 @@ class ImagePairs(Capture):
 
     def __getitem__(self, index: int) -> Frame:
         color_path, depth_path = self._files(index)
-        color = self._grid.color(self._stored_color(color_path))
+        color = self._grid.color(read_color(color_path, self._pairs.color_size))
         if depth_path is None:
             depth_m = np.zeros(color.shape[:2], np.float32)
         else:
-            stored = convert_to_meters(self._stored_depth(depth_path), self._units_per_meter, self.options.max_depth)
-            depth_m = self._grid.depth(stored)
+            raw = read_depth(depth_path, self._pairs.depth_size)
+            depth_m = self._grid.depth(convert_to_meters(raw, self._units_per_meter, self.options.max_depth))
         return Frame(index, float(self.timestamps[index]), color, depth_m, self._grid.intrinsics)
 
     def name(self, index: int) -> str:
@@ -99,15 +100,13 @@ class ImagePairs(Capture):
 
     def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
         path = self._files(index)[1]
-        return None if path is None else (self._stored_depth(path), self._units_per_meter)
+        return None if path is None else (read_depth(path, self._pairs.depth_size), self._units_per_meter)
 
     def _class_image(self, path: Path | None) -> NDArray[np.uint8] | None:
         """The class image at ``path`` on the frames' pixel grid. Raises FrameError if the file is unusable."""
         if path is None or not self.classes:
             return None
-        image = read_classes(path, len(self.classes))
-        _check_size(image, self._pairs.color_size, path)
-        return self._grid.classes(image)
+        return self._grid.classes(read_classes(path, len(self.classes), self._pairs.color_size))
 
     def _files(self, index: int) -> tuple[Path, Path | None]:
         """The color file of a frame and, if depth is read, its depth file."""
@@ -119,16 +118,6 @@ class ImagePairs(Capture):
             raise FrameError(f"Frame {self._pairs.numbers[index]} has no {missing} image for {alone}.")
         return color, depth
 
-    def _stored_color(self, path: Path) -> NDArray[np.uint8]:
-        color = read_color(path)
-        _check_size(color, self._pairs.color_size, path)
-        return color
-
-    def _stored_depth(self, path: Path) -> NDArray[np.uint16]:
-        raw = read_depth(path)
-        _check_size(raw, self._pairs.depth_size, path)
-        return raw
-
 
 def _first_size(paths: Iterable[Path], folder: Path) -> Size:
     for path in paths:
@@ -136,10 +125,4 @@ def _first_size(paths: Iterable[Path], folder: Path) -> Size:
             return image_size(path)
         except FrameError:
             continue
-    raise CaptureError(f"No image of {folder} can be read: all are damaged, or are not PNG or JPEG.")
-
-
-def _check_size(image: NDArray[np.generic], size: Size, path: Path) -> None:
-    if image.shape[1::-1] != size:
-        height, width = image.shape[:2]
-        raise FrameError(f"{path} has {width} x {height} pixels, but other frames have {size[0]} x {size[1]}.")
+    raise CaptureError(f"No image of {folder} can be read: all are damaged, or are not images.")

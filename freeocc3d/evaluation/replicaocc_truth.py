@@ -14,9 +14,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from msgspec import Meta
 from numba import njit, prange
 from numpy.typing import NDArray
 
@@ -28,7 +29,7 @@ from ..core.transforms import back_project, invert, transform
 from ..core.types import UNKNOWN, Frame
 from ..core.voxel_keys import KEY_LIMIT, pack_voxels, unpack_voxels
 from ..settings import config
-from ..settings.option_types import Finite, NotNegative, NotNegativeInt, Positive, PositiveInt
+from ..settings.option_types import Meters, PositiveInt, Stride, VoxelEdge
 from ..settings.typed_options import TypedOptions
 from ..settings.typed_options import build as build_options
 from ..settings.yaml_files import parse_yaml
@@ -40,29 +41,30 @@ _ROWS_BEFORE_MERGE = 4_000_000
 _MOST_CLASSES = 254
 UNLABELED = "occupied"
 """Class of every surface if a capture has no class images."""
+Shift = Annotated[float, Meta(ge=-1000, le=1000)]
 
 
 class Options(TypedOptions, frozen=True):
     """The protocol's parameters, with the paper's values."""
 
-    voxel_size: Positive = 0.08
+    voxel_size: VoxelEdge = 0.08
     """Edge of a voxel, meters."""
-    pixel_stride: PositiveInt = 4
+    pixel_stride: Stride = 4
     """Back-project every n-th pixel, in both directions."""
     frame_stride: PositiveInt = 2
     """Use every n-th frame to decide what is observed."""
-    max_range: Positive = 10.0
+    max_range: Meters = 10.0
     """Depth beyond this many meters counts as not measured."""
-    lattice_offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    lattice_offset: tuple[Shift, Shift, Shift] = (0.0, 0.0, 0.0)
     """Shift of the lattice, meters: half a voxel in z puts a floor at z = 0 inside a voxel, not on a face."""
     min_points: PositiveInt = 1
     """Least number of points of a voxel: sensor noise scatters some points into the voxels next to a surface."""
     fill: Literal["inside", "within"] = "inside"
     """"inside": a cell is occupied if a point lies in it; "within": also if a neighbor cell is, no farther than one
     voxel from center to center."""
-    tolerance: NotNegative = 1.0
+    tolerance: Annotated[float, Meta(ge=0, le=1000)] = 1.0
     """How far an observed voxel's center may lie behind the measured depth, in voxel edges."""
-    dilation: NotNegativeInt = 0
+    dilation: Annotated[int, Meta(ge=0, le=1000)] = 0
     """Grow the observed space by this many voxels, across faces."""
 
 

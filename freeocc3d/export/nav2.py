@@ -10,14 +10,16 @@ and NAME.avoid.yaml with the costs of all words. Source: nav2_map_server's map_i
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from ..core.errors import ConfigError, ExportError
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
 from ..query.scan_map import Map
-from ..settings.option_types import Finite, NotNegative, Positive, Share
+from ..settings.option_types import Share
 from .export_frames import BoxOptions, UprightFrame, find_floor_z, place_voxels, write_description
 from .keepout_masks import parse_avoided, write_layers
 from .map_server_files import PLAN, CellGrid, write_map
@@ -33,13 +35,13 @@ class Options(BoxOptions, frozen=True):
 
     frame: UprightFrame = "gravity"
     """"gravity" (walls along x and y) or "first-camera" (first camera at the origin, its view along x)."""
-    min_height: Finite = 0.1
+    min_height: Annotated[float, Meta(ge=-1000, le=1000)] = 0.1
     """Least height of an obstacle above the floor, meters. The robot drives over lower things."""
-    max_height: Positive = 1.8
+    max_height: Annotated[float, Meta(gt=0, le=1000)] = 1.8
     """Greatest height of an obstacle above the floor, meters. The robot drives under higher things."""
     min_free: Share = 0.5
     """Least share of a column's voxels between the heights that must be free for a free cell, 0…1; 0 = any."""
-    inflation: NotNegative = 0.0
+    inflation: Annotated[float, Meta(ge=0, le=1000)] = 0.0
     """Radius around obstacles that is occupied too, meters; most planners inflate obstacles themselves."""
     avoid: tuple[str, ...] = ()
     """Words with a cost for the robot, as in [carpet:40%, glass:0.5]. WORD: the robot must not enter. WORD:METERS: it

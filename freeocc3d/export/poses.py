@@ -11,16 +11,16 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from ..core.errors import ExportError
 from ..core.transforms import invert, rotations_to_quats, transform
 from ..core.types import Gaussians, Intrinsics
 from ..query.scan_map import Map
-from ..settings.option_types import NotNegativeInt
 from ..settings.typed_options import TypedOptions
 from .export_frames import Frame, to_frame, write_description
 from .ply import write_colored_ply
@@ -37,7 +37,7 @@ class Options(TypedOptions, frozen=True):
     """"colmap" or "nerfstudio"."""
     frame: Frame = "gravity"
     """"gravity" (z up, floor at 0), "first-camera" (z up, first camera at the origin) or "map"."""
-    points: NotNegativeInt = 100_000
+    points: Annotated[int, Meta(ge=0, le=100_000_000)] = 100_000
     """Greatest number of points for the start of training: evenly spread means of Gaussians."""
 
 

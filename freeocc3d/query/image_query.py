@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError
+from ..core.image_files import ImageFileError, read_image
 from ..core.types import Frame, Intrinsics, Occupancy
 from ..language.feature_codec import Features, compute_cosines, mask_known
 from ..storage.saved_map import SavedMap
@@ -127,10 +128,7 @@ def _read(path: Path) -> NDArray[np.uint8]:
     import cv2
 
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise FreeOccError(f"Cannot read the picture {path}: {error.strerror}.") from error
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if image is None:
-        raise FreeOccError(f"{path} is not a readable picture: give a PNG or JPEG file.")
+        image = read_image(path, cv2.IMREAD_COLOR)
+    except ImageFileError as error:
+        raise FreeOccError(f"{error} Give a picture as a PNG or JPEG file.") from error
     return np.asarray(image[..., ::-1])

@@ -20,8 +20,9 @@ import yaml
 from ..core.errors import ConfigError
 from ..core.warnings import Notice
 from . import registry, renamed, stages
+from .option_types import converted, shown
 from .presets import find_preset
-from .typed_options import TypedOptions, build, field_types, nearest
+from .typed_options import TypedOptions, build, field_types, nearest, shortened
 from .yaml_files import apply_override, read_yaml
 
 BackendValues = dict[str, dict[str, Any]]
@@ -179,8 +180,8 @@ def resolve(values: Mapping[str, Any] | Settings) -> Settings:
         return values
     if not isinstance(values, Mapping):
         raise ConfigError(
-            f"Settings are a mapping of sections, such as {{'occupancy': {{'voxel_size': 0.05}}}}, got {values!r}. "
-            "freeocc3d.settings.config.load reads a file or a preset."
+            f"Settings are a mapping of sections, such as {{'occupancy': {{'voxel_size': 0.05}}}}, got "
+            f"{shown(values)}. freeocc3d.settings.config.load reads a file or a preset."
         )
     return _resolve(values, saved=False)
 
@@ -204,7 +205,7 @@ def _resolve(values: Mapping[Any, Any], saved: bool) -> Settings:
     outer = [name for name, section in SECTIONS.items() if not section.within]
     for name in values:
         if name not in outer:
-            raise ConfigError(f"Unknown section '{name}'{nearest(name, outer)}.")
+            raise ConfigError(f"Unknown section '{shortened(name)}'{nearest(name, outer)}.")
     found: dict[str, Any] = {"backends": {}}
     notices: list[Notice] = []
     for name in outer:
@@ -241,40 +242,41 @@ def _divided(
         backend = renamed.current_backend(section.folder, key)
         if key in known:
             own[key] = value
-        elif section.folder and registry.is_backend(section.folder, str(backend)):
+        elif section.folder and isinstance(backend, str) and registry.is_backend(section.folder, backend):
             notices += renamed.compare_names(f"{name}.{key}", f"{name}.{backend}")
             where = f"{name}.{backend}"
             backends[backend] = renamed.current_keys(_lines(value, where), f"{where}.", notices)
         else:
             others = registry.backends(section.folder) if section.folder else ()
-            raise ConfigError(f"Unknown key '{name}.{key}'{nearest(key, [*known, *nested, *others])}.")
+            raise ConfigError(f"Unknown key '{name}.{shortened(key)}'{nearest(key, [*known, *nested, *others])}.")
     return own, backends
 
 
 def _checked(section: str, name: str, values: dict[str, Any]) -> dict[str, Any]:
-    """The values given for a backend that are not its defaults. The backend's class checks them; if its packages are
-    not installed, only the names are checked. Raises ConfigError."""
+    """The values given for a backend that are not its defaults. Its class checks what their types do not say, if its
+    packages are installed. Raises ConfigError."""
     folder, where = SECTIONS[section].folder, f"{section}.{name}."
     backend = registry.backend(folder, name)
-    defaults = {option.name: json.dumps(option.default) for option in backend.options}
-    values = {key: value for key, value in values.items() if json.dumps(value, default=str) != defaults.get(key)}
-    if not values:
-        return {}
-    if backend.missing:
-        registry.check_names(backend, values, where)
+    registry.check_names(backend, values, where)
+    known = {option.name: option for option in backend.options}
+    for key, value in values.items():
+        if not isinstance(kind := known[key].kind, str):  # else its module must say what fits
+            values = {**values, key: converted(kind, value, f"{where}{key}")}
+    values = {key: value for key, value in values.items() if value != known[key].default}
+    if not values or backend.missing:
         return values
     options = registry.build_options(registry.load(folder, name), values, where)
     return {key: getattr(options, key) for key in values}
 
 
 def _section(values: Mapping[Any, Any], name: str) -> dict[Any, Any]:
-    given = values.get(name) or {}
+    given = {} if values.get(name) is None else values[name]
     if not isinstance(given, dict):
-        raise ConfigError(f"The section '{name}' must contain 'key: value' lines, got {given!r}.")
+        raise ConfigError(f"The section '{name}' must contain 'key: value' lines, got {shown(given)}.")
     return given
 
 
 def _lines(given: Any, where: str) -> dict[Any, Any]:
-    if not isinstance(given or {}, dict):
-        raise ConfigError(f"'{where}' must contain 'key: value' lines, got {given!r}.")
+    if given is not None and not isinstance(given, dict):
+        raise ConfigError(f"'{where}' must contain 'key: value' lines, got {shown(given)}.")
     return given or {}

@@ -8,7 +8,8 @@ option::
     order: Literal["auto", "video", "photos"] = "auto"
     cutoff: Advanced[Positive] = 3.0
 
-All number types refuse infinity and NaN.
+All numbers have bounds: those that declare no narrower range end at 1e9, and positive ones begin at 1e-9. Text has at
+most 4096 characters, none of them NUL.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import ast
 import contextlib
 import math
 import numbers
-import sys
+import reprlib
 import types
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -28,16 +29,28 @@ from ..core.errors import ConfigError
 
 T = TypeVar("T")
 
-_LARGEST = sys.float_info.max
+_LEAST = 1e-9
+_LARGEST = 10**9
+"""Bounds of numbers that declare no narrower range; descriptions of types leave them out."""
+_LONGEST_TEXT = 4096
+_LONGEST_LIST = 10_000
 
 Finite = Annotated[float, Meta(ge=-_LARGEST, le=_LARGEST)]
-Positive = Annotated[float, Meta(gt=0, le=_LARGEST)]
+Positive = Annotated[float, Meta(ge=_LEAST, le=_LARGEST)]
 NotNegative = Annotated[float, Meta(ge=0, le=_LARGEST)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 PositiveShare = Annotated[float, Meta(gt=0, le=1)]
 Cosine = Annotated[float, Meta(ge=-1, le=1)]
-PositiveInt = Annotated[int, Meta(ge=1)]
-NotNegativeInt = Annotated[int, Meta(ge=0)]
+Meters = Annotated[float, Meta(ge=0.0001, le=1000)]
+VoxelEdge = Annotated[float, Meta(ge=0.001, le=100)]
+PositiveInt = Annotated[int, Meta(ge=1, le=_LARGEST)]
+NotNegativeInt = Annotated[int, Meta(ge=0, le=_LARGEST)]
+Stride = Annotated[int, Meta(ge=1, le=4096)]
+Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+Device = Annotated[
+    str, Meta(pattern="^[A-Za-z]+(:[0-9]{1,3})?$", max_length=32, description="a device such as cpu or cuda:0")
+]
+FilePath = Annotated[str, Meta(min_length=1, description="a path")]
 
 Advanced = Annotated[T, Meta(extra={"advanced": True})]
 """An option that is only for comparisons with other methods; ``freeocc3d list`` shows it only on request."""
@@ -50,10 +63,11 @@ _NOUNS = {
     type(None): ("null", "nulls"),
 }
 _NAMES = {
-    "Advanced": Advanced, "Annotated": Annotated, "Cosine": Cosine, "Finite": Finite, "Literal": Literal, "Meta": Meta,
-    "NotNegative": NotNegative, "NotNegativeInt": NotNegativeInt, "Positive": Positive, "PositiveInt": PositiveInt,
-    "PositiveShare": PositiveShare, "Share": Share, "bool": bool, "float": float, "int": int, "str": str,
-    "tuple": tuple,
+    "Advanced": Advanced, "Annotated": Annotated, "Cosine": Cosine, "Device": Device, "FilePath": FilePath,
+    "Finite": Finite, "Literal": Literal, "Meta": Meta, "Meters": Meters, "NotNegative": NotNegative,
+    "NotNegativeInt": NotNegativeInt, "Positive": Positive, "PositiveInt": PositiveInt, "PositiveShare": PositiveShare,
+    "Seed": Seed, "Share": Share, "Stride": Stride, "VoxelEdge": VoxelEdge, "bool": bool, "float": float, "int": int,
+    "str": str, "tuple": tuple,
 }  # fmt: skip
 """The names that an option's annotation may contain."""
 
@@ -66,11 +80,12 @@ def converted(kind: Any, value: Any, name: str) -> Any:
     """
     try:
         plain = _plain(value)
-        if not _is_finite(plain):
+        items = plain if isinstance(plain, list) else [plain]
+        if len(items) > _LONGEST_LIST or not all(map(_is_usable, items)):
             raise msgspec.ValidationError
         return msgspec.convert(plain, kind)
     except msgspec.ValidationError:
-        raise ConfigError(f"'{name}' must be {_expected(kind, value)}, got {_shown(value)}.") from None
+        raise ConfigError(f"'{name}' must be {_expected(kind, value)}, got {shown(value)}.") from None
 
 
 def described(kind: Any) -> str:
@@ -80,8 +95,7 @@ def described(kind: Any) -> str:
 
 def is_advanced(kind: Any) -> bool:
     """Whether the type is declared as ``Advanced``."""
-    metas = [part for part in getattr(kind, "__metadata__", ()) if isinstance(part, Meta)]
-    return any((meta.extra or {}).get("advanced") for meta in metas)
+    return any((meta.extra or {}).get("advanced") for meta in _metas(kind))
 
 
 def holds_text(kind: Any) -> bool:
@@ -107,21 +121,25 @@ def annotated_type(annotation: ast.expr, aliases: dict[str, ast.expr]) -> Any:
     return ast.unparse(annotation)
 
 
-def _plain(value: Any) -> Any:
-    """Converts numpy numbers in the value to Python numbers."""
+def _plain(value: Any, inside: bool = False) -> Any:
+    """Converts numpy numbers in the value to Python numbers. inside: the value is an item; lists in it stay."""
     if type(value) in (bool, int, float, str, type(None)):
         return value
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+    if isinstance(value, list | tuple) and not inside:
+        return [_plain(item, inside=True) for item in value[: _LONGEST_LIST + 1]]
     if isinstance(value, numbers.Integral):
         return int(value)
     return float(value) if isinstance(value, numbers.Real) else value
 
 
-def _is_finite(plain: Any) -> bool:
-    if isinstance(plain, list):
-        return all(map(_is_finite, plain))
-    return not isinstance(plain, float) or math.isfinite(plain)
+def _is_usable(plain: Any) -> bool:
+    """Whether a value that is no list can be an option's at all."""
+    return math.isfinite(plain) if isinstance(plain, float) else not isinstance(plain, str) or is_text(plain)
+
+
+def is_text(text: str) -> bool:
+    """Whether options, file names and servers can hold a text: it is not too long, holds no NUL, and is Unicode."""
+    return len(text) <= _LONGEST_TEXT and "\0" not in text and not any("\ud800" <= char <= "\udfff" for char in text)
 
 
 def _base(kind: Any) -> Any:
@@ -137,41 +155,68 @@ def _parts(kind: Any) -> tuple[Any, ...]:
     return (kind,)
 
 
-def _alternatives(kind: Any) -> list[str]:
+def _alternatives(kind: Any, value: Any = None) -> list[str]:
+    """What fits, in words. value: what was given in its place, see ``_range``."""
     if isinstance(kind, str):
         return [kind]
     texts: list[str] = []
     for part in _parts(kind):
         base = _base(part)
-        if get_origin(base) is Literal:
+        said = next((meta.description for meta in _metas(part) if meta.description), None)
+        if said is not None:
+            texts.append(said)
+        elif get_origin(base) is Literal:
             texts += [str(choice) for choice in get_args(base)]
         elif get_origin(base) is tuple:
-            texts.append(_described_list(base))
+            texts.append(_described_list(base, value))
         else:
-            texts.append(_with_range(_NOUNS[base][0], part))
+            texts.append(_with_range(_NOUNS[base][0], part, value))
     return texts
 
 
-def _described_list(kind: Any) -> str:
+def _described_list(kind: Any, value: Any) -> str:
     items = get_args(kind)
     noun = _NOUNS[_base(items[0])][1]
     count = "" if items[-1] is Ellipsis else f"{len(items)} "
-    return f"a list of {count}{_with_range(noun, items[0])}"
+    given = [item for item in value if _is_number(item)] if isinstance(value, list) else []
+    return f"a list of {count}{_with_range(noun, items[0], max(given, key=abs, default=None))}"
 
 
-def _range(kind: Any) -> str:
-    """The range of a number in words; empty if every finite number is allowed."""
-    metas = [part for part in getattr(kind, "__metadata__", ()) if isinstance(part, Meta)]
-    low = next((f"at least {meta.ge:g}" for meta in metas if meta.ge is not None and meta.ge > -_LARGEST), "")
-    low = next((f"greater than {meta.gt:g}" for meta in metas if meta.gt is not None), low)
-    high = next((f"at most {meta.le:g}" for meta in metas if meta.le is not None and meta.le < _LARGEST), "")
-    high = next((f"less than {meta.lt:g}" for meta in metas if meta.lt is not None), high)
-    between = next((f"from {meta.ge:g} to {meta.le:g}" for meta in metas if meta.ge is not None and high), "")
-    return between if between and low else " and ".join(filter(None, (low, high)))
+def _metas(kind: Any) -> list[Meta]:
+    return [part for part in getattr(kind, "__metadata__", ()) if isinstance(part, Meta)]
 
 
-def _with_range(noun: str, kind: Any) -> str:
-    limits = _range(kind)
+def _range(kind: Any, value: Any = None) -> str:
+    """The range of a number in words; empty if it has only the bounds of all numbers. value: one that does not fit; if
+    it is beyond those bounds, they are named too."""
+    bounds = {name: next((getattr(m, name) for m in _metas(kind) if getattr(m, name) is not None), None) for name in (
+        "gt", "ge", "lt", "le"
+    )}  # fmt: skip
+    gt, ge, lt, le = bounds.values()
+    beyond = _is_number(value) and abs(value) > _LARGEST
+    if le == _LARGEST and not beyond:
+        le = None
+    if ge == -_LARGEST and not beyond:
+        ge = None
+    if ge == _LEAST and not beyond and not (_is_number(value) and 0 < value < _LEAST):
+        gt, ge = 0, None
+    if ge is not None and le is not None:
+        return f"from {_number(ge)} to {_number(le)}"
+    low = f"greater than {_number(gt)}" if gt is not None else f"at least {_number(ge)}" if ge is not None else ""
+    high = f"less than {_number(lt)}" if lt is not None else f"at most {_number(le)}" if le is not None else ""
+    return " and ".join(filter(None, (low, high)))
+
+
+def _number(bound: float) -> str:
+    return str(bound) if isinstance(bound, int) and abs(bound) != _LARGEST else f"{bound:g}"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _with_range(noun: str, kind: Any, value: Any) -> str:
+    limits = _range(kind, value)
     return " ".join(filter(None, (noun, "of" if limits.startswith("at ") else "", limits)))
 
 
@@ -184,17 +229,40 @@ def _expected(kind: Any, value: Any) -> str:
     plain = _plain(value)
     if isinstance(plain, float) and not math.isfinite(plain):
         return "a finite number"
-    if isinstance(plain, int | float) and not isinstance(plain, bool):
+    if _is_number(plain):
         for part in _parts(kind):
             base = _base(part)
             fits = base is float or (base is int and isinstance(plain, int))
-            if fits and (limits := _range(part)):
+            if fits and (limits := _range(part, plain)):
                 return limits
-    return described(kind)
+    texts = [item for item in (plain if isinstance(plain, list) else [plain]) if isinstance(item, str)]
+    if not all(map(is_text, texts)):
+        return f"text of at most {_LONGEST_TEXT} characters in UTF-8, without NUL"
+    if isinstance(plain, list) and len(plain) > _LONGEST_LIST:
+        return f"a list of at most {_LONGEST_LIST} values"
+    return _listed(_alternatives(kind, plain))
 
 
-def _shown(value: Any) -> str:
+class _Short(reprlib.Repr):
+    """``repr`` of at most a line, for any value."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxstring = self.maxother = 120
+        self.maxlist = self.maxtuple = self.maxdict = 8
+        self.maxlevel = 3
+
+    def repr_int(self, x: int, level: int) -> str:
+        digits = int(x.bit_length() * math.log10(2))
+        return str(x) if digits < 30 else f"about {'-' * (x < 0)}1e{digits}"
+
+
+_SHORT = _Short()
+
+
+def shown(value: Any) -> str:
+    """A value of any kind and size as a message shows it, in one line of bounded length."""
     plain = _plain(value)
     if plain is None or isinstance(plain, bool):
         return {None: "null", True: "true", False: "false"}[plain]
-    return repr(plain)
+    return _SHORT.repr(plain)

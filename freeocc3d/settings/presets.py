@@ -6,11 +6,13 @@ wheel contains them too.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Literal
 
 from ..core.errors import ConfigError
-from .typed_options import nearest
+from .option_types import is_text
+from .typed_options import nearest, shortened
 
 FOLDER = Path(__file__).parent / "preset_files"
 _ABLATIONS = "ablations"
@@ -25,16 +27,18 @@ def find_preset(given: str | Path, kind: Literal["configuration", "classes"] = "
     returned unchanged. Raises ConfigError for an unknown name.
     """
     path = Path(given)
-    if path.is_file() or path.suffix or path.is_absolute():
+    if not is_text(str(given)):
+        raise ConfigError(f"'{shortened(str(given))}' is no name of a file or preset.")
+    if path.suffix or path.is_absolute() or os.path.isfile(path):
         return path
     folders = (FOLDER / "classes",) if kind == "classes" else (FOLDER, FOLDER / _ABLATIONS)
     for folder in folders:
-        if (found := folder / f"{path}.yaml").is_file():
+        if os.path.isfile(found := folder / f"{path}.yaml"):
             return found
     known = list_presets(kind)
     raise ConfigError(
-        f"There is no file or preset '{given}'{nearest(str(given), known)}. Give the path of a file, or one of the "
-        f"presets {', '.join(known)}."
+        f"There is no file or preset '{shortened(str(given))}'{nearest(str(given), known)}. Give the path of a file, "
+        f"or one of the presets {', '.join(name for name in known if not name.startswith(_ABLATIONS))}."
     )
 
 

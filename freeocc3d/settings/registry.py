@@ -24,7 +24,7 @@ from typing import Any
 from ..core.errors import ConfigError, DependencyError
 from . import renamed, syntax_trees
 from .syntax_trees import Option
-from .typed_options import build, nearest
+from .typed_options import build, nearest, shortened
 
 PACKAGE = Path(__file__).parents[1]
 
@@ -36,6 +36,7 @@ FOLDERS = {
     "export": "exporter",
 }
 """Folder of backends -> what a message calls one of them."""
+_LONGEST_NAME = 100
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,8 @@ def backend(folder: str, name: str) -> Backend:
         return found
     known = backends(folder)
     if name not in known:
-        raise ConfigError(f"Unknown {FOLDERS[folder]} '{name}'{nearest(name, known)}. Choose from: {', '.join(known)}.")
+        said = f"Unknown {FOLDERS[folder]} '{shortened(name)}'{nearest(name, known)}."
+        raise ConfigError(f"{said} Choose from: {', '.join(known)}.")
     return known[name]
 
 
@@ -110,8 +112,12 @@ def build_options(module: types.ModuleType, values: Mapping[str, Any], where: st
     if options is not None and options.__module__ == module.__name__:  # else it was imported from another file
         return build(options, values, where)
     if values:
-        raise ConfigError(f"'{where.rstrip('.')}' has no options. Remove {', '.join(map(str, values))}.")
+        raise ConfigError(_without_options(values, where))
     return None
+
+
+def _without_options(values: Mapping[str, Any], where: str) -> str:
+    return f"'{where.rstrip('.')}' has no options. Remove {', '.join(map(shortened, values))}."
 
 
 def is_backend(folder: str, name: str) -> bool:
@@ -122,16 +128,22 @@ def is_backend(folder: str, name: str) -> bool:
 
 def check_names(backend: Backend, values: Mapping[str, Any], where: str) -> None:
     """Raises ConfigError for an option that a backend does not have; does not import the backend."""
+    if values and not backend.options:
+        raise ConfigError(_without_options(values, where))
     known = [option.name for option in backend.options]
     for key in values:
         if key not in known:
-            raise ConfigError(f"Unknown key '{where}{key}'{nearest(key, known)}.")
+            raise ConfigError(f"Unknown key '{where}{shortened(key)}'{nearest(key, known)}.")
 
 
 def _own(folder: str, name: str) -> Backend | None:
     """This package's backend with that name, or None; reads no other file of the folder."""
     for stem in (name, f"{name}_"):
-        if name.isidentifier() and PACKAGE.joinpath(*folder.split("."), f"{stem}.py").is_file():
+        if (
+            name.isidentifier()
+            and len(name) <= _LONGEST_NAME
+            and PACKAGE.joinpath(*folder.split("."), f"{stem}.py").is_file()
+        ):
             return _described(folder, name, f"freeocc3d.{folder}.{stem}")
     return None
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from ..core.errors import ConfigError
 from ..core.warnings import Notice
+from .option_types import shown
 
 OPTIONS: dict[str, str] = {
     "gaussians.initialisation": "initialization",
@@ -35,7 +36,7 @@ def current_keys(values: Mapping[Any, Any], where: str, notices: list[Notice]) -
     """
     found = {}
     for key, value in values.items():
-        old = f"{where}{key}"
+        old = f"{where}{key if isinstance(key, str) else shown(key)}"
         if old in REMOVED:
             notices.append(
                 Notice("option-removed", f"'{old}' has no effect: remove it. A later release will refuse it.")
@@ -45,7 +46,8 @@ def current_keys(values: Mapping[Any, Any], where: str, notices: list[Notice]) -
         if new != key and new in values:
             raise ConfigError(f"'{old}' is the old name of '{where}{new}': give only the new one.")
         found[new] = value
-        notices += compare_names(old, f"{where}{new}")
+        if new != key:
+            notices += compare_names(old, f"{where}{new}")
     return found
 
 

@@ -13,15 +13,25 @@ from msgspec import Meta
 from ..core.errors import ConfigError
 from .option_types import (
     Advanced,
-    Finite,
-    NotNegative,
+    Device,
+    FilePath,
+    Meters,
     NotNegativeInt,
     Positive,
     PositiveInt,
     PositiveShare,
     Share,
+    Stride,
+    VoxelEdge,
 )
 from .typed_options import TypedOptions
+
+Focal = Annotated[float, Meta(ge=1, le=1e6)]
+Center = Annotated[float, Meta(ge=-1e6, le=1e6)]
+Factor = Annotated[float, Meta(ge=0.01, le=100)]
+VariableName = Annotated[
+    str, Meta(pattern="^[A-Za-z_][A-Za-z0-9_]*$", description="the name of an environment variable")
+]
 
 
 class CaptureOptions(TypedOptions, frozen=True):
@@ -31,22 +41,22 @@ class CaptureOptions(TypedOptions, frozen=True):
     """Name of the reader; "auto" = recognize the layout of the folder."""
     start: NotNegativeInt = 0
     """Index of the first frame to use."""
-    stop: int | None = None
+    stop: NotNegativeInt | None = None
     """Index of the frame before which to stop; null = use all frames to the last."""
     stride: PositiveInt = 1
     """Use every n-th frame."""
     depth: bool = True
     """Read the capture's depth; false = use color only, even if the capture has depth."""
-    depth_scale: Positive | None = None
+    depth_scale: Annotated[float, Meta(ge=0.001, le=1e6)] | None = None
     """Depth units per meter (1000 for millimeters); null = as the format or its files state."""
-    max_depth: Positive = 6.0
+    max_depth: Meters = 6.0
     """Depth beyond this many meters counts as not measured."""
-    max_size: Annotated[int, Meta(ge=16)] | None = 960
+    max_size: Annotated[int, Meta(ge=16, le=16384)] | None = 960
     """Larger images of videos, photographs and reconstructions are reduced to this many pixels on the longer side; null
     = keep their size."""
-    scale: Positive | None = None
+    scale: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = None
     """Meters per unit of poses without a known scale, as in a scan without depth; null = unknown."""
-    intrinsics: tuple[Positive, Positive, Finite, Finite] | None = None
+    intrinsics: tuple[Focal, Focal, Center, Center] | None = None
     """fx, fy, cx, cy of the color image in pixels; they replace those in the files. null = as the files state."""
     color_focal: Annotated[float, Meta(ge=0.5, le=2)] | None = None
     """Focal length of the color camera divided by the one in the files, for files that suit the depth but not the color
@@ -66,26 +76,26 @@ class TrackingOptions(TypedOptions, frozen=True):
 class StereoOptions(TypedOptions, frozen=True):
     """Depth by multi-view stereo, for captures without depth."""
 
-    size: Annotated[int, Meta(ge=64)] = 640
+    size: Annotated[int, Meta(ge=64, le=4096)] = 640
     """Longer side of the stereo depth maps in pixels; they are then enlarged to the size of the frames."""
-    neighbors: PositiveInt = 4
+    neighbors: Annotated[int, Meta(ge=1, le=64)] = 4
     """Number of views that each frame is compared with."""
-    agreeing: Advanced[PositiveInt] = 2
+    agreeing: Advanced[Annotated[int, Meta(ge=1, le=128)]] = 2
     """Number of views, of 2 * neighbors, that must confirm the depth of a pixel to make it part of the surface."""
-    network: str | None = None
+    network: FilePath | None = None
     """ONNX network that predicts (inverse) depth from one image. Its depth is fitted to the stereo depth of each frame
     and fills the gaps in it. null = no network."""
-    device: str = "cpu"
+    device: Device = "cpu"
     """Device that computes stereo: "cpu", or a CUDA device of torch such as "cuda:0"."""
 
 
 class GaussianOptions(TypedOptions, frozen=True):
     """Layer 2: how the depth of keyframes becomes Gaussians."""
 
-    cell_size: Positive | None = None
+    cell_size: VoxelEdge | None = None
     """Edge in meters of the cells that hold one Gaussian each; null = half the voxel size. If the scale is unknown,
     voxels may turn out to be large, so null then also limits the edge to a hundredth of the usual depth."""
-    pixel_stride: PositiveInt | None = None
+    pixel_stride: Stride | None = None
     """Use every n-th row and column of a keyframe; null = about 320 columns, more if cells are small, and all pixels of
     stereo depth."""
     every: NotNegativeInt = 1
@@ -95,16 +105,16 @@ class GaussianOptions(TypedOptions, frozen=True):
     """Move the points of the cells to the surface on which the depth maps of all frames agree, and remove points that
     most depth maps see through. This adds 6 to 22 points of IoU on the shipped captures and halves the number of
     Gaussians."""
-    coverage: Advanced[Positive] = 0.7
+    coverage: Advanced[Annotated[float, Meta(ge=0.01, le=10)]] = 0.7
     """s_perp divided by the spacing of the Gaussians. The spacing is the edge of a cell, or the footprint of a pixel on
     the surface where that is larger. At 0.7 a flat wall reaches alpha = 0.5 at 0.6 voxels from its surface. The center
     of a voxel that the surface crosses is within 0.5 voxels of the surface where the surface is parallel to the grid,
     and within 0.87 where it is oblique."""
-    uncertainty: Advanced[NotNegative] = 0.0
+    uncertainty: Advanced[Annotated[float, Meta(ge=0, le=10)]] = 0.0
     """Standard deviations of an anchor's averaged depth to add (in quadrature) to the spacing. Uncertain surfaces,
     which few keyframes saw from afar, become thicker. A value of 1 loses two to eight points of IoU on the house
     captures and gains 0.3 on the kitchen."""
-    gamma: Advanced[Positive] = 1.0
+    gamma: Advanced[Annotated[float, Meta(ge=0.1, le=10)]] = 1.0
     """Elongation along the viewing ray, s_par = gamma * s_perp; at 1 a Gaussian is a sphere. 1 gives the best results
     on the shipped captures (0.6 and 1.5 lose one to five points of IoU on the kitchen)."""
     opacity: Advanced[PositiveShare] = 0.9
@@ -113,10 +123,10 @@ class GaussianOptions(TypedOptions, frozen=True):
     initialization: Advanced[Literal["ray_aligned", "isotropic"]] = "ray_aligned"
     """"ray_aligned": the paper's geometry-aware initialization, as above; "isotropic": spheres with the mean distance
     to the three nearest Gaussians, as in 3D Gaussian splatting (for comparison)."""
-    edge: Advanced[Positive] = 0.05
+    edge: Advanced[Factor] = 0.05
     """Drop pixels whose depth differs from a neighbor's by more than this share of the depth. At an edge, a sensor
     reports depths that belong to neither side."""
-    min_pixels: Advanced[PositiveInt] = 2
+    min_pixels: Advanced[Annotated[int, Meta(ge=1, le=1_000_000)]] = 2
     """Number of measurements that a cell needs; a cell too small for that many needs fewer."""
 
 
@@ -125,16 +135,16 @@ class FittingOptions(TypedOptions, frozen=True):
 
     rasterizer: str = "cpu"
     """The renderer: "cpu" (compiled), "gsplat" (CUDA), or "reference" (plain PyTorch, slow)."""
-    passes: NotNegativeInt = 6
+    passes: Annotated[int, Meta(ge=0, le=1000)] = 6
     """Number of times that each keyframe is rendered and compared; 0 = keep the initial Gaussians."""
     means: Advanced[Literal["anchored", "free"]] = "anchored"
     """"anchored": means stay on the measured surface, and shapes stay near the initialization; "free": the images move
     every parameter, as in other systems (for comparison; makes occupancy worse)."""
-    width: PositiveInt = 320
+    width: Annotated[int, Meta(ge=16, le=4096)] = 320
     """Width of the rendered images in pixels."""
-    depth_weight: Advanced[Positive] = 1.0
+    depth_weight: Advanced[Annotated[float, Meta(ge=1e-6, le=1e6)]] = 1.0
     """beta: a depth error of one meter weighs as much as a color error of the whole color range."""
-    shape_weight: Advanced[NotNegative] = 0.1
+    shape_weight: Advanced[Annotated[float, Meta(ge=0, le=1e6)]] = 0.1
     """Weight that keeps the outlines of anchored Gaussians near the initialization; it multiplies the mean squared
     logarithm of their change. A smaller value renders better (0.02: + 0.4 dB) and makes occupancy worse (by 0.5 to 1
     point of IoU)."""
@@ -145,21 +155,21 @@ class LanguageOptions(TypedOptions, frozen=True):
 
     encoder: str = "color"
     """Turns images and words into features. "color" needs no network and knows color names only."""
-    keyframes: Positive = 1.0
+    keyframes: Annotated[float, Meta(gt=0, le=1e6)] = 1.0
     """Keyframes to encode: a value up to 1 is a share of all keyframes, a larger one a number. If not all are encoded,
     sharp keyframes that together show the most surface are chosen. The time of layer 3 is proportional to this
     number."""
-    visible_within: Advanced[Positive] = 0.02
+    visible_within: Advanced[Meters] = 0.02
     """A Gaussian is visible if the depth map shows something within this many meters of it…"""
-    visible_share: Advanced[NotNegative] = 0.01
+    visible_share: Advanced[Annotated[float, Meta(ge=0, le=10)]] = 0.01
     """…plus this share of its depth, plus its own standard deviation along the ray; otherwise it is hidden. Where no
     depth was measured, the rendered depth of the Gaussians is used."""
-    near: Advanced[Positive] = 0.5
+    near: Advanced[Meters] = 0.5
     """Views count in proportion to 1 / depth^2; all views nearer than this many meters count the same."""
     border: Advanced[Annotated[float, Meta(ge=0, le=0.5)]] = 0.1
     """Width of the border of an image, as a share of its shorter side, in which views count less toward the edge:
     encoders see things there that the edge cuts off."""
-    disagreement: Advanced[Positive | None] = 0.6
+    disagreement: Advanced[Factor | None] = 0.6
     """Leave out a region of a view if its features differ too much from those of the other views: by more than this
     share of the difference between two random places of the scene. null = leave out none."""
 
@@ -167,18 +177,18 @@ class LanguageOptions(TypedOptions, frozen=True):
 class VocabularyOptions(TypedOptions, frozen=True):
     """Names of what is in the scene, from a vision-language model. The word in a query competes with them."""
 
-    endpoint: str | None = None
+    endpoint: Annotated[str, Meta(min_length=1, description="an address")] | None = None
     """Address of an OpenAI-compatible server, such as http://localhost:11434/v1 (Ollama). Keyframes are sent to it.
     null = ask no model."""
     model: str = ""
     """Name of the model on the server."""
-    api_key_env: str | None = None
+    api_key_env: VariableName | None = None
     """Name of the environment variable that holds the server's key; null = the server needs no key."""
-    keyframes: PositiveInt = 24
+    keyframes: Annotated[int, Meta(ge=1, le=10_000)] = 24
     """Largest number of keyframes to ask about; they are evenly spread."""
-    timeout: Positive = 60.0
+    timeout: Annotated[float, Meta(ge=0.1, le=86400)] = 60.0
     """Longest time in seconds to wait for one answer."""
-    retries: NotNegativeInt = 2
+    retries: Annotated[int, Meta(ge=0, le=100)] = 2
     """Number of times to repeat a question that got no answer."""
 
     def __post_init__(self) -> None:
@@ -190,20 +200,20 @@ class VocabularyOptions(TypedOptions, frozen=True):
 class OccupancyOptions(TypedOptions, frozen=True):
     """Layer 4: how Gaussians become voxels."""
 
-    voxel_size: Positive = 0.08
+    voxel_size: VoxelEdge = 0.08
     """Edge of a voxel in meters."""
-    finest: Positive | None = None
+    finest: VoxelEdge | None = None
     """Edge of the smallest voxels in meters, such as 0.01 where the others have 0.08. Voxels are halved down to this
     size where the surface is not flat or its meaning changes. null = all voxels have one size."""
     projection: Advanced[Literal["probabilistic", "poisson", "integrated", "released"]] = "probabilistic"
     """What a Gaussian adds to a voxel: "probabilistic" (the paper's equations), "poisson" (with its opacity, in the
     form of the paper's code), "integrated" (its mass inside the voxel), "released" (a dilation, as the paper's code
     runs)."""
-    cutoff: Advanced[Positive] = 3.0
+    cutoff: Advanced[Annotated[float, Meta(ge=0.1, le=10)]] = 3.0
     """Distance, in standard deviations, to which a Gaussian affects voxels."""
     threshold: Annotated[float, Meta(gt=0, lt=1)] = 0.5
     """A voxel is occupied if its alpha is at least this."""
-    device: str = "cpu"
+    device: Device = "cpu"
     """Device that projects the Gaussians: "cpu" (compiled), or a GPU of torch such as "cuda:0"."""
     contradiction: Advanced[Positive] = 4.0
     """A voxel above the threshold is nevertheless free if the log-odds of the depth maps there (see carving) are at
@@ -218,23 +228,23 @@ class OccupancyOptions(TypedOptions, frozen=True):
 class CarvingOptions(TypedOptions, frozen=True):
     """Layer 4: free space from depth maps."""
 
-    margin: Advanced[Positive] = 1.0
+    margin: Advanced[Factor] = 1.0
     """A depth map sees through a voxel if its depth exceeds that of the voxel's center by this many voxel edges (plus
     the uncertainty of the depth)."""
-    noise: Advanced[NotNegative] = 0.0019
+    noise: Advanced[Annotated[float, Meta(ge=0, le=0.1)]] = 0.0019
     """Standard deviation of a depth divided by the depth squared, in 1/m, where the frame states no uncertainty. Three
     standard deviations are added to the margin."""
-    hit: Advanced[Positive] = 0.85
+    hit: Advanced[Factor] = 0.85
     """Log-odds that a depth map adds to the voxel in which it ends: OctoMap's value, a probability of 0.7."""
-    miss: Advanced[Positive] = 0.4
+    miss: Advanced[Factor] = 0.4
     """Log-odds that a depth map subtracts from a voxel that it sees through: OctoMap's value, a probability of 0.4."""
     min_free: PositiveInt = 1
     """A voxel without surface is free if at least this many depth maps see through it."""
     every: NotNegativeInt = 1
     """Use every n-th tracked frame for free space, in addition to the keyframes; 0 = keyframes only."""
-    no_return: NotNegative = 0.0
+    no_return: Annotated[float, Meta(ge=0, le=1000)] = 0.0
     """Where a wide patch of a depth map has no measurement, space up to this many meters counts as seen through; 0 =
     such a patch has no effect. Use it only for sensors that fail just beyond their range: black, shiny and very near
     things have no depth either, and would be carved away."""
-    ray_step: Advanced[PositiveInt] = 16
+    ray_step: Advanced[Stride] = 16
     """Follow the ray of every n-th pixel (of more pixels if blocks are small) to find the blocks that a camera saw."""

@@ -20,7 +20,9 @@ from typing import Any, TypeVar, get_type_hints
 import msgspec
 
 from ..core.errors import ConfigError
-from .option_types import converted
+from .option_types import converted, shown
+
+_LONGEST_NAME = 100
 
 
 class TypedOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -58,7 +60,7 @@ def build(options: type[O], values: Mapping[str, Any], where: str = "") -> O:
     types = field_types(options)
     for key in values:
         if key not in types:
-            raise ConfigError(f"Unknown key '{where}{key}'{nearest(key, types)}.")
+            raise ConfigError(f"Unknown key '{where}{shortened(key)}'{nearest(key, types)}.")
     checked = {name: converted(types[name], value, f"{where}{name}") for name, value in values.items()}
     try:
         return options(**checked)
@@ -67,8 +69,14 @@ def build(options: type[O], values: Mapping[str, Any], where: str = "") -> O:
         raise ConfigError(named) from None
 
 
+def shortened(name: object) -> str:
+    """A name of unknown kind and length, as messages show it in one line."""
+    text = name if isinstance(name, str) else shown(name)
+    return text if len(text) <= _LONGEST_NAME and text.isprintable() else repr(text[:_LONGEST_NAME])[1:-1] + "…"
+
+
 def nearest(word: object, known: Iterable[str], least: float = 0.5) -> str:
     """Returns ``" (did you mean 'x'?)"`` for the nearest known word, or an empty string. least: of difflib's ratio,
     0…1."""
-    close = difflib.get_close_matches(str(word), list(known), n=1, cutoff=least)
+    close = difflib.get_close_matches(shortened(word), list(known), n=1, cutoff=least)
     return f" (did you mean '{close[0]}'?)" if close else ""

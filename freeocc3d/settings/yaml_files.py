@@ -7,35 +7,34 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from ..core import yaml_documents
 from ..core.errors import ConfigError
+from ..core.regular_files import read_text
+from ..core.yaml_documents import InvalidYaml
 from .option_types import holds_text, is_list
 
+_MOST_BYTES = 16 << 20
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Reads 1e-4 as a number, as YAML 1.2 does; YAML 1.1 requires a decimal point."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
-)
+_FLOAT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
+"""1e-4 is a number, as in YAML 1.2; YAML 1.1 requires a decimal point."""
 
 
 def parse_yaml(text: str) -> Any:
-    """The value of a YAML text. Raises yaml.YAMLError."""
-    return yaml.load(text, Loader=_Loader)
+    """The value of a YAML text. Raises InvalidYaml."""
+    return yaml_documents.parse_yaml(text, _FLOAT.fullmatch)
 
 
 def read_yaml(path: Path) -> dict[Any, Any]:
     """Reads the sections of a configuration file. Raises ConfigError if it is unreadable, invalid YAML or not a
     mapping."""
     try:
-        loaded = parse_yaml(path.read_text(encoding="utf-8"))
+        loaded = parse_yaml(read_text(path, _MOST_BYTES))
     except OSError as error:
         raise ConfigError(f"Cannot read the configuration {path}: {error.strerror}.") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not valid YAML: it holds bytes that are not text in UTF-8.") from error
+    except InvalidYaml as error:
+        raise ConfigError(f"{path} is not valid YAML: {error}.") from error
     if loaded is not None and not isinstance(loaded, dict):
         raise ConfigError(f"{path} must contain sections such as 'tracking:', got a {type(loaded).__name__}.")
     return loaded or {}
@@ -49,7 +48,7 @@ def apply_override(values: dict[Any, Any], override: str) -> None:
         raise ConfigError(f"An override has the form section.key=value, got '{override}'.")
     try:
         value = parse_yaml(text)
-    except yaml.YAMLError as error:
+    except InvalidYaml as error:
         raise ConfigError(f"The value in '{override}' is not valid YAML.") from error
     node = values
     for key in keys[:-1]:
@@ -79,6 +78,6 @@ def named_values(assignments: Iterable[str], kinds: Mapping[str, Any]) -> dict[s
             else:
                 items = [part.strip() for part in text.split(",")]
                 values[name] = items if holds_text(kind) else [parse_yaml(item) for item in items]
-        except yaml.YAMLError as error:
+        except InvalidYaml as error:
             raise ConfigError(f"The value of '{name}' is not valid YAML: '{text}'.") from error
     return values

@@ -6,7 +6,6 @@ knows.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_type_hints
@@ -16,8 +15,12 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from ..core.checksums import hash_bytes
 from ..core.errors import MapError
+from ..core.regular_files import read_bytes
 from ..core.transforms import is_rigid
+from ..core.typed_documents import InvalidDocument, as_type
+from ..core.yaml_documents import InvalidYaml, parse_yaml
 from .map_files import MANIFEST
 
 FORMAT_VERSION = 3
@@ -25,6 +28,8 @@ FORMAT_VERSION = 3
 
 OLDEST_VERSION = 2
 """The oldest format that is read. Format 1 packed features in another way."""
+
+_MOST_BYTES = 64 << 20
 
 POSES = "camera to world"
 CODEC = "transform coding, 8, 4 and 2 bits a direction"
@@ -38,6 +43,7 @@ Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
 Count = Annotated[int, msgspec.Meta(ge=0)]
+Checksum = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{32}\Z")]
 
 
 def matrix(T: NDArray[np.float64]) -> Matrix:
@@ -145,7 +151,9 @@ class Manifest(MapFacts, frozen=True, kw_only=True):
     counts: Annotated[MapCounts, _key("numbers of Gaussians, voxels, frames and submaps")]
     keyframes: Annotated[tuple[Count, ...], _key("the capture's frames that are keyframes, ascending")]
     files: Annotated[dict[str, Count], _key("files of the folder with their sizes, bytes")]
-    checksums: Annotated[dict[str, str], _key("files of the folder with their checksums, XXH3 of 128 bits")] = {}
+    checksums: Annotated[dict[str, Checksum] | None, _key("the same files with their checksums: XXH3 of 128 bits")] = (
+        None
+    )
 
     @property
     def finest_m(self) -> float:
@@ -176,11 +184,17 @@ def manifest_keys() -> Iterator[ManifestKey]:
         yield ManifestKey(field.name, field.required, meta.extra["since"], meta.description or "")
 
 
+_SEAL = b"\n# xxh3_128 "
+"""Before the checksum of all bytes of map.yaml that precede it: the last line, a comment. Who edits the file removes
+the line; earlier maps have none."""
+
+
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write map.yaml. Raises OSError."""
     content = {name: value for name, value in msgspec.to_builtins(manifest).items() if value is not None}
     text = yaml.safe_dump({"format_version": manifest.format_version, **content}, sort_keys=False)
-    (folder / MANIFEST).write_text(text, encoding="utf-8")
+    data = text.encode().rstrip(b"\n")
+    (folder / MANIFEST).write_bytes(data + _SEAL + hash_bytes(data).encode() + b"\n")
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -190,11 +204,22 @@ def read_manifest(folder: Path) -> Manifest:
     if not folder.is_dir():
         raise MapError(f"The map folder {folder} does not exist.")
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_SafeLoader)
+        data = read_bytes(path, _MOST_BYTES)
+        content = parse_yaml(data.decode("utf-8-sig"))
     except FileNotFoundError as error:
         raise MapError(f"{folder} is not a map: it has no {MANIFEST}.") from error
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise MapError(f"{path} cannot be read: {' '.join(str(error).split())}.") from error
+    except OSError as error:
+        raise MapError(f"{path} cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise MapError(f"{path} is damaged: it holds bytes that are not text in UTF-8.") from error
+    except InvalidYaml as error:
+        raise MapError(f"{path} is damaged: {error}.") from error
+    body, seal, stated = data.rpartition(_SEAL)
+    if seal and stated.strip() != hash_bytes(body).encode():
+        raise MapError(
+            f"{path} is damaged or was changed: its last line states another checksum. Copy the whole folder "
+            "again; who changed it on purpose removes that line."
+        )
     version = content.get("format_version") if isinstance(content, dict) else None
     if not isinstance(version, int):
         raise MapError(f"{path} is not the manifest of a map: it has no format_version.")
@@ -205,9 +230,9 @@ def read_manifest(folder: Path) -> Manifest:
     if version < OLDEST_VERSION:
         raise MapError(f"The map {folder} has the old format {version}: map the capture again.")
     try:
-        manifest = msgspec.convert(content, Manifest)
-    except msgspec.ValidationError as error:
-        raise MapError(f"{path} is damaged: {_what_is_wrong(error)}.") from error
+        manifest = as_type(content, Manifest)
+    except InvalidDocument as error:
+        raise MapError(f"{path} is damaged: {error}.") from error
     if problem := _problem(manifest, folder):
         raise MapError(f"{path} is damaged: {problem}.")
     return manifest
@@ -227,33 +252,3 @@ def _problem(manifest: Manifest, folder: Path) -> str:
     root = folder.resolve()
     outside = next((name for name in manifest.files if not (folder / name).resolve().is_relative_to(root)), None)
     return "" if outside is None else f"'files' names {outside}, which lies outside the map's folder"
-
-
-_KINDS = {
-    "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false", "array": "a list",
-    "object": "a group of keys", "null": "nothing",
-}  # fmt: skip
-_SHAPES = (
-    (r"Object missing required field `(?P<key>\w+)`", "lacks '{key}'"),
-    (r"Expected `(?P<wanted>[^`]+)`, got `(?P<found>\w+)`", "has {found} instead of {wanted}"),
-    (r"Expected `array` of length (?P<wanted>\d+), got (?P<found>\d+)", "has {found} entries instead of {wanted}"),
-    (r"Expected `\w+` (?P<bound>[<>]=? \S+)", "has a number that is not {bound}"),
-)
-
-
-def _what_is_wrong(error: msgspec.ValidationError) -> str:
-    """A validation error as part of a sentence that names the field."""
-    message, _, where = str(error).partition(" - at `$")
-    field = where.strip("`.")
-    for pattern, sentence in _SHAPES:
-        if match := re.fullmatch(pattern, message):
-            said = {name: _in_words(value) for name, value in match.groupdict().items()}
-            return f"{repr(field) if field else 'it'} {sentence.format(**said)}"
-    return f"'{field}': {message}"
-
-
-def _in_words(kinds: str) -> str:
-    return " or ".join(_KINDS.get(kind, kind) for kind in kinds.split(" | "))
-
-
-_SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

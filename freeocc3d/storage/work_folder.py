@@ -156,7 +156,7 @@ class WorkFolder:
         if "map" not in self._marks:
             return False
         try:
-            files = read_manifest(self.folder).checksums
+            files = read_manifest(self.folder).checksums or {}
             return all(hash_file(self.folder / name) == checksum for name, checksum in files.items())
         except (OSError, MapError):
             return False
@@ -260,7 +260,7 @@ class WorkFolder:
 
     def mark_complete(self) -> None:
         """Record that the map is whole: from now on a resumed run only gives it its name. Raises OSError."""
-        files = read_manifest(self.folder).checksums
+        files = read_manifest(self.folder).files
         for folder in {(self.folder / name).parent for name in files}:
             sync(folder)
         self._mark("map", map_files.MANIFEST)
@@ -268,7 +268,7 @@ class WorkFolder:
     def finish(self, output: Path) -> None:
         """Give the work folder the map's name. At every moment the folder of that name is the old or the new map, and
         the work can be resumed until it is the new one. Raises OSError."""
-        listed = {map_files.MANIFEST, *read_manifest(self.folder).checksums}
+        listed = {map_files.MANIFEST, *read_manifest(self.folder).files}
         for path in self.folder.rglob("*"):
             name = path.relative_to(self.folder).as_posix()
             if not (name in listed or name in (_MARKS, LOCK) or path.is_dir()):

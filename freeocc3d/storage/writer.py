@@ -118,10 +118,10 @@ def _copy_missing(source: Path, folder: Path, pictures: bool) -> list[str]:
 def _require_equal(source: SavedMap, made: Manifest, copied: list[str], depth_factor: float) -> None:
     """Raise MapError if a copied file is not as the source map states it."""
     images = "" if depth_factor == 1 else ".color.jpg"
-    copied = [*copied, *(name for name in made.checksums if PurePath(name).match(f"{map_files.KEYFRAMES}/*{images}"))]
-    stated = source.manifest.checksums
+    found, stated = made.checksums or {}, source.manifest.checksums or {}
+    copied = [*copied, *(name for name in found if PurePath(name).match(f"{map_files.KEYFRAMES}/*{images}"))]
     for name in copied:
-        if not name.endswith(INDEX) and stated.get(name, made.checksums[name]) != made.checksums[name]:
+        if not name.endswith(INDEX) and stated.get(name, found[name]) != found[name]:
             raise MapError(f"{source.path / name} is damaged: its checksum is not the stated one. Copy the map again.")
 
 

@@ -10,19 +10,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from ..core.progress import Progress
 from ..core.types import Frame, Submap, Trajectory
 from ..core.warnings import Notice
-from ..settings.option_types import Positive
 from ..settings.typed_options import TypedOptions
 from .pose_graph import Edge, edges_to_arrays
 from .records import Records
 
+Overlap = Annotated[float, Meta(gt=0, le=2)]
 LEAST_COVERED = 0.05
 """Smallest share of a frame's pixels with a surface to track."""
 
@@ -30,7 +31,7 @@ LEAST_COVERED = 0.05
 class KeyframeOptions(TypedOptions, frozen=True):
     """Which frames become keyframes."""
 
-    keyframe_overlap: Positive = 0.85
+    keyframe_overlap: Overlap = 0.85
     """A frame becomes a keyframe if it shares less than this part of its keyframe's view."""
 
 

@@ -85,7 +85,7 @@ def test_query_by_class_by_picture_and_as_a_page(room, tmp_path) -> None:
     assert (tmp_path / "q.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert "did you mean 'yellow'?): --classes" in refused("query", room, "--class", "yelow")
     assert "does not lie in the picture" in refused("query", room, "--image", looks, "--box", 5, 0, 4, 9)
-    assert "is not a readable picture" in refused("query", room, "--image", room / "map.yaml")
+    assert "is not a readable image" in refused("query", room, "--image", room / "map.yaml")
     for wrong in (
         ["red", "--box", 0, 0, 1, 1],
         ["--class", "red", "--not", "blue"],

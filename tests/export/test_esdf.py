@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from exported_maps import map_of, read_vdb
+from exported_maps import VDB_READERS, map_of
 from scenes import occupancy_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
@@ -58,7 +58,8 @@ def test_in_another_frame_the_arrays_say_where_they_are(tmp_path) -> None:
     np.testing.assert_allclose(sorted(found.tolist()), sorted(expected.tolist()), atol=1e-6)
 
 
-def test_openvdb_holds_the_distances_of_known_voxels(tmp_path) -> None:
+@pytest.mark.parametrize("read_vdb", VDB_READERS)
+def test_openvdb_holds_the_distances_of_known_voxels(tmp_path, read_vdb) -> None:
     scan_map = map_of(scene())
     export_map(scan_map, "esdf", tmp_path / "esdf.npz")
     export_map(scan_map, "esdf", tmp_path / "esdf.vdb")

@@ -1,14 +1,15 @@
-"""OpenVDB files, read by OpenVDB's own Python module, Debian's python3-openvdb."""
+"""OpenVDB files, read by a plain reader, and by OpenVDB's own Python module, Debian's python3-openvdb."""
 
 import numpy as np
 import pytest
-from exported_maps import read_vdb
+from exported_maps import VDB_READERS
 
 from freeocc3d.export.openvdb_files import write_vdb
 
 
+@pytest.mark.parametrize("read_vdb", VDB_READERS)
 @pytest.mark.parametrize("seed", range(2))
-def test_openvdb_reads_every_voxel(tmp_path, seed) -> None:
+def test_every_voxel_is_read(tmp_path, seed, read_vdb) -> None:
     rng = np.random.default_rng(seed)
     # Leaves that share nodes, in other nodes, across the origin, and under other children of the root.
     keys = np.unique(np.concatenate((rng.integers(-20, 20, (12, 3)), rng.integers(-1500, 1500, (6, 3)))), axis=0)
@@ -30,7 +31,8 @@ def test_openvdb_reads_every_voxel(tmp_path, seed) -> None:
     np.testing.assert_array_equal(found, np.where(active, values, 0).ravel())
 
 
-def test_one_block(tmp_path) -> None:
+@pytest.mark.parametrize("read_vdb", VDB_READERS)
+def test_one_block(tmp_path, read_vdb) -> None:
     keys, values = np.zeros((1, 3), np.int32), np.full((1, 512), 2.5, np.float32)
     write_vdb(tmp_path / "a.vdb", "d", keys, values, values > 0, 1.0, np.zeros(3), {})
     assert read_vdb(tmp_path / "a.vdb", [(7, 0, 7), (8, 0, 0)], tmp_path)["values"] == [[2.5, True], [0.0, False]]

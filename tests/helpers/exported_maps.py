@@ -13,6 +13,7 @@ import pytest
 import yaml
 from manifests import tiny_manifest
 from scenes import occupancy_of
+from vdb_files import read_vdb_plainly
 
 from freeocc3d.core.types import FREE, OCCUPIED, Occupancy
 from freeocc3d.query.regions import Region
@@ -143,3 +144,10 @@ def read_vdb(path, indices, tmp_path):
     run = subprocess.run(command, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout)
+
+
+VDB_READERS = [
+    pytest.param(lambda path, indices, _: read_vdb_plainly(path, indices), id="plain"),
+    pytest.param(read_vdb, id="openvdb"),
+]
+"""Each reads a grid from a file, with the values at indices; OpenVDB itself only where it is installed."""

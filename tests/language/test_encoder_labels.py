@@ -133,7 +133,7 @@ def test_broken_class_images_are_reported(tmp_path: Path) -> None:
     path = Path(folder(tmp_path, [0, 1]))
     encoder = load(Options(folder=str(path)), capture)
     (path / "seg2_frame00000.png").write_bytes(b"not a picture")
-    with pytest.raises(CaptureError, match="not a class image"):
+    with pytest.raises(CaptureError, match="not a readable image"):
         encoder.encode(capture[0])
     (path / "seg2_frame00001.png").unlink()
     with pytest.raises(CaptureError, match="Cannot read"):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scenes import CAMERA, gaussians, random_gaussians
 
-from freeocc3d.core.types import Frame
+from freeocc3d.core.types import Frame, Gaussians, Intrinsics
 from freeocc3d.language.lifting import Options
 from freeocc3d.language.visibility import VisibleGaussians, find_visible, find_visible_reference
 
@@ -42,6 +45,24 @@ def weight(z: float, depth_m: object, options: Options | None = None, x: float =
     return float(found.weights[0])
 
 
+UNEVEN = Intrinsics(160, 120, 130.0, 110.0, 83.25, 55.75)
+"""A camera whose axes differ."""
+
+
+def settled(cloud: Gaussians, image: Frame, T: NDArray[np.float64], options: Options) -> NDArray[np.bool_]:
+    """Whether a Gaussian is seen, at the same pixel, also by a camera and a tolerance that differ a little: float32
+    puts those that are not on the other side of a border now and then."""
+    pixels, weights = find_visible_reference(cloud, image, T, options)
+    same = np.ones(len(cloud), bool)
+    camera = image.intrinsics
+    for x, y, more in ((2e-3, 2e-3, 0), (-2e-3, 2e-3, 0), (2e-3, -2e-3, 0), (-2e-3, -2e-3, 0), (0, 0, 1), (0, 0, -1)):
+        moved = replace(image, intrinsics=replace(camera, cx=camera.cx + x, cy=camera.cy + y))
+        wider = msgspec.structs.replace(options, visible_within=options.visible_within + 1e-4 * more)
+        others, other_weights = find_visible_reference(cloud, moved, T, wider)
+        same &= ((other_weights > 0) == (weights > 0)) & ((others == pixels) | (weights == 0))
+    return same
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("measured", [0.0, 0.6, 1.0])
 def test_kernel_agrees_with_numpy(seed: int, measured: float) -> None:
@@ -49,15 +70,18 @@ def test_kernel_agrees_with_numpy(seed: int, measured: float) -> None:
     cloud = random_gaussians(3000, seed, extent=3.0)
     depth = 2.0 + rng.normal(0, 0.3, (CAMERA.height, CAMERA.width))
     depth[rng.random(depth.shape) >= measured] = 0
-    options = Options(visible_within=0.3, visible_share=0.1)
-    found = find_visible(cloud, frame(depth), pose(seed), options)
-    pixels, weights = find_visible_reference(cloud, frame(depth), pose(seed), options)
+    image, T = replace(frame(depth), intrinsics=UNEVEN), pose(seed)
+    options = Options(visible_within=0.1, visible_share=0.05, border=0.2)
+    found = find_visible(cloud, image, T, options)
+    pixels, weights = find_visible_reference(cloud, image, T, options)
     ours = np.zeros(len(cloud))
     ours[found.rows] = found.weights
-    assert 100 < np.count_nonzero(weights) < 2500
-    # float32 puts a few Gaussians on the other side of a pixel's border or of the tolerance
-    assert np.isclose(ours, weights, rtol=1e-3, atol=1e-6).mean() > 0.99
-    assert (found.pixels == pixels[found.rows]).mean() > 0.99
+    same = settled(cloud, image, T, options)
+    assert same.mean() > 0.97
+    assert 80 < np.count_nonzero(weights) < 2500
+    np.testing.assert_allclose(ours[same], weights[same], rtol=2e-3, atol=1e-6)
+    kept = same[found.rows]
+    np.testing.assert_array_equal(found.pixels[kept], pixels[found.rows][kept])
 
 
 def test_hidden_and_outside_are_not_seen() -> None:

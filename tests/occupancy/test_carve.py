@@ -8,7 +8,7 @@ from scenes import CAMERA, wall_frame
 
 from freeocc3d.core import voxel_keys
 from freeocc3d.core.transforms import project
-from freeocc3d.core.types import Frame
+from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.occupancy import carve
 
 V = 0.08
@@ -130,6 +130,77 @@ def test_no_block_is_missed_however_small_blocks_are(sigma: float | None) -> Non
         wanted = voxel_keys.pack_voxels(np.floor((middles[inside] - ORIGIN) / edge).astype(int))
         assert len(wanted) > 50
         assert set(wanted.tolist()) <= found
+
+
+SKEWED = Intrinsics(90, 60, 70.0, 85.0, 41.0, 33.0)
+"""A camera whose axes differ in everything."""
+
+
+def patchwork(seed: int, sigma: bool) -> Frame:
+    """A depth image of many small patches at different depths, some without any, seen by ``SKEWED``."""
+    rng = np.random.default_rng(seed)
+    depth = np.repeat(np.repeat(rng.uniform(0.5, 2.5, (12, 15)), 5, axis=0), 6, axis=1)
+    depth[rng.random(depth.shape) < 0.02] = 0.4
+    depth[rng.random(depth.shape) < 0.02] = 0
+    depth[20:30, 30:48] = 0
+    uncertain = np.float32(rng.uniform(0.001, 0.03, depth.shape)) if sigma else None
+    return Frame(0, 0.0, np.zeros((*depth.shape, 3), np.uint8), np.float32(depth), SKEWED, uncertain)
+
+
+def count_plainly(frame: Frame, T, centers, voxel_size: float, options: carve.Options):
+    """Whether an image sees through each voxel, ends in it, and whether no border is too near to tell."""
+    camera, depth = frame.intrinsics, frame.depth_m.astype(float)
+    height, width = depth.shape
+    half, near = 0.5 * voxel_size, 1e-4
+    point = (centers - T[:3, 3]) @ T[:3, :3]
+    z = point[..., 2]
+    ahead = z >= half
+    safe = np.where(ahead, z, 1.0)
+    u = camera.fx * point[..., 0] / safe + camera.cx
+    v = camera.fy * point[..., 1] / safe + camera.cy
+    column, row = np.floor(u + 0.5).astype(int), np.floor(v + 0.5).astype(int)
+
+    def depth_at(row, column):
+        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        found = depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        return np.where(inside, found, 0.0), inside
+
+    here, inside = depth_at(row, column)
+    spread = 3 * options.noise * z**2
+    if frame.depth_sigma_m is not None:
+        spread = 3 * frame.depth_sigma_m[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(float)
+    far = options.margin * voxel_size + spread
+    du, dv = (camera.fx * half / safe).astype(int), (camera.fy * half / safe).astype(int)
+    looked = ahead & inside & (here != 0)
+    free = looked & (np.abs(here) - z > far)
+    hit = looked & ~free & (here > 0) & (np.abs(here - z) <= half + spread)
+    clear = np.abs(z - half) > near
+    for border in (u + 0.5, v + 0.5, camera.fx * half / safe, camera.fy * half / safe):
+        clear &= np.abs(border - np.rint(border)) > near
+    clear &= (np.abs(np.abs(here) - z - far) > near) & (np.abs(np.abs(here - z) - half - spread) > near)
+    for down, right in ((0, -du), (0, du), (-dv, 0), (dv, 0)):
+        there, _ = depth_at(row + down, column + right)
+        free &= (there <= 0) | (there > z + far)
+        clear &= np.abs(there - z - far) > near
+    return free, hit, clear
+
+
+@pytest.mark.parametrize(("seed", "sigma", "no_return"), [(0, False, 0.0), (1, True, 0.0), (2, False, 3.0)])
+def test_every_voxel_is_counted_as_the_definition_says(seed: int, sigma: bool, no_return: float) -> None:
+    turn = np.array(((0.8, 0.0, 0.6), (0.36, 0.8, -0.48), (-0.48, 0.6, 0.64)))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = turn, (0.1, -0.2, 0.3)
+    options = carve.Options(no_return=no_return, margin=0.7, noise=0.004)
+    frame = patchwork(seed, sigma)
+    free, hits, centers = evidence_of(frame, T, options)
+    if no_return:
+        frame.depth_m[21:29, 31:47] = -no_return  # all but the rim of the wide patch
+    wanted_free, wanted_hits, clear = count_plainly(frame, T, centers, V, options)
+    assert clear.mean() > 0.95
+    assert wanted_free.sum() > 300
+    assert wanted_hits.sum() > 300
+    np.testing.assert_array_equal(free[clear], wanted_free[clear])
+    np.testing.assert_array_equal(hits[clear], wanted_hits[clear])
 
 
 def looks(count: int) -> list[tuple[Frame, np.ndarray]]:

@@ -93,3 +93,60 @@ def test_colors_of_parts_are_averaged() -> None:
 def test_a_map_of_one_size_stays_what_it_is() -> None:
     one = some_map(np.array([(0, 0, 0), (3, -1, 2)]), np.zeros(2))
     assert levels.make_uniform(one, 0).replace(levels=one.levels).state is one.state
+
+
+@pytest.mark.parametrize("evidence", ["probability", "free", "hits"])
+def test_a_block_is_known_if_a_single_voxel_has_any_evidence(evidence: str) -> None:
+    one = some_map(np.array([(0, 0, 0), (3, -1, 2), (4, 0, 0)]), np.zeros(3))
+    nothing = {name: np.zeros_like(getattr(one, name)) for name in ("probability", "free", "hits")}
+    nothing[evidence][1, 77] = 1
+    known = levels.mask_known_blocks(one.replace(**nothing))
+    np.testing.assert_array_equal(known, (False, True, False))
+    kept = levels.select_blocks(one, known)
+    np.testing.assert_array_equal(kept.keys, [(3, -1, 2)])
+    np.testing.assert_array_equal(kept.state, one.state[1:2])
+    before, own = (np.count_nonzero(one.state[rows] == OCCUPIED) for rows in (slice(0, 1), slice(1, 2)))
+    np.testing.assert_array_equal(kept.colors, one.colors[before : before + own])
+    np.testing.assert_array_equal(kept.features, one.features[before : before + own])
+
+
+def test_levels_are_put_together_in_their_order() -> None:
+    whole = some_map(np.array([(0, 0, 0)]), np.zeros(1))
+    half = some_map(levels.subdivide_keys(np.array([(1, 0, 0)])), np.zeros(8), seed=1)
+    made = levels.combine_levels((whole, half))
+    np.testing.assert_array_equal(made.levels, [0] + 8 * [1])
+    assert made.voxel_size == whole.voxel_size
+    for level, part in enumerate((whole, half)):
+        again = levels.select_blocks(made, made.levels == level)
+        for name in ("keys", "probability", "free", "hits", "state", "features", "colors"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(part, name))
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_parts_give_the_highest_probability_the_most_evidence_and_the_mean_feature(missing: bool) -> None:
+    keys = levels.subdivide_keys(np.array([(-2, 0, 1)]))
+    parts = some_map(keys, np.ones(8), seed=2)
+    if missing:
+        parts = levels.select_blocks(parts, np.arange(8) != 5)
+    made = levels.make_uniform(parts, 0)
+    assert made.voxel_size == 0.08
+    found = {name: cells(made, getattr(made, name)) for name in ("probability", "free", "hits")}
+    for name, whole in found.items():
+        wanted: dict[tuple[int, ...], float] = {}
+        for at, value in cells(parts, getattr(parts, name)).items():
+            over = tuple(np.floor_divide(at, 2).tolist())
+            wanted[over] = max(wanted.get(over, 0), value)
+        assert {at: value for at, value in whole.items() if at in wanted} == wanted
+        assert not any(value for at, value in whole.items() if at not in wanted)
+    sums: dict[tuple[int, ...], np.ndarray] = {}
+    for at, feature in zip(map(tuple, (parts.occupied_voxels() // 2).tolist()), parts.features, strict=True):
+        sums[at] = sums.get(at, np.zeros(3)) + feature.astype(float)
+    for at, feature in zip(map(tuple, made.occupied_voxels().tolist()), made.features, strict=True):
+        np.testing.assert_allclose(feature, sums[at] / np.linalg.norm(sums[at]), atol=2e-3)
+
+
+def cells(occupancy: Occupancy, values: np.ndarray) -> dict[tuple[int, ...], float]:
+    """Values of the voxels of a map of one size by their places."""
+    local = np.stack(np.unravel_index(np.arange(512), (8, 8, 8)), axis=1)
+    places = (occupancy.keys[:, None] * 8 + local).reshape(-1, 3)
+    return dict(zip(map(tuple, places.tolist()), values.reshape(-1).tolist(), strict=True))

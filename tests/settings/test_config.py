@@ -68,13 +68,16 @@ def test_options_of_a_backend_nest_below_its_layer() -> None:
             r"'tracking\.rgbd\.keyframe_overlop' \(did you mean 'keyframe_overlap'\?\)",
         ),
         ({"tracking": {"keyframe_overlap": 0.5}}, r"Unknown key 'tracking\.keyframe_overlap'"),
-        ({"occupancy": {"voxel_size": "8 cm"}}, r"'occupancy\.voxel_size' must be a number greater than 0, got '8 cm'"),
-        ({"occupancy": {"voxel_size": -1}}, r"^'occupancy\.voxel_size' must be greater than 0, got -1\.$"),
+        (
+            {"occupancy": {"voxel_size": "8 cm"}},
+            r"'occupancy\.voxel_size' must be a number from .* 100, got '8 cm'",
+        ),
+        ({"occupancy": {"voxel_size": -1}}, r"^'occupancy\.voxel_size' must be from 0\.001 to 100, got -1\.$"),
         (
             {"tracking": {"odometry": {"width": 320.5}}},
-            r"'tracking\.odometry\.width' must be a whole number of at least 1",
+            r"'tracking\.odometry\.width' must be a whole number from 16 to 4096",
         ),
-        ({"tracking": {"stereo": {"size": 10}}}, r"'tracking\.stereo\.size' must be at least 64, got 10"),
+        ({"tracking": {"stereo": {"size": 10}}}, r"'tracking\.stereo\.size' must be from 64 to 4096, got 10"),
         ({"tracking": {"stereo": 3}}, r"'tracking\.stereo' must contain 'key: value' lines, got 3"),
         ({"tracking": {"stero": {}}}, r"'tracking\.stero' \(did you mean 'stereo'\?\)"),
         ({"capture": {"intrinsics": [585, 585, 320]}}, r"'capture\.intrinsics' must be a list of 4 numbers"),
@@ -134,7 +137,7 @@ def test_malformed_overrides_are_refused(override: str) -> None:
     [
         ("capture.intrinsics=[1, 2", "is not valid YAML"),
         ("capture.stopp=5", r"did you mean 'stop'"),
-        ("capture.stop=five", r"'capture\.stop' must be a whole number or null, got 'five'"),
+        ("capture.stop=five", r"'capture\.stop' must be a whole number of at least 0 or null, got 'five'"),
         ("tracking.known=5", r"'tracking\.known' must contain"),
     ],
 )
@@ -212,12 +215,29 @@ def test_numbers_may_be_written_without_a_point(tmp_path: Path) -> None:
     assert config.load(path, ["carving.noise=2e-3"]).carving.noise == 0.002
 
 
-def test_a_backend_that_is_not_chosen_is_checked_by_its_class_or_by_names() -> None:
-    with pytest.raises(ConfigError, match=r"'language\.labels\.stride' must be at least 1, got 0"):
+def test_a_backend_that_is_not_chosen_is_checked_even_if_its_package_is_not_installed() -> None:
+    with pytest.raises(ConfigError, match=r"'language\.labels\.stride' must be from 1 to 4096, got 0"):
         config.resolve({"language": {"labels": {"stride": 0}}})
-    absent = {"gsplat": {"device": 3}}  # whose package is not installed: only names are known
-    if registry.backend("gaussians.rasterizers", "gsplat").missing:
-        assert config.resolve({"fitting": absent}).given("fitting", "gsplat") == {"device": 3}
+    with pytest.raises(ConfigError, match=r"'fitting\.gsplat\.device' must be a device such as cpu or cuda:0, got 3"):
+        config.resolve({"fitting": {"gsplat": {"device": 3}}})
+    given = config.resolve({"fitting": {"gsplat": {"device": "cuda:1"}}}).given("fitting", "gsplat")
+    assert given == {"device": "cuda:1"}
+
+
+NAMES: list[Any] = ["x" * 10**6, "a\0b", "a\nb", "\ud800", "../export/npz", "", None, 1.5, 10**5000, True, ()]
+
+
+@pytest.mark.parametrize("name", NAMES, ids=[str(k) for k in range(len(NAMES))])
+def test_any_unknown_name_is_refused_in_one_line(name: Any) -> None:
+    given: list[dict[Any, Any]] = [{name: {}}, {"tracking": {name: 1}}, {"tracking": {"rgbd": {name: 1}}}]
+    for values in given:
+        with pytest.raises(ConfigError, match=r"^Unknown (section|key) '.*\.$") as error:
+            config.resolve(values)
+        assert len(str(error.value)) < 500
+    if isinstance(name, str):
+        with pytest.raises(ConfigError) as error:
+            config.resolve({"tracking": {"backend": name}}).backend("tracking")
+        assert len(str(error.value)) < 500
 
 
 def test_what_is_given_at_its_default_imports_no_backend() -> None:

@@ -11,12 +11,16 @@ from freeocc3d.core.errors import ConfigError
 from freeocc3d.settings.option_types import (
     Advanced,
     Cosine,
+    Device,
+    FilePath,
     Finite,
+    Meters,
     NotNegative,
     NotNegativeInt,
     Positive,
     PositiveInt,
     PositiveShare,
+    Seed,
     Share,
     annotated_type,
     converted,
@@ -78,6 +82,20 @@ def test_values_that_fit(kind: Any, value: object, expected: object) -> None:
         (Cosine, -2, "from -1 to 1, got -2"),
         (Annotated[float, Meta(gt=0, lt=1)], 1, "greater than 0 and less than 1, got 1"),
         (Advanced[Positive | None], -1, "greater than 0, got -1"),
+        (Positive, 1e300, "from 1e-09 to 1e+09, got 1e+300"),
+        (Positive, 1e-300, "at least 1e-09, got 1e-300"),
+        (NotNegative | None, 10**400, "from 0 to 1e+09, got about 1e400"),
+        pytest.param(Finite, -(10**5000), "from -1e+09 to 1e+09, got about -1e5000", id="long"),
+        (NotNegativeInt, 2**63, "from 0 to 1e+09, got 9223372036854775808"),
+        (Seed, -1, "from 0 to 4294967295, got -1"),
+        (Meters, 2000, "from 0.0001 to 1000, got 2000"),
+        (tuple[Finite, Finite], [1, 1e12], "a list of 2 numbers from -1e+09 to 1e+09, got [1, 1000000000000.0]"),
+        (Device, "", "a device such as cpu or cuda:0, got ''"),
+        (Device, "cuda:0 ", "a device such as cpu or cuda:0, got 'cuda:0 '"),
+        (FilePath | None, "", "a path or null, got ''"),
+        (str, "a\0b", "text of at most 4096 characters in UTF-8, without NUL, got 'a\\x00b'"),
+        (FilePath, "a\ud800", "text of at most 4096 characters in UTF-8, without NUL, got 'a\\ud800'"),
+        (Finite, [[[[[1]]]]], "a number, got [[[[...]]]]"),
         (Literal["a", "b", "c"], "d", "a, b or c, got 'd'"),
         (Literal["a", "b"] | None, 1, "a, b or null, got 1"),
         (tuple[Finite, Finite], [1.0], "a list of 2 numbers, got [1.0]"),
@@ -123,3 +141,29 @@ def test_an_annotation_in_a_syntax_tree_is_the_type() -> None:
     assert read("tuple[Side, ...]", Side="Annotated[int, Meta(ge=16)]") == tuple[Annotated[int, Meta(ge=16)], ...]
     assert read("Foreign | None") == "Foreign | None"
     assert read("__import__('os')") == "__import__('os')"
+
+
+def nested(depth: int) -> list[object]:
+    found: list[object] = []
+    for _ in range(depth):
+        found = [found]
+    return found
+
+
+def circle() -> list[object]:
+    found: list[object] = []
+    found.append(found)
+    return found
+
+
+@pytest.mark.parametrize(
+    "value",
+    [nested(10_000), circle(), {"a": nested(10_000)}, "x" * 10**6, [0] * 10**6, {1: {2: circle()}}, object()],
+    ids=str.split("nested circle within text list inside object"),
+)
+@pytest.mark.parametrize("kind", [Finite, PositiveInt | None, Device, str, tuple[str, ...], tuple[int, ...], bool])
+def test_any_value_is_refused_in_one_line(kind: Any, value: object) -> None:
+    with pytest.raises(ConfigError) as error:
+        converted(kind, value, "layer.x")
+    assert len(str(error.value)) < 400
+    assert "\n" not in str(error.value)

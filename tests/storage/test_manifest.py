@@ -8,6 +8,7 @@ import pytest
 import yaml
 from manifests import tiny_manifest
 
+from freeocc3d.core.checksums import hash_bytes
 from freeocc3d.core.errors import MapError
 from freeocc3d.storage.manifest import (
     FORMAT_VERSION,
@@ -30,6 +31,7 @@ from freeocc3d.storage.manifest import (
         {"refined": Refined(map="maps/room", box=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))},
         {"vocabulary": SceneWords(keyframes=(0, 2), names={"sofa": NameCount(count=2, keyframes=(0, 2))})},
         {"scale": MapScale(metric=False, by="none")},
+        {"files": {"report.json": 3}, "checksums": {"report.json": hash_bytes(b"abc")}},
     ],
 )
 def test_what_is_written_is_read(tmp_path: Path, changes: dict[str, Any]) -> None:
@@ -43,6 +45,27 @@ def test_a_map_states_the_oldest_version_that_has_all_its_keys() -> None:
     assert tiny_manifest(finest_voxel_m=0.05).format_version == FORMAT_VERSION
     assert max(key.since for key in manifest_keys()) == FORMAT_VERSION
     assert all(key.description for key in manifest_keys())
+
+
+def test_no_byte_of_the_manifest_changes_without_a_word(tmp_path: Path) -> None:
+    write_manifest(tmp_path, tiny_manifest())
+    path = tmp_path / "map.yaml"
+    whole = path.read_bytes()
+    for place in range(0, whole.index(b"\n# xxh3_128"), 7):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with pytest.raises(MapError, match=r"map\.yaml"):
+            read_manifest(tmp_path)
+
+
+def test_who_edits_the_manifest_removes_its_checksum(tmp_path: Path) -> None:
+    write_manifest(tmp_path, tiny_manifest())
+    path = tmp_path / "map.yaml"
+    edited = path.read_text().replace("camera to world", "world to camera")
+    path.write_text(edited)
+    with pytest.raises(MapError, match="removes that line"):
+        read_manifest(tmp_path)
+    path.write_text("\n".join(edited.splitlines()[:-1]))
+    assert read_manifest(tmp_path).poses == "world to camera"
 
 
 def test_a_map_from_before_scales_and_gravity_frames_is_read(tmp_path: Path) -> None:
@@ -69,6 +92,7 @@ def test_a_map_from_before_scales_and_gravity_frames_is_read(tmp_path: Path) -> 
         ("keyframes", [0, "one"], r"'keyframes\[1\]' has text instead of a whole number"),
         ("files", {"../../secret": 1}, "secret, which lies outside"),
         ("T_world_map", (2 * np.eye(4)).tolist(), "'T_world_map' is not a rigid transform"),
+        ("checksums", {"report.json": "0" * 31}, r"'checksums\[\.\.\.\]'"),
         ("scale", {"factor": 2.0}, "'scale' lacks 'metric'"),
         ("scale", {"metric": True, "factor": float("nan")}, r"'scale\.factor' is not a finite number"),
         ("scale", {"metric": True, "factor": -1.0}, r"'scale\.factor' is not a finite number"),

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import CaptureError, FrameError
+from ...core.image_files import Size
 from ...core.types import Frame, Intrinsics
 from ...core.warnings import Notice
 from ..base import Capture, Options
 from ..camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
-from ..image_decoding import Size, read_color
+from ..image_decoding import read_color
 
 REQUIRES: tuple[str, ...] = ("PIL",)
 

@@ -7,9 +7,10 @@ import math
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numba import njit, prange
 from numpy.typing import NDArray
 
@@ -17,7 +18,7 @@ from ...core.depth_noise import compute_sensor_sigma
 from ...core.errors import CaptureError
 from ...core.transforms import back_project, invert
 from ...core.types import FREE, UNKNOWN, Frame, Intrinsics
-from ...settings.option_types import NotNegativeInt, PositiveInt
+from ...settings.option_types import Seed
 from ...settings.typed_options import TypedOptions
 from .. import base, builtin_room, room_shading
 from ..camera_files import read_given_calibration
@@ -41,19 +42,21 @@ the flattest view for which the change of depth over this distance is taken."""
 _EDGE = 0.05  # relative depth step at which the sensor's two views disagree
 _GRAZING = 0.10, 0.22  # cosines of incidence below which all, and the first, pixels are lost
 
+Side = Annotated[int, Meta(ge=1, le=4096)]
+
 
 class Options(TypedOptions, frozen=True):
     """The walk and the camera."""
 
-    frames: PositiveInt = 240
+    frames: Annotated[int, Meta(ge=1, le=100_000)] = 240
     """Frames of one round through the room; fewer frames mean a faster walk."""
-    width: PositiveInt = 320
+    width: Side = 320
     """Image width, pixels."""
-    height: PositiveInt = 240
+    height: Side = 240
     """Image height, pixels."""
     noise: bool = True
     """Whether depth and color have sensor noise; false = exact."""
-    seed: NotNegativeInt = 0
+    seed: Seed = 0
     """Seed of the noise."""
 
 

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import CaptureError, FrameError
+from ...core.image_files import Size
 from ...core.types import Frame, Intrinsics
 from ..base import Capture, Options
 from ..camera_files import convert_35mm, guess_camera, read_given_calibration, reduce_camera
-from ..image_decoding import Size
 
 REQUIRES: tuple[str, ...] = ("av",)
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from ...core.errors import DependencyError
 from ...core.types import Intrinsics
+from ...settings.option_types import Device
 from ...settings.typed_options import TypedOptions
 from .base import BLUR, NEAR, Rendered, Splats
 
@@ -16,7 +17,7 @@ REQUIRES = ("gsplat",)
 class Options(TypedOptions, frozen=True):
     """The device."""
 
-    device: str = "cuda:0"
+    device: Device = "cuda:0"
     """A CUDA device of torch, such as "cuda:0"."""
 
 

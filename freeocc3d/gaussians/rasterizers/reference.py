@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ...core.types import Intrinsics
+from ...settings.option_types import Device
 from ...settings.typed_options import TypedOptions
 from .base import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR, TRANSMITTANCE_MIN, Rendered, Splats, compute_slope_limits
 
@@ -17,7 +18,7 @@ _TILE = 16
 class Options(TypedOptions, frozen=True):
     """The device."""
 
-    device: str = "cpu"
+    device: Device = "cpu"
     """A device of torch, such as "cpu" or "cuda:0"."""
 
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import MapError
 from ...core.types import Frame
-from ...settings.option_types import PositiveInt
+from ...settings.option_types import Stride
 from ...settings.typed_options import TypedOptions
 from .base import Encoder, TextEncoder, TextFeatures
 
@@ -172,7 +172,7 @@ Channel = Annotated[float, Meta(ge=16, le=255)]
 class Options(TypedOptions, frozen=True):
     """How pixels get color names."""
 
-    stride: PositiveInt = 4
+    stride: Stride = 4
     """Edge in pixels of the blocks over which memberships are averaged into one feature."""
     white: tuple[Channel, Channel, Channel] | None = None
     """RGB (16 to 255) of a white thing in this capture, for scans in colored or dim light; null = colors are not

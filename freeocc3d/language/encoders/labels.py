@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from ...capture.base import Capture
 from ...capture.class_files import read_class_names
 from ...core.errors import CaptureError
+from ...core.image_files import ImageFileError, read_image
 from ...core.types import Frame
-from ...settings.option_types import PositiveInt
+from ...settings.option_types import FilePath, Stride
 from ...settings.typed_options import TypedOptions
 from .. import synonyms
 from .base import Encoder, TextEncoder, TextFeatures
@@ -29,13 +30,13 @@ _ASPECT_TOLERANCE = 0.02
 class Options(TypedOptions, frozen=True):
     """The class images, if the capture has none."""
 
-    folder: str | None = None
+    folder: FilePath | None = None
     """Folder of class images, PNG with one channel. If their number equals that of the frames, they are used in order.
     Otherwise the last number in a file's name is the frame's index, from 0. null = use the capture's own."""
-    classes: str | None = None
+    classes: FilePath | None = None
     """File with the class names: JSON {"classes": [...]} or one name per line. The first (value 0) means nothing. null
     = classes.json or classes.txt in the folder, or the capture's own."""
-    stride: PositiveInt = 2
+    stride: Stride = 2
     """Use every n-th pixel of a class image."""
 
 
@@ -171,10 +172,9 @@ class _FolderImages:
         if path is None:
             return None
         try:
-            data = np.frombuffer(path.read_bytes(), np.uint8)
-        except OSError as error:
-            raise CaptureError(f"Cannot read the class image {path}: {error.strerror}.") from error
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-        if image is None or image.ndim != 2:
-            raise CaptureError(f"{path} is not a class image: a class image is a PNG with one channel.")
+            image = read_image(path, cv2.IMREAD_UNCHANGED)
+        except ImageFileError as error:
+            raise CaptureError(f"The class image cannot be used: {error}") from error
+        if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+            raise CaptureError(f"{path} is not a class image: a class image is an 8- or 16-bit PNG with one channel.")
         return np.asarray(image)

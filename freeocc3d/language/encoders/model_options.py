@@ -6,12 +6,13 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from ...settings.option_types import Cosine, NotNegativeInt
+from ...settings.option_types import Cosine, Device
 from ...settings.typed_options import TypedOptions
 from ..text_networks import CONTRAST, TEMPLATES, Wording
 
 ImageSide = Annotated[int, Meta(ge=16, le=4096)]
 WindowSide = Annotated[int, Meta(ge=0, le=4096)]
+FeatureSpacing = Annotated[int, Meta(ge=0, le=4096)]
 
 
 class WordOptions(TypedOptions, frozen=True):
@@ -27,7 +28,7 @@ class WordOptions(TypedOptions, frozen=True):
     rooms."""
     threshold: Cosine = 0.15
     """Smallest cosine of a match."""
-    device: str = "cpu"
+    device: Device = "cpu"
     """Device that runs the image network: "cpu", or "cuda:0" with onnxruntime-gpu."""
 
     def __post_init__(self) -> None:
@@ -48,5 +49,5 @@ class PatchOptions(WordOptions, frozen=True):
     window: WindowSide | None = None
     """Edge in pixels of the windows to encode one by one; they overlap by half. 0 = the whole frame at once; null = the
     size of the model's training images."""
-    stride: NotNegativeInt = 4
+    stride: FeatureSpacing = 4
     """Pixels between features, which are upsampled from patches along the image's edges; 0 = one feature per patch."""

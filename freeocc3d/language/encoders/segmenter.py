@@ -9,9 +9,10 @@ network of 40 classes (bedroom, living; mIoU over the classes present): p 15.4, 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
@@ -19,7 +20,7 @@ from ...capture.class_files import read_class_file, read_class_names
 from ...core.errors import ConfigError, FrameError
 from ...core.onnx_session import load_session
 from ...core.types import Frame
-from ...settings.option_types import Finite, Positive, PositiveInt
+from ...settings.option_types import Device, FilePath, Stride
 from ...settings.registry import nearest
 from ...settings.typed_options import TypedOptions
 from .. import synonyms
@@ -37,6 +38,9 @@ VOID = ("unlabeled", "unlabelled", "unannotated", "unknown", "undefined", "void"
 _INPUTS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _FREE_SIZE_STEP = 32
 """A network that accepts any input size gets a multiple of this, the usual product of its strides."""
+Level = Annotated[float, Meta(ge=-1000, le=1000)]
+Spread = Annotated[float, Meta(ge=0.001, le=1000)]
+Side = Annotated[int, Meta(ge=1, le=4096)]
 
 
 class Options(TypedOptions, frozen=True):
@@ -49,24 +53,24 @@ class Options(TypedOptions, frozen=True):
     line."""
     void: tuple[str, ...] | None = None
     """Names of classes that mean nothing; null = the usual names ("unlabeled", "void" and similar)."""
-    mapping: str | None = None
+    mapping: FilePath | None = None
     """YAML file that maps the classes to another taxonomy: classes: [wall, ...], map: {name: class}."""
-    embeddings: str | None = None
+    embeddings: FilePath | None = None
     """File (.npz) with text embeddings of many names, including the classes: arrays "names" and "embeddings". A name
     means a class if their embeddings are nearer than is usual between names of the file."""
-    mean: tuple[Finite, Finite, Finite] = (0.485, 0.456, 0.406)
+    mean: tuple[Level, Level, Level] = (0.485, 0.456, 0.406)
     """Mean of red, green and blue, in 0…1, to normalize images with; an input of bytes is not normalized."""
-    std: tuple[Positive, Positive, Positive] = (0.229, 0.224, 0.225)
+    std: tuple[Spread, Spread, Spread] = (0.229, 0.224, 0.225)
     """Standard deviation of red, green and blue, in 0…1, to normalize images with."""
     channels: Literal["rgb", "bgr"] = "rgb"
     """Order of the input's channels: "rgb" or "bgr"."""
-    size: tuple[PositiveInt, PositiveInt] | None = None
+    size: tuple[Side, Side] | None = None
     """Width and height of the input; null = as the network states, or near the frame's size if any size is possible."""
-    output: str | None = None
+    output: Annotated[str, Meta(min_length=1)] | None = None
     """Name of the output with a channel for each class; null = the first such output."""
-    stride: PositiveInt = 4
+    stride: Stride = 4
     """Pixels of the frame between features; logits are interpolated."""
-    device: str = "cpu"
+    device: Device = "cpu"
     """Device that runs the network: "cpu", or a GPU such as "cuda:0" with onnxruntime-gpu."""
 
 

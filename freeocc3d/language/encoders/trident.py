@@ -24,11 +24,11 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from ...core.types import Frame
-from ...settings.option_types import Advanced, Finite, NotNegativeInt
+from ...settings.option_types import Advanced, Device
 from .. import model_packages
 from ..text_networks import ModelWords
 from .base import Encoder
-from .model_options import PatchOptions, WindowSide
+from .model_options import FeatureSpacing, PatchOptions, WindowSide
 
 if TYPE_CHECKING:
     from ..patch_features import Tiling
@@ -49,19 +49,19 @@ class Options(PatchOptions, frozen=True):
     sam: str = ""
     """The same for kind "sam"."""
     window: WindowSide | None = 336
-    beta: Advanced[Finite] = 1.2
+    beta: Advanced[Annotated[float, Meta(ge=-100, le=100)]] = 1.2
     """A pair of DINO patches counts if its correlation exceeds this times the mean correlation."""
-    gamma: Advanced[Finite] = 3.0
+    gamma: Advanced[Annotated[float, Meta(ge=-1000, le=1000)]] = 3.0
     """Factor of the correlations in the softmax."""
-    cosine: Advanced[Finite] = 1.2
+    cosine: Advanced[Annotated[float, Meta(ge=-100, le=100)]] = 1.2
     """A pair of SAM patches counts if its cosine exceeds this times the mean cosine."""
     points: Advanced[Annotated[int, Meta(ge=0, le=64)]] = 16
     """Number of prompt points for SAM along the longer side of the grid; 0 = no masks."""
-    mask_score: Advanced[Finite] = 0.8
+    mask_score: Advanced[Annotated[float, Meta(ge=-100, le=100)]] = 0.8
     """Smallest quality of a mask, as SAM estimates it."""
-    stride: NotNegativeInt = 4
+    stride: FeatureSpacing = 4
     """Pixels between features, which are upsampled along the image's edges; 0 = SAM's grid."""
-    device: str = "cpu"
+    device: Device = "cpu"
     """Device that runs the image networks: "cpu", or "cuda:0" with onnxruntime-gpu."""
 
 

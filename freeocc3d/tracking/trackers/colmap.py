@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
 from ...core.errors import ConfigError
 from ...core.progress import Progress
 from ...core.types import Frame, Trajectory
-from ...settings.option_types import PositiveInt
+from ...settings.option_types import FilePath
 from ..base import KeyframeOptions, PosedPoints, Tracked
 from ..given_poses import GivenTracker
 from ..sfm.colmap_reconstruction import read_model
@@ -26,17 +27,17 @@ REQUIRES: tuple[str, ...] = ("pycolmap",)
 class Options(KeyframeOptions, frozen=True):
     """The frames, how to match and map them, the camera, and an existing model."""
 
-    frames: PositiveInt = 300
+    frames: Annotated[int, Meta(ge=1, le=100_000)] = 300
     """Largest number of frames to reconstruct; of more, the sharpest with equal image motion between them are used."""
     order: Literal["auto", "video", "photos"] = "auto"
     """"video": each frame overlaps the one before; "photos": images in no order; "auto": decide by the images."""
-    features: str = "sift"
+    features: FilePath = "sift"
     """"sift", or the path of an ONNX network for keypoints and descriptors (SuperPoint, DISK, ALIKED)."""
     mapping: Literal["incremental", "global"] = "incremental"
     """"incremental": add image by image; "global": place all at once, which is faster but needs more overlap."""
     intrinsics: Literal["refine", "fixed"] = "refine"
     """"refine": start from the capture's intrinsics; "fixed": keep them unchanged."""
-    model: str | None = None
+    model: FilePath | None = None
     """Folder of an existing COLMAP model (cameras, images, points3D) of the capture's images to use instead."""
 
 

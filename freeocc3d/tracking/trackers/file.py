@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from ...capture import read_trajectory
@@ -15,7 +16,7 @@ from ...capture.point_files import read_points
 from ...core.errors import ConfigError, TrackingError
 from ...core.transforms import invert, project, transform
 from ...core.types import Frame
-from ...settings.option_types import Positive
+from ...settings.option_types import FilePath
 from ..base import KeyframeOptions
 from ..given_poses import GivenTracker
 from ..rgbd import orb_features
@@ -38,12 +39,12 @@ class Options(KeyframeOptions, frozen=True):
 
     path: str = ""
     """The trajectory: a file, or a folder of 7-Scenes poses or a COLMAP model; may be relative to the capture."""
-    max_time_difference: Positive = 0.02
+    max_time_difference: Annotated[float, Meta(gt=0, le=3600)] = 0.02
     """Largest time difference of a pose and its frame, seconds, for files with times."""
-    scale: Positive | None = 1.0
+    scale: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = 1.0
     """Meters per unit of the file. null (for monocular systems) = estimate it from the capture's depth; without depth,
     use capture.scale, else it is unknown."""
-    points: str | None = None
+    points: FilePath | None = None
     """Point cloud (PLY, PCD, XYZ) in the file's world, which gives depth to frames where they have none."""
 
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import cv2
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
 from ...core.errors import ConfigError
 from ...core.transforms import invert, nearest_rigid
 from ...core.types import Frame, Intrinsics
-from ...settings.option_types import Advanced, Finite, NotNegativeInt, Positive, PositiveInt
+from ...settings.option_types import Advanced, Device, Finite, Meters, PositiveShare
 from .. import pose_graph
 from ..base import LEAST_COVERED, KeyframeOptions, Tracked, Tracker
 from ..overlap import DepthView, measure_mutual_overlap, sample_points
@@ -28,26 +29,27 @@ _DEPTH_SCALE, _FARTHEST_M = 1.0, 1000.0
 
 _HUBER_DEPTH, _HUBER_INTENSITY = 0.05, 0.1
 """Residuals, meters and intensities 0…1, above which Huber's loss is linear: Open3D's defaults."""
+Iterations = Annotated[int, Meta(ge=0, le=1000)]
 
 
 class Options(KeyframeOptions, frozen=True):
     """Odometry and keyframes."""
 
-    device: str = "cpu"
+    device: Device = "cpu"
     """Device of the odometry: "cpu", or "cuda:0" and so on if Open3D has CUDA."""
-    width: PositiveInt = 320
+    width: Annotated[int, Meta(ge=16, le=4096)] = 320
     """Image width for tracking, pixels; smaller images keep their size."""
-    iterations: Advanced[tuple[NotNegativeInt, NotNegativeInt, NotNegativeInt]] = (10, 6, 4)
+    iterations: Advanced[tuple[Iterations, Iterations, Iterations]] = (10, 6, 4)
     """Gauss–Newton iterations per pyramid level, coarse to fine."""
-    depth_difference: Advanced[Positive] = 0.07
+    depth_difference: Advanced[Meters] = 0.07
     """Largest depth difference of a correspondence, meters."""
-    min_fitness: Advanced[Positive] = 0.3
+    min_fitness: Advanced[PositiveShare] = 0.3
     """Smallest share of pixels with a correspondence."""
-    max_residual: Advanced[Positive] = 0.03
+    max_residual: Advanced[Annotated[float, Meta(gt=0, le=1000)]] = 0.03
     """Largest root mean square of the odometry's residual, which mixes meters and gray levels 0…1."""
     min_information: Advanced[Finite] = 1e-3
     """Smallest eigenvalue of the information matrix, per correspondence, of a constrained pose."""
-    overlap_edges: Advanced[NotNegativeInt] = 6
+    overlap_edges: Advanced[Annotated[int, Meta(ge=0, le=1000)]] = 6
     """Number of earlier keyframes to register a new keyframe to, besides the last: those with most overlap."""
     min_edge_overlap: Advanced[Finite] = 0.4
     """Smallest share of the view that such a keyframe has in common."""

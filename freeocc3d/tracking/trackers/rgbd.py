@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
 from ...core.transforms import invert, measure_pose_difference
 from ...core.types import Frame
-from ...settings.option_types import Advanced, Positive, PositiveInt
+from ...settings.option_types import Advanced
 from .. import pose_graph
-from ..base import LEAST_COVERED, KeyframeOptions, Tracked, Tracker
+from ..base import LEAST_COVERED, KeyframeOptions, Overlap, Tracked, Tracker
 from ..overlap import DepthView, measure_mutual_overlap
 from ..pose_graph import Edge
 from ..records import Records
@@ -46,12 +47,12 @@ _LEAST_SCORED = 0.1  # smallest correlation in a pose's score: uniform surfaces 
 class Options(KeyframeOptions, frozen=True):
     """Tracking, loop closure and refinement."""
 
-    keyframe_overlap: Positive = 0.8
+    keyframe_overlap: Overlap = 0.8
     close_loops: Advanced[bool] = True
     """Find loop closures, and make the camera path agree with them."""
     refine: Advanced[bool] = True
     """Align all overlapping keyframes jointly at the end."""
-    neighbors: Advanced[PositiveInt] = 16
+    neighbors: Advanced[Annotated[int, Meta(ge=1, le=1000)]] = 16
     """Number of earlier keyframes to align each keyframe with in the refinement."""
 
 
