@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import CaptureError
 from ..core.image_files import Size
 from ..core.transforms import is_rigid
+from ..core.typed_documents import InvalidDocument, as_type, parse_json
 from ..core.types import Intrinsics
 from .base import Options
+from .number_files import JSON_BYTES, MATRIX_BYTES, read_number_rows, read_text
 
 ASPECT_TOLERANCE = 0.02
 """Largest relative difference of the aspect ratios of two images that show the same view. ScanNet's color and depth
@@ -30,8 +33,28 @@ USUAL_FOCAL = 0.85
 to 0.96. The default is within a fifth of all of them, close enough for an estimate to start from."""
 
 
+FOCAL_RANGE = 0.01, 1000.0
+"""Focal lengths of cameras over the longer side of their images: from a view of 179 degrees to one of 0.06."""
+
+
 DIAGONAL_35MM = 43.27
 """Diagonal of the 36 x 24 mm frame, millimeters."""
+
+
+T = TypeVar("T")
+
+Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+"""A number of a document: finite, and no larger than a length or a coefficient can be."""
+
+PositiveNumber = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
+
+
+class _Open3DCamera(msgspec.Struct):
+    """PinholeCameraIntrinsic as Open3D writes it: ``intrinsic_matrix`` is column-major."""
+
+    width: PositiveNumber
+    height: PositiveNumber
+    intrinsic_matrix: Annotated[tuple[Number, ...], msgspec.Meta(min_length=9, max_length=9)]
 
 
 @dataclass(frozen=True)
@@ -46,16 +69,12 @@ class Calibration:
     def camera(self, size: Size) -> Intrinsics:
         """The camera of images of ``size``. Parameters for another size of the same view are rescaled.
 
-        Raises CaptureError: a value is not finite, a focal length not positive, the principal point outside the image,
-        or the size shows another view.
+        Raises CaptureError: a value is not finite, a focal length that no camera has, the principal point outside the
+        image, or the size shows another view.
         """
         fx, fy, cx, cy = self.values
-        if not np.isfinite(self.values).all() or fx <= 0 or fy <= 0:
-            raise CaptureError(
-                f"{self.source} holds unusable intrinsics (fx, fy, cx, cy = {fx:g}, {fy:g}, {cx:g}, {cy:g}): "
-                "correct it, or give capture.intrinsics."
-            )
         width, height = self.size or size
+        check_focal(self.values, (width, height), self.source)
         if min(width, height) <= 0 or not same_view((width, height), size):
             raise CaptureError(
                 f"{self.source} is for images of {width} x {height} pixels, but the images have {size[0]} x {size[1]}: "
@@ -67,6 +86,17 @@ class Calibration:
                 "so it may be for another resolution: correct it, or give capture.intrinsics."
             )
         return Intrinsics(width, height, fx, fy, cx, cy).resized(*size)
+
+
+def check_focal(values: tuple[float, float, float, float], size: Size, source: str) -> None:
+    """Raise CaptureError if fx, fy, cx, cy are not those of a camera with images of ``size``. source: for messages."""
+    fx, fy, cx, cy = values
+    low, high = (ratio * max(size) for ratio in FOCAL_RANGE)
+    if not np.isfinite(values).all() or not low <= min(fx, fy) <= max(fx, fy) <= high:
+        raise CaptureError(
+            f"{source} holds unusable intrinsics (fx, fy, cx, cy = {fx:g}, {fy:g}, {cx:g}, {cy:g}): "
+            "correct it, or give capture.intrinsics."
+        )
 
 
 def same_view(a: Size, b: Size) -> bool:
@@ -139,50 +169,32 @@ def read_rigid(path: Path) -> NDArray[np.float64]:
 def read_pose(path: Path) -> NDArray[np.float64] | None:
     """Read (4, 4) T_world_cam; None if the file is missing or holds no rigid transform. ScanNet writes -inf where
     tracking was lost."""
-    matrix = read_matrix(path) if path.is_file() else None
+    matrix = read_matrix(path) if os.path.lexists(path) else None
     return matrix if matrix is not None and is_rigid(matrix) else None
 
 
 def read_matrix(path: Path) -> NDArray[np.float64] | None:
     """Read a text file of (rows, columns) numbers; None if it holds anything else. Raises CaptureError if the file
     cannot be read."""
-    rows = [line.replace(",", " ").split() for line in read_text(path).splitlines() if line.strip()]
     try:
-        return np.array(rows, np.float64, ndmin=2)
-    except ValueError:  # rows of unequal length, or words
+        return read_number_rows(path, MATRIX_BYTES).table()
+    except ValueError:  # words
         return None
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object. Raises CaptureError with the file's name."""
+def read_json(path: Path, kind: type[T]) -> T:
+    """Read a JSON document as the type ``kind``. Raises CaptureError with the names of the file and the field."""
+    text = read_text(path, JSON_BYTES)
     try:
-        content = json.loads(read_text(path))
-    except ValueError as error:
-        raise CaptureError(f"{path} is not valid JSON: {error}.") from error
-    if not isinstance(content, dict):
-        raise CaptureError(f"{path} must hold a JSON object.")
-    return content
-
-
-def read_text(path: Path) -> str:
-    """Read the text of a file. Raises CaptureError."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise CaptureError(f"Cannot read {path}: {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise CaptureError(f"{path} is not a text file.") from error
+        return as_type(parse_json(text, finite=True), kind)
+    except InvalidDocument as error:
+        raise CaptureError(f"{path} is not usable: {error}. Correct it.") from error
 
 
 def _open3d_intrinsics(path: Path) -> Calibration:
-    """PinholeCameraIntrinsic as Open3D writes it: ``intrinsic_matrix`` is column-major."""
-    content = read_json(path)
-    try:
-        matrix = np.array(content["intrinsic_matrix"], np.float64).reshape(3, 3).T
-        size = int(content["width"]), int(content["height"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise CaptureError(f"{path} must hold width, height and an intrinsic_matrix of 9 numbers.") from error
-    return _from_matrix(matrix, size, path)
+    content = read_json(path, _Open3DCamera)
+    matrix = np.array(content.intrinsic_matrix).reshape(3, 3).T
+    return _from_matrix(matrix, (int(content.width), int(content.height)), path)
 
 
 def _from_matrix(K: NDArray[np.float64], size: Size | None, path: Path) -> Calibration:

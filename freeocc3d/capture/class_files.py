@@ -10,24 +10,29 @@ The file is YAML or JSON, or a bare list of names: YAML, JSON, or one name per l
 
 from __future__ import annotations
 
-import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, ConfigError
+from ..core.regular_files import read_text
+from ..core.typed_documents import InvalidDocument, parse_json
+from ..core.yaml_documents import InvalidYaml, parse_yaml
 from ..settings.presets import find_preset
 from ..settings.registry import nearest
 
 CLASSES_JSON = "classes.json"
 """The file in a capture's folder that names the values of its class images."""
 
-_MOST_CLASSES = 65536
+_MOST_BYTES = 4 << 20
+_LONGEST_NAME = 1000
+_NOT_TEXT = re.compile("[\x00-\x08\x0a-\x1f\x7f\ud800-\udfff]")
+_MOST_CLASSES = 4096
 _MOST_IN_BYTES = 255
 """Largest number of classes: the class images of a capture are uint8."""
 
@@ -76,22 +81,28 @@ def read_class_file(path: Path) -> ClassFile:
     if path.suffix != ".json" and (strange := set(content) - {"classes", "map"}):
         raise CaptureError(
             f"The class file {path} must hold 'classes', a list of names, and may hold 'map', but not "
-            f"'{strange.pop()}'."
+            f"'{str(min(strange, key=str))[:100]}'."
         )
     classes, mapped = content["classes"], content.get("map") or {}
     if not isinstance(classes, list) or not classes or not all(isinstance(name, str) for name in classes):
         raise CaptureError(f"'classes' of {path} must hold a list of names (quote a name like \"no\").")
+    if not all(len(name) <= _LONGEST_NAME and not _NOT_TEXT.search(name) for name in classes):
+        raise CaptureError(f"'classes' of {path} holds a name that is longer than {_LONGEST_NAME} letters or not text.")
     if len(classes) > _MOST_CLASSES:
         raise CaptureError(f"{path} names {len(classes)} classes, but at most {_MOST_CLASSES} are possible.")
-    if not isinstance(mapped, dict) or not all(isinstance(name, str) for name in mapped):
+    if not isinstance(mapped, dict) or not all(
+        isinstance(name, str) and isinstance(target, str | None) for name, target in mapped.items()
+    ):
         raise CaptureError(f"'map' of {path} must hold lines of the form 'name: class'.")
     names = tuple(name.strip() for name in classes)
     spelled = {name.lower(): name for name in names}
     targets: dict[str, str | None] = {}
     for name, target in mapped.items():
-        if target is not None and str(target).strip().lower() not in spelled:
-            raise CaptureError(f"{path} maps '{name}' to '{target}', which is not one of its classes: correct it.")
-        targets[name.strip().lower()] = None if target is None else spelled[str(target).strip().lower()]
+        if target is not None and target.strip().lower() not in spelled:
+            raise CaptureError(
+                f"{path} maps '{name[:100]}' to '{target[:100]}', which is not one of its classes: correct it."
+            )
+        targets[name.strip().lower()] = None if target is None else spelled[target.strip().lower()]
     return ClassFile(path, names, targets)
 
 
@@ -115,18 +126,15 @@ def capture_class_names(folder: Path) -> tuple[str, ...]:
 
 def _content(path: Path) -> Any:
     """The content of the file, as plain data."""
+    form = "JSON" if path.suffix == ".json" else "YAML" if path.suffix in (".yaml", ".yml") else "text"
     try:
-        text = path.read_text(encoding="utf-8")
-        if path.suffix == ".json":
-            return json.loads(text)
-        if path.suffix in (".yaml", ".yml"):
-            return yaml.safe_load(text)
-        return [line for line in text.splitlines() if line.strip()]
+        text = read_text(path, _MOST_BYTES)
+        if form == "JSON":
+            return parse_json(text, finite=True)
+        return parse_yaml(text) if form == "YAML" else [line for line in text.splitlines() if line.strip()]
     except OSError as error:
         raise CaptureError(f"Cannot read the class file {path}: {(error.strerror or str(error)).lower()}.") from error
-    except (ValueError, RecursionError, yaml.YAMLError) as error:
-        form = "JSON" if path.suffix == ".json" else "YAML" if path.suffix in (".yaml", ".yml") else "text"
-        said = " ".join(str(error).split())
+    except (InvalidDocument, InvalidYaml, UnicodeDecodeError) as error:
         raise CaptureError(
-            f"The class file {path} is not valid {form}: {said}. It must hold 'classes', a list of names."
+            f"The class file {path} is not valid {form}: {error}. It must hold 'classes', a list of names."
         ) from error

@@ -9,9 +9,7 @@ time); A. Geiger et al., KITTI's odometry development kit; the format pages of C
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +20,10 @@ from ..core import tum_files
 from ..core.errors import CaptureError
 from ..core.transforms import invert, is_rigid
 from .base import Capture
+from .camera_files import read_matrix
+from .colmap_models import FARTHEST, colmap_folder, read_colmap_model
+from .nerfstudio_files import read_transforms
+from .number_files import NumberRows, read_number_rows
 
 SAME_TIME_S = 0.02
 """Largest difference of timestamps that match, as in the TUM RGB-D benchmark."""
@@ -32,7 +34,9 @@ FORMS = (
 )
 """The supported formats, in words."""
 
-_LARGEST_BYTES = 1 << 28
+_MOST_POSES = 1_000_000
+_LATEST = 1e12
+"""Largest time of a pose, seconds."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class PoseFile:
             return self.timestamps
         numbers = [_number(name) for name in self.names]
         if numbers and all(numbers):
-            return np.array(numbers, np.float64)
+            return np.array([float(number[-18:]) for number in numbers])
         return np.arange(len(self.T_world_cam), dtype=np.float64)
 
     def of_frames(self, capture: Capture, tolerance_s: float = SAME_TIME_S) -> NDArray[np.float64]:
@@ -91,87 +95,91 @@ class PoseFile:
 def read_trajectory(path: str | Path) -> PoseFile:
     """Read a file in any of ``FORMS``. Raises CaptureError for any other file, or a damaged one."""
     path = Path(path).expanduser()
-    try:
-        if path.is_dir():
-            return _read_folder(path)
-        if not path.is_file():
-            raise CaptureError(f"There is no trajectory {path}: check the path.")
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise CaptureError(f"{path} is too large for a trajectory: it has {path.stat().st_size / 1e6:.0f} MB.")
-        if path.name in ("images.txt", "images.bin"):
-            return _read_colmap(path.parent)
-        read: Callable[[Path], PoseFile] = _read_nerfstudio if path.suffix == ".json" else _read_text
-        found = read(path)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CaptureError(f"{path} is not a trajectory: expected {FORMS}.") from error
-    return _checked(found)
+    if path.is_dir():
+        return _read_folder(path)
+    if not path.exists():
+        raise CaptureError(f"There is no trajectory {path}: check the path.")
+    if path.name in ("images.txt", "images.bin"):
+        return _read_colmap(path.parent)
+    return _read_nerfstudio(path) if path.suffix == ".json" else _read_text(path)
 
 
 def _checked(found: PoseFile) -> PoseFile:
     finite = np.isfinite(found.T_world_cam).all(axis=(1, 2))
     if not finite.any():
         raise CaptureError(f"{found.path} is not a trajectory: it holds no pose.")
+    if (np.abs(found.T_world_cam[finite, :3, 3]) > FARTHEST).any():
+        raise CaptureError(f"{found.path} holds a position that is not possible: correct it.")
     if not all(is_rigid(pose) for pose in found.T_world_cam[finite]):
         raise CaptureError(f"{found.path} holds a matrix that is not a rigid camera-to-world pose.")
     return found
 
 
 def _read_folder(folder: Path) -> PoseFile:
-    from .colmap_models import colmap_folder
-
     if files := sorted(folder.glob("*.pose.txt")):
-        T = np.stack([np.loadtxt(file).reshape(4, 4) for file in files])
+        T = np.stack([_read_pose(file) for file in files])
         return _checked(PoseFile(folder, T, names=tuple(file.name for file in files)))
     if model := colmap_folder(folder):
-        return _checked(_read_colmap(model))
+        return _read_colmap(model)
     if (folder / "transforms.json").is_file():
-        return _checked(_read_nerfstudio(folder / "transforms.json"))
+        return _read_nerfstudio(folder / "transforms.json")
     raise CaptureError(f"{folder} holds no trajectory: expected {FORMS}.")
 
 
+def _read_pose(path: Path) -> NDArray[np.float64]:
+    """A (4, 4) matrix; NaN if it holds no numbers, as where tracking was lost. Raises CaptureError."""
+    matrix = read_matrix(path)
+    if matrix is None or matrix.shape != (4, 4):
+        raise CaptureError(f"{path} must hold a pose of 4 x 4 numbers: correct or remove it.")
+    return matrix if np.isfinite(matrix).all() else np.full((4, 4), np.nan)
+
+
 def _read_text(path: Path) -> PoseFile:
-    lines = [line.replace(",", " ").split() for line in path.read_text(encoding="utf-8").splitlines()]
-    rows = [line for line in lines if line and not line[0].startswith("#")]
-    lengths = {len(row) for row in rows}
-    if lengths == {tum_files.NUMBERS}:
-        timestamps, T = tum_files.tum_poses(rows)
-        return PoseFile(path, T, timestamps)
-    if lengths in ({12}, {16}):
-        T = np.tile(np.eye(4), (len(rows), 1, 1))
-        T[:, : len(rows[0]) // 4] = np.array(rows, np.float64).reshape(len(rows), -1, 4)
-        return PoseFile(path, T)
-    return _read_log(path, rows)
+    try:
+        rows = read_number_rows(path)
+        table = rows.table()
+        if table is not None and table.shape[1] == tum_files.NUMBERS:
+            timestamps, T = tum_files.tum_poses(table)
+            if (np.abs(timestamps) > _LATEST).any():
+                raise ValueError("a time is out of range")
+            found = PoseFile(path, T, timestamps)
+        elif table is not None and table.shape[1] in (12, 16):
+            T = np.tile(np.eye(4), (len(table), 1, 1))
+            T[:, : table.shape[1] // 4] = table.reshape(len(table), -1, 4)
+            found = PoseFile(path, T)
+        else:
+            found = _read_log(path, rows)
+    except ValueError as error:
+        raise CaptureError(f"{path} is not a trajectory: expected {FORMS}.") from error
+    return _checked(found)
 
 
-def _read_log(path: Path, rows: list[list[str]]) -> PoseFile:
+def _read_log(path: Path, rows: NumberRows) -> PoseFile:
     """Read Open3D's .log: per pose a line of three numbers, first the frame number, then four lines of the matrix."""
-    if len(rows) % 5 or not rows or any(len(row) != (3 if n % 5 == 0 else 4) for n, row in enumerate(rows)):
-        raise ValueError
-    numbers = [int(float(row[0])) for row in rows[::5]]
-    if min(numbers) < 0 or max(numbers) > 10_000_000:
-        raise ValueError
-    T = np.full((max(numbers) + 1, 4, 4), np.nan)
-    for k, number in enumerate(numbers):
-        T[number] = np.array(rows[5 * k + 1 : 5 * k + 5], np.float64)
+    count = len(rows.lengths) // 5
+    if not count or not np.array_equal(rows.lengths, np.tile((3, 4, 4, 4, 4), count)):
+        raise ValueError("no log")
+    blocks = rows.values.reshape(count, 3 + 16)
+    numbers = blocks[:, 0]
+    if not ((numbers >= 0) & (numbers < _MOST_POSES)).all():
+        raise ValueError("a frame number is out of range")
+    T = np.full((int(numbers.max()) + 1, 4, 4), np.nan)
+    T[numbers.astype(np.int64)] = blocks[:, 3:].reshape(count, 4, 4)
     return PoseFile(path, T)
 
 
 def _read_nerfstudio(path: Path) -> PoseFile:
-    frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
-    T = np.array([frame["transform_matrix"] for frame in frames], np.float64).reshape(-1, 4, 4)
-    T[:, :, 1:3] *= -1  # OpenGL's camera looks along -z with y up
-    return PoseFile(path, T, names=tuple(Path(frame["file_path"]).name for frame in frames))
+    content = read_transforms(path)
+    names = tuple(Path(frame.file_path).name for frame in content.frames)
+    return _checked(PoseFile(path, content.poses(), names=names))
 
 
 def _read_colmap(folder: Path) -> PoseFile:
-    from .colmap_models import read_colmap_model
-
     model = read_colmap_model(folder)
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    images = sorted(model.images, key=lambda image: image.name)
     if not images:
         raise CaptureError(f"The COLMAP model {folder} holds no image with a pose: check the reconstruction.")
-    T_cam_world = np.tile(np.eye(4), (len(images), 1, 1))
-    T_cam_world[:, :3] = [image.cam_from_world().matrix() for image in images]
+    T_cam_world = np.stack([image.T_cam_world for image in images])
     return _checked(PoseFile(folder, invert(T_cam_world), names=tuple(Path(image.name).name for image in images)))
 
 

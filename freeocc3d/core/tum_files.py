@@ -6,6 +6,7 @@ Source: J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, I
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -41,8 +42,9 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return tum_poses(rows)
 
 
-def tum_poses(rows: list[list[str]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(M,) timestamps and (M, 4, 4) poses from M lines, split into words. Raises ValueError that says what is wrong."""
+def tum_poses(rows: Sequence[Sequence[str]] | NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(M,) timestamps and (M, 4, 4) poses from M lines of words or numbers. Raises ValueError that says what is
+    wrong."""
     if any(len(row) != NUMBERS for row in rows):
         raise ValueError(f"a line does not hold {NUMBERS} numbers")
     table = np.array(rows, np.float64).reshape(-1, NUMBERS)

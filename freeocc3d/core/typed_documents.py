@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from typing import Any, TypeVar
 
 import msgspec
@@ -11,6 +12,7 @@ import msgspec
 T = TypeVar("T")
 
 _DEEPEST = 100
+_HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 _TOO_DEEP = f"its values are nested more than {_DEEPEST} deep"
 
 
@@ -18,11 +20,16 @@ class InvalidDocument(ValueError):
     """A document is not JSON, or its content has another type. The message is part of a sentence."""
 
 
-def parse_json(text: str | bytes) -> Any:
-    """The value of a JSON text, at most 100 deep; as Python writes it, with NaN and Infinity. Raises
-    InvalidDocument."""
+def parse_json(text: str | bytes, finite: bool = False) -> Any:
+    """The value of a JSON text, at most 100 deep; as Python writes it, with NaN and Infinity unless ``finite``. Raises
+    InvalidDocument, also for a name that stands twice in an object, and for half a character."""
+    refuse = _refuse_constant if finite else None
     try:
-        value = json.loads(text)
+        value = json.loads(text, object_pairs_hook=_unique, parse_constant=refuse)
+        if _HALF_CHARACTER.search(text if isinstance(text, str) else text.decode("utf-8", "replace")):
+            json.dumps(value, ensure_ascii=False).encode()  # a surrogate alone could never be written again
+    except InvalidDocument:
+        raise
     except json.JSONDecodeError as error:
         raise InvalidDocument(f"line {error.lineno}: {error.msg}") from error
     except ValueError as error:  # not UTF-8, or a whole number of thousands of digits
@@ -35,6 +42,18 @@ def parse_json(text: str | bytes) -> Any:
         if not level:
             return value
     raise InvalidDocument(_TOO_DEEP)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = Counter(name for name, _ in pairs)
+        raise InvalidDocument(f"'{names.most_common(1)[0][0][:80]}' stands twice")
+    return found
+
+
+def _refuse_constant(name: str) -> None:
+    raise InvalidDocument(f"it holds {name} instead of a number")
 
 
 def _inner(outer: Any) -> Any:

@@ -113,11 +113,11 @@ def broken_nerfstudio(folder: Path, key: str, value: object, frame: bool) -> Non
     ("key", "value", "frame", "said"),
     [
         ("camera_model", "EQUIRECTANGULAR", False, "camera model EQUIRECTANGULAR, which is not supported"),
-        ("fl_x", "wide", False, "intrinsics that are not numbers"),
+        ("fl_x", "wide", False, "'fl_x' has text instead of a number"),
         ("fl_x", None, False, "states no focal length"),
         ("k4", 0.1, False, "states k4"),
         ("file_path", "../../elsewhere.png", True, "lies outside "),
-        ("transform_matrix", [[1, 2], [3, 4]], True, "is not a trajectory"),
+        ("transform_matrix", [[1, 2], [3, 4]], True, "has 2 entries instead of 4"),
         ("frames", [], False, "not a trajectory|holds 0 images"),
     ],
 )

@@ -103,11 +103,11 @@ def test_parameters_for_another_size_of_the_same_view_are_rescaled(tmp_path: Pat
     ("changes", "message"),
     [
         ({"fx": 0.0}, "unusable intrinsics"),
-        ({"cy": float("nan")}, "unusable intrinsics"),
-        ({"fx": "wide"}, "all numbers"),
+        ({"cy": float("nan")}, "it holds NaN instead of a number"),
+        ({"fx": "wide"}, r"'camera.fx' has text instead of a number"),
         ({"w": 32, "h": 32}, "for images of 32 x 32 pixels, but the images have 32 x 24"),
-        ({"w": float("nan")}, "w and h"),
-        ({"scale": 0}, "scale must be a positive"),
+        ({"w": 10**400}, r"'camera.w' has a number that is too large"),
+        ({"scale": 0}, r"'camera.scale' has a number that is not >= 0.001"),
     ],
 )
 def test_unusable_parameters_name_their_file(tmp_path: Path, changes: dict[str, object], message: str) -> None:

@@ -325,3 +325,25 @@ def test_planes_of_pieces_far_apart_take_no_memory() -> None:
     centers = np.array([(2.5, 2.0, 1.5), (2.0, 2.0, 1.5)])
     for plane in detect_layout(_measured(points, centers), centers, np.eye(3)[2:]).planes:
         assert plane.support.size <= 1 << 24
+
+
+@pytest.mark.parametrize("gap", [2.0, 2.5, 3.0])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_two_sheets_a_few_cells_apart_are_two_planes_of_their_size(gap: float, axis: int) -> None:
+    """The same points are not found a second time, and none of the other sheet's are taken away."""
+    rng = np.random.default_rng(axis)
+    sheet = _rectangle((0.0, 0.0, 0.0), (2.0, 1.5, 0.0))
+    points = np.concatenate([sheet + (0.0, 0.0, height) for height in (0.0, gap * _CELL)])
+    points = np.roll(points + 0.001 * rng.normal(size=points.shape), axis + 1, axis=1)  # the sheets are across ``axis``
+    centers = np.roll(np.array([(1.0, 0.7, 1.5), (0.5, 0.5, 1.4)]), axis + 1, axis=1)
+    layout = detect_layout(_measured(points, centers), centers, np.eye(3)[[axis]])
+    planes = sorted((plane for plane in layout.planes if not plane.outermost), key=lambda plane: abs(plane.offset))
+    assert len(planes) == 2
+    for plane, height in zip(planes, (0.0, gap * _CELL), strict=True):
+        assert abs(plane.normal[axis]) > 0.9999
+        assert abs(plane.offset) == pytest.approx(height, abs=0.001)
+        middles = plane.corner + (np.argwhere(plane.support) + 0.5) * plane.square
+        there = np.roll(middles @ plane.axes + plane.normal * plane.offset, -axis - 1, axis=1)
+        np.testing.assert_allclose(there[:, :2].min(axis=0), 0.0, atol=1.5 * plane.square)
+        np.testing.assert_allclose(there[:, :2].max(axis=0), (2.0, 1.5), atol=1.5 * plane.square)
+        assert len(middles) * plane.square**2 == pytest.approx(3.0, rel=0.07)

@@ -9,18 +9,20 @@ import numpy as np
 import pytest
 import yaml
 from command_line import refused, run
+from manifests import tiny_manifest
 from posed_captures import write_colmap, write_nerfstudio
 
 from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import FreeOccError, MapError
 from freeocc3d.core.transforms import is_rigid, transform
 from freeocc3d.core.tum_files import write_tum
+from freeocc3d.core.types import Intrinsics, Trajectory
 from freeocc3d.core.warnings import Notice, read_notices
 from freeocc3d.editing import scaling
 from freeocc3d.pipeline import run as pipeline
 from freeocc3d.query.scan_map import Map, load_map
 from freeocc3d.storage import map_files
-from freeocc3d.storage.manifest import MapScale
+from freeocc3d.storage.manifest import MapScale, Refined, matrix
 from freeocc3d.tracking.trackers import file, known
 from freeocc3d.viewer import map_pictures
 
@@ -155,6 +157,128 @@ def test_a_pixel_without_depth_takes_the_nearest_that_has_one(half: Map) -> None
     assert scaling.scale_by_length(holed, [f"{frame}:102,102", "red cup"], 1.0) > 0  # type: ignore[arg-type]
     with pytest.raises(MapError, match=rf"Keyframe {frame} has no depth within 6 pixels of 110,110"):
         scaling.scale_by_length(holed, [f"{frame}:110,110", "red cup"], 1.0)  # type: ignore[arg-type]
+
+
+def pictured(depth_m: np.ndarray) -> SimpleNamespace:
+    """A map of one keyframe, frame 7, whose camera has differing axes and stands away from the origin."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), (1.0, 2.0, 3.0)
+    camera = Intrinsics(depth_m.shape[1], depth_m.shape[0], 50.0, 40.0, 21.0, 13.0)
+    return SimpleNamespace(
+        path=Path("map"),
+        keyframes=SimpleNamespace(depth_m=lambda row: depth_m, views=lambda: [("image", camera)]),
+        trajectory=SimpleNamespace(keyframes=np.array([7]), T_world_keyframe=T[None]),
+    )
+
+
+@pytest.mark.parametrize("pixel", [(20, 15), (0, 0), (39, 29), (3, 28)])
+def test_a_pixel_takes_the_nearest_depth_that_is_at_most_six_pixels_away(pixel: tuple[int, int]) -> None:
+    x, y = pixel
+    for dx, dy in [(0, 0), (6, 0), (-6, 0), (0, 6), (0, -6), (6, -6), (-6, 6), (7, 0), (-7, 0), (0, 7), (0, -7)]:
+        if not (0 <= x + dx < 40 and 0 <= y + dy < 30):
+            continue
+        depth = np.zeros((30, 40), np.float32)
+        depth[y + dy, x + dx] = 2.0
+        if max(abs(dx), abs(dy)) > 6:
+            with pytest.raises(MapError, match=f"no depth within 6 pixels of {x},{y}"):
+                scaling._point(pictured(depth), f"7:{x},{y}")
+            continue
+        seen = 2.0 * np.array(((x - 21.0) / 50, (y - 13.0) / 40, 1.0))
+        wanted = (seen[2] + 1.0, seen[0] + 2.0, seen[1] + 3.0)
+        np.testing.assert_allclose(scaling._point(pictured(depth), f" 7:{x},{y} "), wanted)
+    for farther, nearer in (((4, 0), (0, 3)), ((-3, 3), (4, 0)), ((0, -5), (-2, -4))):
+        depth = np.zeros((30, 40), np.float32)
+        for (dx, dy), z in ((farther, 3.0), (nearer, 2.0)):
+            depth[15 + dy, 20 + dx] = z
+        np.testing.assert_allclose(scaling._point(pictured(depth), "7:20,15")[0], 1.0 + 2.0)
+
+
+def test_a_pixel_beyond_the_image_or_the_keyframes_is_refused() -> None:
+    depth = np.ones((30, 40), np.float32)
+    for x, y in ((40, 0), (0, 30), (40, 30)):
+        with pytest.raises(MapError, match=rf"Pixel {x},{y} is outside keyframe 7: 40 x 30 pixels"):
+            scaling._point(pictured(depth), f"7:{x},{y}")
+    many = pictured(depth)
+    many.trajectory.keyframes = np.array([0, 10, 20, 30, 40])
+    with pytest.raises(MapError, match="the nearest are 10, 20, 30\\."):
+        scaling._point(many, "19:1,1")
+
+
+def test_a_length_is_the_distance_of_its_ends() -> None:
+    depth = np.full((30, 40), 2.0, np.float32)
+    length = 2.0 * np.hypot(10 / 50, 8 / 40)
+    assert scaling.scale_by_length(pictured(depth), ["7:5,6", "7:15,14"], 3.0) == pytest.approx(3.0 / length)
+
+
+@pytest.mark.parametrize(("voxel_m", "depth_m", "factor"), [(0.05, 3.0, 0.02), (0.1, 3.0, 65.535 / 3)])
+def test_the_smallest_and_the_largest_factor_of_a_map(voxel_m, depth_m, factor, monkeypatch) -> None:
+    class Passed(Exception):
+        """All checks of the factor are behind it."""
+
+    def made_of(*_):
+        raise Passed
+
+    monkeypatch.setattr(scaling.WorkFolder, "made_of", made_of)
+    frames = SimpleNamespace(depth_m=lambda row: np.array([[0.1, depth_m][row]]))
+    frames = type("Frames", (), {"depth_m": staticmethod(frames.depth_m), "__len__": lambda _: 2})()
+    given = SimpleNamespace(manifest=SimpleNamespace(finest_m=voxel_m), keyframes=frames, path=Path("map"))
+    outwards = 1.001 if factor > 1 else 0.999
+    with pytest.raises(Passed):
+        scaling.scale_map(given, factor / outwards, "given", "out")
+    with pytest.raises(MapError, match="check the length"):
+        scaling.scale_map(given, factor * outwards, "given", "out")
+
+
+def test_the_height_is_that_of_the_cameras_in_the_middle(monkeypatch: pytest.MonkeyPatch) -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, 3] = ((5.0, -1.0, 0.0), (0.0, -2.0, 9.0), (0.0, -6.0, 4.0))
+    T = np.array(((0.0, 0, 1, -1.0), (-1, 0, 0, 0), (0, -1, 0, 0.5), (0, 0, 0, 1)))
+    given = SimpleNamespace(
+        T_gravity_map=T, trajectory=SimpleNamespace(T_world_keyframe=poses), gaussians=None, path=Path("map")
+    )
+    monkeypatch.setattr(scaling, "is_floor_seen", lambda *_: True)
+    assert scaling.scale_by_camera_height(given, 5.0) == pytest.approx(5.0 / 2.5)
+
+
+@pytest.mark.parametrize(("off", "fits"), [(0.08, True), (0.13, False)])
+def test_poses_that_differ_by_a_tenth_of_their_spread_are_another_scans(tmp_path, off, fits) -> None:
+    count = 40
+    T = np.tile(np.eye(4), (count, 1, 1))
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    T[:, :3, 3] = np.stack((np.cos(angle), np.sin(angle), 0 * angle), axis=1)
+    times = np.arange(float(count))
+    trajectory = Trajectory(times, T, np.array([0], np.int32), np.full(count, "tracked"), np.ones(count, np.float32))
+    other = T.copy()
+    other[:, :3, 3] = 3.0 * (other[:, :3, 3] + np.outer(np.where(np.arange(count) % 2, off, -off), (0.0, 0.0, 1.0)))
+    write_tum(tmp_path / "poses.txt", dataclasses.replace(trajectory, T_world_cam=other))
+    given = SimpleNamespace(trajectory=trajectory)
+    if fits:
+        assert scaling.scale_by_poses(given, str(tmp_path / "poses.txt")) == pytest.approx(3.0, rel=1e-6)
+    else:
+        with pytest.raises(FreeOccError, match=r"at least 0\.39 m apart, and the camera path spreads over 3\.0"):
+            scaling.scale_by_poses(given, str(tmp_path / "poses.txt"))
+
+
+def test_every_length_of_a_manifest_is_scaled() -> None:
+    T = np.eye(4)
+    T[:3, 3] = 1.0, 2.0, 3.0
+    said = tiny_manifest(
+        origin=(1.0, -2.0, 3.0),
+        finest_voxel_m=0.05,
+        T_world_map=matrix(T),
+        T_gravity_map=matrix(2 * T - np.eye(4)),
+        scale=MapScale(metric=False, by="none", factor=1.5),
+        refined=Refined(map="coarse", box=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0)),
+    )
+    made = scaling._manifest(SimpleNamespace(manifest=said), 2.0, "length")
+    assert (made.voxel_size_m, made.finest_voxel_m, made.origin) == (0.2, 0.1, (2.0, -4.0, 6.0))
+    assert made.scale == MapScale(metric=True, by="length", factor=3.0)
+    assert made.refined is not None
+    assert made.refined.box == (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)
+    for found, before in ((made.T_world_map, said.T_world_map), (made.T_gravity_map, said.T_gravity_map)):
+        wanted = np.array(before)
+        wanted[:3, 3] *= 2
+        np.testing.assert_allclose(found, wanted)
 
 
 def test_the_cameras_height_above_the_floor(half: Map, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from scenes import occupancy_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.export import export_map, geojson
+from freeocc3d.query.regions import Region
 
 
 def test_an_outline_on_the_floor_with_its_height_and_scores(tmp_path) -> None:
@@ -27,7 +28,19 @@ def test_an_outline_on_the_floor_with_its_height_and_scores(tmp_path) -> None:
     assert properties["area_m2"] == pytest.approx(0.08)
     assert (properties["height_min_m"], properties["height_max_m"]) == (0.42, 0.52)
     np.testing.assert_allclose(properties["centroid"], (2.1, -0.2, 0.47), atol=1e-6)
-    assert told["frame"] == "gravity"
+    assert (properties["score"], properties["confidence"], properties["volume_m3"]) == (0.8, 0.9, 0.008)
+    assert (told["frame"], told["unit"]) == ("gravity", "metre")
+    np.testing.assert_allclose(told["T_frame_map"], scan_map.T_gravity_map)
+
+
+def test_numbers_of_large_and_tiny_regions_keep_four_digits_and_a_milliliter() -> None:
+    region = Region(0.12344, 0.98766, np.array((1.23456, -0.5, 0)), np.zeros(3), np.ones(3), 1.2345678, np.arange(1))
+    corners = np.stack(np.meshgrid(*[(0.0, 0.12344)] * 3), axis=-1).reshape(-1, 3)
+    properties = geojson._feature("cup", region, corners, region.centroid)["properties"]
+    assert [properties[name] for name in ("score", "confidence", "volume_m3")] == [0.1234, 0.9877, 1.234568]
+    assert properties["centroid"] == [1.2346, -0.5, 0.0]
+    assert (properties["height_min_m"], properties["height_max_m"]) == (0.0, 0.1234)
+    assert properties["area_m2"] == 0.0151  # 123 mm by 123 mm
 
 
 def test_words_are_those_asked_for(tmp_path) -> None:

@@ -11,7 +11,7 @@ from scenes import occupancy_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.core.types import FREE, OCCUPIED
-from freeocc3d.export import export_map
+from freeocc3d.export import export_map, octomap
 from freeocc3d.export.export_frames import place_voxels
 
 pyoctomap = pytest.importorskip("pyoctomap")
@@ -151,3 +151,16 @@ def test_what_cannot_be_written_is_reported(tmp_path) -> None:
     with pytest.raises(ExportError, match=r"map.bt.json already exists"):
         export_map(scan_map, "octomap", tmp_path / "map.bt")
     assert [path.name for path in tmp_path.iterdir()] == ["map.bt.json"]
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_voxels_up_to_the_limit_of_the_keys_are_written_and_none_beyond(axis: int) -> None:
+    first, last = np.zeros((2, 3), int)
+    first[axis], last[axis] = -(1 << 15), (1 << 15) - 1
+    (leaves,) = octomap.collect_leaves(occupancy_of([first], free=[last]), log_odds=False, color=False)
+    assert leaves.corners[:, axis].tolist() == [-(1 << 15), (1 << 15) - 1]
+    assert leaves.values.tolist() == [1.0, -1.0]
+    for beyond in (first, last):
+        outside = beyond + np.sign(beyond)
+        with pytest.raises(ExportError, match="farther than 3277 m"):
+            octomap.collect_leaves(occupancy_of([outside]), log_odds=False, color=False)

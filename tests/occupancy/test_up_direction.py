@@ -71,3 +71,23 @@ def test_a_camera_that_nods_is_not_held_sideways() -> None:
     for pose, pitch in zip(T, np.linspace(-np.pi / 2, np.pi / 2, 60), strict=True):
         pose[1:3, 1:3] = [[np.cos(pitch), -np.sin(pitch)], [np.sin(pitch), np.cos(pitch)]]
     assert -estimate_up(T, np.zeros((0, 3)))[1] > 0.99
+
+
+def test_up_follows_level_surfaces_by_ten_degrees_and_two_corrections_at_most() -> None:
+    yaw = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    T = np.tile(np.eye(4), (12, 1, 1))
+    T[:, 0, 0] = T[:, 2, 2] = np.cos(yaw)
+    T[:, 0, 2], T[:, 2, 0] = np.sin(yaw), -np.sin(yaw)
+    flat = np.random.default_rng(0).uniform(-3, 3, (4000, 2))
+    for azimuth in np.deg2rad(np.arange(0, 360, 30)):
+        for tilt, found in ((9.0, True), (18.0, False)):
+            away = np.array((np.cos(azimuth), 0.0, np.sin(azimuth)))
+            normal = np.cos(np.deg2rad(tilt)) * np.array((0.0, -1.0, 0.0)) + np.sin(np.deg2rad(tilt)) * away
+            a = np.cross(normal, (0.3, 0.4, 0.8))
+            a /= np.linalg.norm(a)
+            points = flat @ np.stack((a, np.cross(normal, a)))
+            up = estimate_up(T, points)
+            if found:
+                assert np.degrees(np.arccos(min(up @ normal, 1.0))) < 1.0
+            else:
+                assert np.degrees(np.arccos(-up[1])) <= 10.0 + 3.0 + 0.8 + 0.1

@@ -75,6 +75,7 @@ def changes_of(source: str) -> set[str]:
         ("x = 2", {"x = 3", "x = -2"}),
         ("x = 0.25", {"x = 0.5", "x = -0.25"}),
         ("x = a[2]", {"x = a[3]"}),
+        ("x = f(a, axis=1)", {"x = f(a, axis=2)"}),
         ("x = a[:n]", {"x = a[1:n]", "x = a[:n - 1]"}),
         ("x = np.minimum(a, b)", {"x = np.maximum(a, b)"}),
         ("x = any(a)", {"x = all(a)"}),

@@ -82,8 +82,14 @@ def find_sites(tree: ast.Module) -> list[Site]:
     return [
         Site(path, node.lineno, found)
         for path, node in _walk(tree, ())
-        if (found := list(_replacements(node, is_index=any(name == "slice" for name, _ in path[-3:]))))
+        if (found := list(_replacements(node, _is_index(tree, path))))
     ]
+
+
+def _is_index(tree: ast.Module, path: Path) -> bool:
+    """Whether a constant counts from the end if it is negative, and so may mean the same."""
+    parent = _follow(tree, path[:-1])
+    return any(name == "slice" for name, _ in path[-3:]) or (isinstance(parent, ast.keyword) and parent.arg == "axis")
 
 
 def sample_changes(source: str, seed: str, count: int) -> list[Change]:

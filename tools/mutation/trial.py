@@ -57,7 +57,7 @@ class Copies:
         wanted = {name for top in (self.project.package, *_COPIED) for name in _files(root, top)}
         for name in wanted | {name for top in (self.project.package, *_COPIED) for name in _files(self.warm, top)}:
             source, copy = root / name, self.warm / name
-            if name in wanted and copy.exists() and _stamp(source) == _stamp(copy):
+            if name in wanted and copy.exists() and source.read_bytes() == copy.read_bytes():
                 continue
             copy.unlink(missing_ok=True)
             changed.add(name)
@@ -114,10 +114,6 @@ def _files(root: Path, top: str) -> Iterator[str]:
 
 def _output_of(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.txt")
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    return path.stat().st_mtime_ns, path.stat().st_size
 
 
 def warm_up(project: Project) -> None:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from ...core.errors import CaptureError
 from ...core.transforms import invert
 from ..base import Options
-from ..colmap_models import colmap_folder, colmap_lens, read_colmap_model
+from ..colmap_models import colmap_folder, read_colmap_model
 from ..posed_images import PosedImage, PosedImages, compute_nominal_scale, resolve_inside
 from .photos import make_natural_key
 
-REQUIRES: tuple[str, ...] = ("pycolmap",)
+REQUIRES: tuple[str, ...] = ()
 
 
 class Reader(PosedImages):
@@ -31,17 +29,13 @@ class Reader(PosedImages):
         if folder is None:
             raise CaptureError(f"{path} holds no COLMAP model: expected {self.layout}.")
         model = read_colmap_model(folder)
-        lenses = {number: colmap_lens(camera, str(folder)) for number, camera in model.cameras.items()}
+        lenses = {number: camera.lens(str(folder)) for number, camera in model.cameras.items()}
         posed = []
-        for image in model.images.values():
-            if image.has_pose:
-                T_cam_world = np.eye(4)
-                T_cam_world[:3] = image.cam_from_world().matrix()
-                file = resolve_inside(path / "images", image.name, folder)
-                posed.append(PosedImage(file, None, lenses[image.camera_id], invert(T_cam_world)))
+        for image in model.images:
+            file = resolve_inside(path / "images", image.name, folder)
+            posed.append(PosedImage(file, None, lenses[image.camera], invert(image.T_cam_world)))
         posed.sort(key=lambda view: make_natural_key(view.image))
-        points = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
-        super().__init__(path, options, posed, options.scale or compute_nominal_scale(posed, points))
+        super().__init__(path, options, posed, options.scale or compute_nominal_scale(posed, model.points))
         self.metric_poses = options.scale is not None
 
     @classmethod

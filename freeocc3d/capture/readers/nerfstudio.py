@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from ...core.errors import CaptureError
 from ...core.types import Intrinsics
 from ..base import Options
-from ..camera_files import Calibration, read_json
+from ..camera_files import Calibration
 from ..lenses import BROWN_MODELS, PINHOLE_MODELS, Lens, lens_of
+from ..nerfstudio_files import read_transforms
 from ..point_files import read_points
 from ..posed_images import PosedImage, PosedImages, compute_nominal_scale, resolve_inside
 from ..trajectory_files import read_trajectory
@@ -45,21 +46,22 @@ class Reader(PosedImages):
 
     def __init__(self, path: Path, options: Options):
         file = path / TRANSFORMS
-        content = read_json(file)
-        poses = read_trajectory(file).T_world_cam  # also checks that frames have paths and poses
+        content = read_transforms(file)
+        poses = read_trajectory(file).T_world_cam  # also checks that they are rigid
         posed = []
-        for frame, T_world_cam in zip(content["frames"], poses, strict=True):
-            image = resolve_inside(path, str(frame["file_path"]), file)
+        for frame, T_world_cam in zip(content.frames, poses, strict=True):
+            image = resolve_inside(path, frame.file_path, file)
             if not image.suffix:  # as in NeRF's synthetic scenes
                 image = image.with_suffix(".png")
-            depth = frame.get("depth_file_path") if options.depth else None
-            depth_path = None if depth is None else resolve_inside(path, str(depth), file)
-            posed.append(PosedImage(image, depth_path, _lens({**content, **frame}, image, file), T_world_cam))
+            depth = frame.depth_file_path if options.depth else None
+            depth_path = None if depth is None else resolve_inside(path, depth, file)
+            lens = _lens({**content.stated(), **frame.stated()}, image, file)
+            posed.append(PosedImage(image, depth_path, lens, T_world_cam))
         posed.sort(key=lambda view: make_natural_key(view.image))
-        comes_with_depth = any("depth_file_path" in frame for frame in content["frames"])
+        comes_with_depth = any(frame.depth_file_path is not None for frame in content.frames)
         scale = options.scale
-        if scale is None and not comes_with_depth and (points := content.get("ply_file_path")):
-            scale = compute_nominal_scale(posed, _points(resolve_inside(path, str(points), file)))
+        if scale is None and not comes_with_depth and (points := content.ply_file_path):
+            scale = compute_nominal_scale(posed, _points(resolve_inside(path, points, file)))
         super().__init__(path, options, posed, scale)
         self.metric_poses = comes_with_depth or options.scale is not None
 
@@ -80,21 +82,23 @@ def _lens(stated: Mapping[str, Any], image: Path, file: Path) -> Lens:
     """The lens that a frame states. Raises CaptureError."""
     model = "OPENCV_FISHEYE" if stated.get("is_fisheye") else str(stated.get("camera_model", "OPENCV")).upper()
     model = "OPENCV" if model in _WITH_ALL_COEFFICIENTS else model
-    try:
-        width, height = int(stated.get("w", 0)), int(stated.get("h", 0))
-        if min(width, height) <= 0:
-            header = read_header(image)
-            if header is None:
-                raise CaptureError(f"{file} states no size (w, h), and its image {image} cannot be read.")
-            width, height = header.size if header.orientation < 5 else header.size[::-1]
-        fx = float(stated.get("fl_x") or 0.5 * width / math.tan(0.5 * float(stated["camera_angle_x"])))
-        fy = float(stated.get("fl_y") or fx)
-        cx, cy = float(stated.get("cx", width / 2)), float(stated.get("cy", height / 2))
-        names = ("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "k3", "k4", "p1", "p2")
-        coefficients = {name: float(stated.get(name, 0.0)) for name in names}
-    except KeyError as error:
-        raise CaptureError(f"{file} states no focal length: add fl_x or camera_angle_x.") from error
-    except (TypeError, ValueError, ZeroDivisionError) as error:
-        raise CaptureError(f"{file} holds intrinsics that are not numbers: correct it.") from error
+    width, height = int(stated.get("w", 0)), int(stated.get("h", 0))
+    if min(width, height) <= 0:
+        header = read_header(image)
+        if header is None:
+            raise CaptureError(f"{file} states no size (w, h), and its image {image} cannot be read.")
+        width, height = header.size if header.orientation < 5 else header.size[::-1]
+    fx = stated.get("fl_x") or _focal(stated.get("camera_angle_x"), width)
+    if fx is None:
+        raise CaptureError(f"{file} states no focal length: add fl_x or camera_angle_x.")
+    fy = stated.get("fl_y") or fx
+    cx, cy = stated.get("cx", width / 2), stated.get("cy", height / 2)
+    names = ("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "k3", "k4", "p1", "p2")
+    coefficients = {name: stated.get(name, 0.0) for name in names}
     camera: Intrinsics = Calibration((fx, fy, cx - 0.5, cy - 0.5), (width, height), str(file)).camera((width, height))
     return lens_of(model, camera, coefficients, str(file))
+
+
+def _focal(view: float | None, width: int) -> float | None:
+    """Focal length of a view of that many radians across the width; None if there is none, or no camera has it."""
+    return 0.5 * width / math.tan(0.5 * view) if view is not None and 0 < view < math.pi else None

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
-import math
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,15 +15,17 @@ from ...core.transforms import is_rigid
 from ..base import Options
 from ..camera_files import (
     Calibration,
+    Number,
+    PositiveNumber,
     guess_camera,
     read_given_calibration,
     read_json,
-    read_text,
     rescale_camera,
 )
 from ..class_files import capture_class_names
 from ..depth_registration import PixelGrid
 from ..image_pairs import ImagePairs, pair_files
+from ..number_files import read_number_rows
 from ..numbered_files import has_file, list_numbered
 
 REQUIRES: tuple[str, ...] = ()
@@ -33,6 +36,25 @@ CLASSES = r"semantic_class_(\d+)\.png"
 
 UNITS_PER_METER = 6553.5
 """Depth units per meter of the published Replica renderings; ``scale`` in cam_params.json overrides it."""
+
+
+DepthUnits = Annotated[float, msgspec.Meta(ge=1e-3, le=1e9)]
+
+
+class _Camera(msgspec.Struct):
+    """The camera of cam_params.json. scale: depth units per meter."""
+
+    w: PositiveNumber
+    h: PositiveNumber
+    fx: Number
+    fy: Number
+    cx: Number
+    cy: Number
+    scale: DepthUnits = UNITS_PER_METER
+
+
+class _Parameters(msgspec.Struct):
+    camera: _Camera
 
 
 class Reader(ImagePairs):
@@ -80,11 +102,13 @@ class Reader(ImagePairs):
         path = self.path / "traj.txt"
         if not path.is_file():
             return None
-        lines = [line for line in read_text(path).splitlines() if line.strip()]
         try:
-            poses = np.array([[float(number) for number in line.split()] for line in lines]).reshape(-1, 4, 4)
-        except ValueError as error:
-            raise CaptureError(f"{path} must hold 16 numbers per line: correct or remove it.") from error
+            table = read_number_rows(path).table()
+        except ValueError:
+            table = None
+        if table is None or table.shape[1] != 16:
+            raise CaptureError(f"{path} must hold 16 numbers per line: correct or remove it.")
+        poses = table.reshape(-1, 4, 4)
         if len(poses) != len(self) and len(poses) <= self._pairs.numbers[-1]:
             raise CaptureError(f"{path} holds {len(poses)} poses for {len(self)} frames: correct or remove it.")
         return poses
@@ -101,14 +125,6 @@ def _parameters(path: Path, options: Options) -> tuple[Calibration | None, float
                 "(and capture.depth_scale)."
             )
         return override, UNITS_PER_METER
-    camera = read_json(file).get("camera", {})
-    try:
-        fx, fy, cx, cy, width, height = (float(camera[key]) for key in ("fx", "fy", "cx", "cy", "w", "h"))
-        units_per_meter = float(camera.get("scale", UNITS_PER_METER))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise CaptureError(f'{file} must hold {{"camera": {{w, h, fx, fy, cx, cy, scale}}}}, all numbers.') from error
-    if not (math.isfinite(units_per_meter) and units_per_meter > 0):
-        raise CaptureError(f"{file}: scale must be a positive number of depth units per meter, not {units_per_meter}.")
-    if not (math.isfinite(width) and math.isfinite(height)):
-        raise CaptureError(f"{file}: w and h must be numbers of pixels.")
-    return override or Calibration((fx, fy, cx, cy), (int(width), int(height)), str(file)), units_per_meter
+    camera = read_json(file, _Parameters).camera
+    values, size = (camera.fx, camera.fy, camera.cx, camera.cy), (int(camera.w), int(camera.h))
+    return override or Calibration(values, size, str(file)), camera.scale

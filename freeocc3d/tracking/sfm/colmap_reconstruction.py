@@ -9,9 +9,10 @@ import numpy as np
 import pycolmap
 
 from ...capture.base import Capture
-from ...capture.colmap_models import colmap_folder, colmap_lens, read_colmap_model
+from ...capture.colmap_models import ColmapModel, ModelCamera, ModelImage, colmap_folder, read_colmap_model
 from ...capture.lenses import Lens
 from ...core.errors import CaptureError, TrackingError
+from ...core.transforms import invert
 from ...core.types import Intrinsics
 from .reconstruction import Reconstruction
 
@@ -36,7 +37,7 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
 
     found = convert_model(model, len(capture), frame_of, str(folder))
     if not found.has_pose.any():
-        first = next((image.name for image in model.images.values()), "no image")
+        first = next((image.name for image in model.images), "no image")
         raise TrackingError(
             f"No image of the model in {folder} belongs to a frame of {capture.path}: its first image is {first}, the "
             f"capture's {names[0] or 'has no name'}."
@@ -53,8 +54,27 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
     return found
 
 
+def plain_model(model: pycolmap.Reconstruction) -> ColmapModel:
+    """A model in pycolmap's memory as plain data: the images that have a pose."""
+    images = []
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        T_cam_world = np.eye(4)
+        T_cam_world[:3] = image.cam_from_world().matrix()
+        seen = [point.point3D_id for point in image.get_observation_points2D()]  # pycolmap gives no array
+        images.append(ModelImage(image.name, image.camera_id, T_cam_world, np.array(seen, np.uint64)))
+    cameras = {
+        number: ModelCamera(camera.model.name, camera.width, camera.height, tuple(camera.params.tolist()))
+        for number, camera in model.cameras.items()
+    }
+    ids = np.array(sorted(model.points3D), np.uint64)
+    points = np.array([model.points3D[int(i)].xyz for i in ids], np.float64).reshape(-1, 3)
+    return ColmapModel(cameras, images, points, ids)
+
+
 def convert_model(
-    model: pycolmap.Reconstruction, frames: int, frame_of: Callable[[str], int | None], source: str
+    model: ColmapModel, frames: int, frame_of: Callable[[str], int | None], source: str
 ) -> Reconstruction:
     """Convert a model to a reconstruction of a capture's N ``frames``. frame_of: image name -> frame, or None.
 
@@ -63,17 +83,15 @@ def convert_model(
     """
     T_world_cam = np.full((frames, 4, 4), np.nan)
     seen_frame, seen_id, cameras = [], [], set()
-    for image in model.images.values():
-        frame = frame_of(image.name) if image.has_pose else None
+    for image in model.images:
+        frame = frame_of(image.name)
         if frame is None:
             continue
-        T_world_cam[frame] = np.eye(4)
-        T_world_cam[frame, :3] = image.cam_from_world().inverse().matrix()
-        ids = [point.point3D_id for point in image.get_observation_points2D()]  # pycolmap gives no array
-        seen_id.append(np.array(ids, np.uint64))
-        seen_frame.append(np.full(len(ids), frame, np.int32))
-        cameras.add(image.camera_id)
-    lenses = {colmap_lens(model.cameras[camera], source) for camera in cameras} or {_NO_LENS}
+        T_world_cam[frame] = invert(image.T_cam_world)
+        seen_id.append(image.seen)
+        seen_frame.append(np.full(len(image.seen), frame, np.int32))
+        cameras.add(image.camera)
+    lenses = {model.cameras[camera].lens(source) for camera in cameras} or {_NO_LENS}
     if len(lenses) > 1:
         raise TrackingError(
             f"The model has {len(lenses)} cameras, but a capture has one: make the model with one shared camera "
@@ -81,7 +99,7 @@ def convert_model(
         )
     observed = np.concatenate(seen_id) if seen_id else np.zeros(0, np.uint64)
     unique, seen_point = np.unique(observed, return_inverse=True)
-    points = np.array([model.points3D[int(i)].xyz for i in unique], np.float32).reshape(-1, 3)
+    points = model.points[model.rows(unique)].astype(np.float32)
     return Reconstruction(
         T_world_cam,
         next(iter(lenses)),

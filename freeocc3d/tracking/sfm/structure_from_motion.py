@@ -27,7 +27,7 @@ from ...core.threads import count_threads
 from ...core.types import Intrinsics
 from ...core.warnings import Notice
 from . import diagnosis, frame_selection, mapping, pair_selection
-from .colmap_reconstruction import convert_model
+from .colmap_reconstruction import convert_model, plain_model
 from .database import SfmDatabase, image_name
 from .feature_matching import match_descriptors
 from .local_features import Detector, LocalFeatures, load_detector
@@ -83,7 +83,7 @@ def reconstruct_poses(
     progress.stage("adjustment")
     model = mapping.adjust_model(models[0], recipe.intrinsics == "fixed", distorts=not capture.intrinsics_known)
     frame_of = {image_name(index): index for index in found}
-    result = convert_model(model, len(capture), frame_of.get, what).normalized()
+    result = convert_model(plain_model(model), len(capture), frame_of.get, what).normalized()
     apart, pieces = _apart(models, result.has_pose)
     if pieces:
         text = (
