@@ -21,6 +21,9 @@ from .base import Capture, Options
 from .depth_registration import PixelGrid
 from .image_decoding import convert_to_meters, image_size, read_classes, read_color, read_depth
 
+MOST_FRAME_PIXELS = 1 << 25
+"""Largest frame: that of an 8K video. A run keeps several frames in memory, with 7 bytes per pixel."""
+
 
 @dataclass(frozen=True)
 class Pairs:
@@ -78,6 +81,12 @@ class ImagePairs(Capture):
     def __init__(self, path: Path, options: Options, pairs: Pairs, grid: PixelGrid, units_per_meter: float):
         """units_per_meter: of the stored depth, unless ``options.depth_scale`` is set."""
         super().__init__(path, options)
+        width, height = grid.intrinsics.width, grid.intrinsics.height
+        if width * height > MOST_FRAME_PIXELS:
+            raise CaptureError(
+                f"The frames of {path} have {width} x {height} pixels, but at most {MOST_FRAME_PIXELS / 1e6:.0f} "
+                "million are possible: reduce the images."
+            )
         self._pairs = pairs
         self._grid = grid
         self._units_per_meter = options.depth_scale or units_per_meter

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import CaptureError, ConfigError, FrameError
+from ..core.regular_files import user_path
 from ..core.warnings import Notice
 from ..settings import registry
 from .base import Capture, Options
+from .numbered_files import list_folder
 
 VIDEO = "video"
 """The reader of video files; all others read folders."""
@@ -31,6 +34,8 @@ INDOOR_MEDIAN_M = 0.1, 20.0
 
 TYPICAL_MEDIAN_M = 2.0
 
+_MOST_BELOW = 1000
+
 
 def open_capture(
     path: str | Path, options: Options | None = None, backend_options: Mapping[str, Mapping[str, Any]] | None = None
@@ -44,9 +49,11 @@ def open_capture(
     options = options or Options()
     if str(path).startswith(BUILTIN):
         return _construct("synthetic", Path(path), options, backend_options or {})
-    folder = Path(path).expanduser()
-    if not folder.exists():
+    folder = user_path(path)
+    if not os.path.exists(folder):
         raise CaptureError(f"There is no folder or video {folder}: check the path of the capture.")
+    if not (folder.is_dir() or folder.is_file()):
+        raise CaptureError(f"{folder} is neither a folder nor a regular file: give a folder of frames, or a video.")
     is_video = options.format == VIDEO or (options.format == "auto" and folder.is_file())
     if folder.is_file() != is_video:
         raise CaptureError(
@@ -150,7 +157,7 @@ def _readers() -> dict[str, type[Capture]]:
 
 def _below(folder: Path, readers: Mapping[str, type[Capture]]) -> str:
     """A hint at the first subfolder that is a capture, as in data sets of several, or at the first video."""
-    for child in sorted(folder.iterdir()):
+    for child in (folder / name for name in list_folder(folder)[:_MOST_BELOW]):
         if child.is_dir() and any(reader.recognizes(child) for reader in readers.values()):
             return f", but {child} is: give that folder"
         if child.is_file() and child.suffix.lower() in VIDEO_SUFFIXES:

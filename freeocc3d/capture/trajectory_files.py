@@ -9,6 +9,7 @@ time); A. Geiger et al., KITTI's odometry development kit; the format pages of C
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +19,14 @@ from numpy.typing import NDArray
 
 from ..core import tum_files
 from ..core.errors import CaptureError
+from ..core.regular_files import user_path
 from ..core.transforms import invert, is_rigid
 from .base import Capture
 from .camera_files import read_matrix
 from .colmap_models import FARTHEST, colmap_folder, read_colmap_model
 from .nerfstudio_files import read_transforms
 from .number_files import NumberRows, read_number_rows
+from .numbered_files import list_folder
 
 SAME_TIME_S = 0.02
 """Largest difference of timestamps that match, as in the TUM RGB-D benchmark."""
@@ -94,10 +97,10 @@ class PoseFile:
 
 def read_trajectory(path: str | Path) -> PoseFile:
     """Read a file in any of ``FORMS``. Raises CaptureError for any other file, or a damaged one."""
-    path = Path(path).expanduser()
+    path = user_path(path)
     if path.is_dir():
         return _read_folder(path)
-    if not path.exists():
+    if not os.path.exists(path):
         raise CaptureError(f"There is no trajectory {path}: check the path.")
     if path.name in ("images.txt", "images.bin"):
         return _read_colmap(path.parent)
@@ -116,7 +119,7 @@ def _checked(found: PoseFile) -> PoseFile:
 
 
 def _read_folder(folder: Path) -> PoseFile:
-    if files := sorted(folder.glob("*.pose.txt")):
+    if files := [folder / name for name in list_folder(folder) if name.endswith(".pose.txt")]:
         T = np.stack([_read_pose(file) for file in files])
         return _checked(PoseFile(folder, T, names=tuple(file.name for file in files)))
     if model := colmap_folder(folder):

@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 
+def printable(text: str) -> str:
+    """The text in one line that can be printed and stored: line breaks, control characters and bytes that are not text,
+    as names of files may hold them, become escapes such as ``\\n``."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 class FreeOccError(Exception):
     """A known failure, with a message that a user can act on. The command line prints the message and exits with 1."""
+
+    def __str__(self) -> str:
+        """The message, as one line: names of files from outside may hold line breaks, or bytes that are not text."""
+        return printable(super().__str__())
 
 
 class CaptureError(FreeOccError):

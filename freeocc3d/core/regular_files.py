@@ -17,6 +17,9 @@ TEXT_BYTES = 256 << 20
 IMAGE_BYTES = 512 << 20
 """Largest encoded image that is read."""
 
+MOST_ENTRIES = 500_000
+"""Most entries of a folder that is listed: the frames of hours."""
+
 _KINDS = (
     (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
@@ -65,6 +68,25 @@ def read_text(path: Path, limit: int = TEXT_BYTES) -> str:
     """The text of a regular file in UTF-8, with or without a byte order mark. Raises OSError as ``check_regular``
     does, and UnicodeDecodeError, a ValueError."""
     return read_bytes(path, limit).decode("utf-8-sig")
+
+
+def user_path(path: str | Path) -> Path:
+    """The path that a user gives, with ``~`` as the home folder where there is one."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:  # there is no such user, or no home
+        return Path(path)
+
+
+def list_names(folder: Path) -> list[str]:
+    """The names in a folder, sorted. Raises OSError: no folder, or one of more than ``MOST_ENTRIES``."""
+    names = []
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            names.append(entry.name)
+            if len(names) > MOST_ENTRIES:
+                raise UnusableFile(errno.EFBIG, f"it holds more than {MOST_ENTRIES:,} files", str(folder))
+    return sorted(names)
 
 
 def _refuse(path: Path, found: os.stat_result, limit: int | None) -> None:

@@ -157,7 +157,7 @@ def test_a_file_is_only_read_as_a_video_and_a_folder_never(tmp_path: Path) -> No
         open_capture(tmp_path, Options(format="video"))
     with pytest.raises(CaptureError, match=r"but .*scan\.mp4 may be: give that file"):
         open_capture(tmp_path)
-    with pytest.raises(ConfigError, match="'max_size' must be at least 16"):
+    with pytest.raises(ConfigError, match="'max_size' must be from 16 to"):
         open_capture(path, Options(max_size=2))
     with pytest.raises(ConfigError, match="'scale' must be greater than 0"):
         open_capture(path, Options(scale=0.0))

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from freeocc3d.core import regular_files
 from freeocc3d.core.checksums import hash_bytes, hash_file
-from freeocc3d.core.regular_files import UnusableFile, check_regular, read_bytes, read_text
+from freeocc3d.core.regular_files import UnusableFile, check_regular, list_names, read_bytes, read_text, user_path
 
 
 def special(kind: str, folder: Path) -> Path:
@@ -55,3 +56,21 @@ def test_text_may_have_a_byte_order_mark_and_checksums_tell_a_flipped_bit(tmp_pa
     path.write_bytes(b"\xff\xff")
     with pytest.raises(ValueError, match="utf-8"):
         read_text(path)
+
+
+def test_the_names_in_a_folder_are_sorted_and_their_number_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in (b"b", b"a", b"\xff", b"line\nbreak"):
+        (Path(os.fsdecode(os.path.join(os.fsencode(tmp_path), name)))).write_bytes(b"")
+    assert list_names(tmp_path) == ["a", "b", "line\nbreak", "\udcff"]
+    monkeypatch.setattr(regular_files, "MOST_ENTRIES", 3)
+    with pytest.raises(UnusableFile) as caught:
+        list_names(tmp_path)
+    assert caught.value.strerror == "it holds more than 3 files"
+
+
+def test_a_home_that_is_unknown_leaves_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    assert user_path("~/scan") == Path("/home/me/scan")
+    assert user_path("~nobody_of_this_name/scan") == Path("~nobody_of_this_name/scan")

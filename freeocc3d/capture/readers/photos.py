@@ -21,6 +21,7 @@ from ...core.warnings import Notice
 from ..base import Capture, Options
 from ..camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
 from ..image_decoding import read_color
+from ..numbered_files import list_folder
 
 REQUIRES: tuple[str, ...] = ("PIL",)
 
@@ -123,16 +124,20 @@ class Reader(Capture):
 def list_images(folder: Path) -> list[Path]:
     """The images of a folder or, if it has none, of its ``images/``, in natural order: 2 before 10."""
     for place in (folder, folder / "images"):
-        paths = list(place.iterdir()) if place.is_dir() else []
-        found = [path for path in paths if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
+        paths = [place / name for name in list_folder(place) if not name.startswith(".")]
+        found = [path for path in paths if path.suffix.lower() in SUFFIXES]
         if found:
             return sorted(found, key=make_natural_key)
     return []
 
 
 def make_natural_key(path: Path) -> list[tuple[int, str]]:
-    """Sort key that compares numbers in names as numbers."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.as_posix().lower())]
+    """Sort key that compares numbers in names as numbers, of any length."""
+    parts = re.split(r"([0-9]+)", path.as_posix().lower())
+    numbers = [part.lstrip("0") for part in parts[1::2]]
+    keys = [(-1, part) for part in parts]
+    keys[1::2] = [(len(number), number) for number in numbers]
+    return keys
 
 
 def read_header(path: Path) -> Header | None:
@@ -236,5 +241,5 @@ def _too_few(path: Path, found: Sequence[Path]) -> str:
 
 
 def _unreadable(path: Path) -> list[Path]:
-    places = [place for place in (path, path / "images") if place.is_dir()]
-    return [file for place in places for file in sorted(place.iterdir()) if file.suffix.lower() in UNREADABLE]
+    files = (place / name for place in (path, path / "images") for name in list_folder(place))
+    return [file for file in files if file.suffix.lower() in UNREADABLE]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...capture.base import Capture
 from ...capture.class_files import read_class_names
+from ...capture.numbered_files import list_folder
 from ...core.errors import CaptureError
 from ...core.image_files import ImageFileError, read_image
 from ...core.types import Frame
@@ -24,6 +25,7 @@ REQUIRES: tuple[str, ...] = ()
 
 _VOID = 255
 """A value that means nothing in many class images, even if there are fewer than 255 classes."""
+_MOST_CLASSES = 2048
 _ASPECT_TOLERANCE = 0.02
 
 
@@ -49,6 +51,8 @@ class LabelsEncoder(Encoder):
     def __init__(
         self, classes: tuple[str, ...], images: Callable[[int], NDArray[np.integer] | None], stride: int = 2
     ) -> None:
+        if len(classes) > _MOST_CLASSES:
+            raise CaptureError(f"The labels encoder knows at most {_MOST_CLASSES} classes, not {len(classes)}.")
         self.classes = classes
         self.images = images
         self.stride = stride
@@ -156,10 +160,11 @@ class _FolderImages:
     """Class images in a folder, in the order of the last number in their names, or found by it."""
 
     def __init__(self, folder: Path, frames: int):
-        paths = [path for path in folder.glob("*.png") if re.search(r"\d", path.stem)] if folder.is_dir() else []
+        names = [name for name in list_folder(folder) if name.endswith(".png")]
+        paths = [folder / name for name in names if re.search(r"\d", name.removesuffix(".png"))]
         if not paths:
             raise CaptureError(f"The folder {folder} has no class images: *.png with the frame's number in the name.")
-        numbered = {int(re.findall(r"\d+", path.stem)[-1]): path for path in sorted(paths)}
+        numbered = {int(re.findall(r"\d+", path.stem)[-1]): path for path in paths}
         if len(numbered) < len(paths):
             raise CaptureError(f"Several class images in {folder} have the same number: keep one for each frame.")
         in_order = len(numbered) == frames

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ...capture.base import Capture
 from ...core.errors import ConfigError
 from ...core.progress import Progress
+from ...core.regular_files import user_path
 from ...core.types import Frame, Trajectory
 from ...settings.option_types import FilePath
 from ..base import KeyframeOptions, PosedPoints, Tracked
@@ -77,7 +78,7 @@ class ColmapTracker(GivenTracker):
     def _reconstruct(self, folder: Path, frames: range, progress: Progress) -> Reconstruction:
         options, scale = self.options, self._capture.options.scale
         if options.model is not None:
-            found = read_model(Path(options.model).expanduser(), self._capture).normalized()
+            found = read_model(user_path(options.model), self._capture).normalized()
         else:
             recipe = Recipe(options.frames, options.order, options.features, options.mapping, options.intrinsics)
             found = reconstruct_poses(self._capture, frames, folder, recipe, progress)

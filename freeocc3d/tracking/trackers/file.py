@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -14,6 +15,7 @@ from ...capture import read_trajectory
 from ...capture.base import Capture
 from ...capture.point_files import read_points
 from ...core.errors import ConfigError, TrackingError
+from ...core.regular_files import user_path
 from ...core.transforms import invert, project, transform
 from ...core.types import Frame
 from ...settings.option_types import FilePath
@@ -110,9 +112,9 @@ def project_depth(points_cam: NDArray[np.float32], frame: Frame) -> NDArray[np.f
 
 def _beside(path: str, capture: Capture) -> Path:
     """The path as given or, if it does not exist, the path in the capture's folder or the folder of the video."""
-    given = Path(path).expanduser()
+    given = user_path(path)
     inside = (capture.path.parent if capture.path.is_file() else capture.path) / given
-    return inside if not given.exists() and inside.exists() else given
+    return inside if not os.path.exists(given) and os.path.exists(inside) else given
 
 
 def _scale(T_world_cam: NDArray[np.float64], capture: Capture, options: Options) -> float:
