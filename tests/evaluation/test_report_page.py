@@ -220,3 +220,29 @@ def test_a_room_of_nothing_and_several_rooms(tmp_path: Path) -> None:
     assert [row[0] for row in both.rows if row[0] in ("first <i>", "second")] == ["first <i>", "second"]
     assert "2 scenes, pooled by voxels" in both.text
     assert "#scene-2" in both.addresses
+
+
+def test_ways_are_drawn_from_above_in_centimeters_with_y_down() -> None:
+    scene = room(way=True)
+    drawn = report_page._drawn_way(scene)
+    errors = scene.errors
+    assert errors is not None
+    true = np.array([list(map(float, pair.split(","))) for pair in drawn["true"].split()])
+    pieces = np.array([piece[:4] for piece in drawn["pieces"]])
+    for found, points in (
+        (true, errors.true),
+        (pieces[:, :2], errors.aligned[:-1]),
+        (pieces[:, 2:], errors.aligned[1:]),
+    ):
+        drawn_steps, steps = np.diff(found[::13], axis=0), 100 * np.diff(points[::13, :2], axis=0)
+        np.testing.assert_allclose(drawn_steps @ drawn_steps.T, steps @ steps.T, atol=6.0)  # lengths and angles
+        turns, true_turns = (a[:-1, 0] * a[1:, 1] - a[:-1, 1] * a[1:, 0] for a in (drawn_steps, steps))
+        np.testing.assert_allclose(turns, -true_turns, rtol=0.03)  # y points down
+    every = np.concatenate((true, pieces[:, :2], pieces[-1:, 2:]))
+    np.testing.assert_allclose(every.min(axis=0), 0.0, atol=0.06)
+    extent = every.max(axis=0)
+    x, y, width, height = drawn["box"]
+    np.testing.assert_allclose((x, y), -0.04 * extent.max(), rtol=0.01)
+    np.testing.assert_allclose((width, height), extent + 0.08 * extent.max(), rtol=0.01)
+    assert drawn["worst"] == errors.errors_m.max()
+    np.testing.assert_allclose(drawn["start"], true[0], atol=0.06)

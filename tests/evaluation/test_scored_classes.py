@@ -83,3 +83,15 @@ def test_the_shipped_example_maps_all_classes_of_the_house() -> None:
         mapped = classes.apply(original, str(EXAMPLE))
         np.testing.assert_array_equal((mapped.labels > 0) & (mapped.labels < 255), original.labels % 255 > 0)
         assert set(original.classes[1:]) <= set(classes.labels)
+
+
+@pytest.mark.parametrize(("count", "fits"), [(254, True), (255, False)])
+def test_as_many_classes_as_labels_of_a_byte_leave(tmp_path: Path, count: int, fits: bool) -> None:
+    """0 is free and 255 unknown."""
+    path = write(tmp_path / "c.txt", "".join(f"thing {n}\n" for n in range(count)))
+    if fits:
+        classes = load_class_map(path)
+        assert classes.classes[-1] == "thing 253"
+        return
+    with pytest.raises(FreeOccError, match="at most 254 different names"):
+        load_class_map(path)

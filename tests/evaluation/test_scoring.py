@@ -15,6 +15,7 @@ from freeocc3d.cli.scores import scores_document, scores_text
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.tum_files import write_tum
 from freeocc3d.core.types import Trajectory
+from freeocc3d.evaluation import scoring
 from freeocc3d.evaluation.confusion import Prediction
 from freeocc3d.evaluation.ground_truth import load_ground_truth, save_ground_truth
 from freeocc3d.evaluation.scene_scoring import ScoredScene
@@ -140,16 +141,30 @@ def test_the_truth_as_prediction_scores_100_everywhere() -> None:
         assert all(own is None or own["miou"] == 1.0 for key, own in document["miou_over"].items() if key != "listed")
 
 
+NAMES = ("free", "wall", "sofa", "lamp")
+
+
+def some_truth(seed: int = 0, classes: tuple[str, ...] = NAMES) -> GroundTruth:
+    """Patches of free, unknown and occupied voxels."""
+    rng = np.random.default_rng(seed)
+    values = rng.choice([0, 0, 0, 1, 1, 2, 3, 255], (7, 6, 5))
+    labels = np.repeat(np.repeat(np.repeat(values, 3, axis=0), 2, axis=1), 2, axis=2)
+    return GroundTruth(np.minimum(labels, 255).astype(np.uint8), np.array((0.5, -1.0, 2.0)), 0.08, classes)
+
+
+def saved(truth: GroundTruth, path: Path) -> Path:
+    save_ground_truth(truth, path, True)
+    return path
+
+
 def test_a_shifted_and_a_swapped_truth_score_what_numpy_counts(tmp_path: Path) -> None:
-    truth = load_ground_truth(data_folder() / "house" / "bedroom" / "ground_truth.npz")
+    truth = some_truth()
     known = truth.labels != 255
+    there = saved(truth, tmp_path / "truth.npz")
 
     def scored(labels: Any, origin: Any = truth.origin) -> dict[str, Any]:
-        save_ground_truth(GroundTruth(labels, origin, 0.08, truth.classes), tmp_path / "claim.npz", True)
-        save_ground_truth(truth, tmp_path / "truth.npz", True)
-        return scores_document(
-            evaluate_scenes(ScoringRequest(grid=tmp_path / "claim.npz", ground_truths=[tmp_path / "truth.npz"]))
-        )
+        claim = saved(GroundTruth(labels, origin, 0.08, truth.classes), tmp_path / "claim.npz")
+        return scores_document(evaluate_scenes(ScoringRequest(grid=claim, ground_truths=[there])))
 
     occupied = known & (truth.labels > 0)
     for axis in range(3):
@@ -158,15 +173,54 @@ def test_a_shifted_and_a_swapped_truth_score_what_numpy_counts(tmp_path: Path) -
         moved = np.roll(np.where(known, truth.labels, 0), 1, axis)
         moved[tuple(slice(0, 1) if a == axis else slice(None) for a in range(3))] = 0
         expected = ((moved > 0) & occupied).sum() / (((moved > 0) | occupied) & known).sum()
-        walls = (moved == 21) & known
-        of_wall = (walls & (truth.labels == 21)).sum() / (walls | (truth.labels == 21)).sum()
         document = scored(truth.labels, truth.origin + shift)
         assert document["iou"] == pytest.approx(expected, abs=1e-12)
-        assert document["per_class"]["wall"] == pytest.approx(of_wall, abs=1e-12)
+        assert list(document["per_class"]) == list(NAMES[1:])
+        for label, name in enumerate(NAMES[1:], start=1):
+            own = (moved == label) & known
+            of_class = (own & (truth.labels == label)).sum() / (own | (truth.labels == label)).sum()
+            assert document["per_class"][name] == pytest.approx(of_class, abs=1e-12)
     flipped = truth.labels[::-1]
     claimed = (flipped > 0) & (flipped < 255)
     expected = (claimed & occupied).sum() / ((claimed | occupied) & known).sum()
     assert scored(np.ascontiguousarray(flipped))["iou"] == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_class_file_says_which_classes_are_scored(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text("classes: [furniture, wall, carpet]\nmap: {sofa: furniture, lamp: null}\n")
+    there = saved(some_truth(), tmp_path / "truth.npz")
+    found = evaluate_scenes(ScoringRequest(grid=there, ground_truths=[there], classes=tmp_path / "c.yaml"))
+    assert (found.classes, found.listed, found.how) == (("furniture", "wall", "carpet"), True, "se3")
+    assert found.scores.iou == pytest.approx(1.0)
+    assert found.miou() == pytest.approx(2 / 3)  # no carpet
+    plain = evaluate_scenes(ScoringRequest(grid=there, ground_truths=[there], align="none"))
+    assert (plain.classes, plain.listed, plain.how) == (NAMES[1:], False, "none")
+    assert plain.miou() == pytest.approx(1.0)
+
+
+def test_classes_of_several_truths_are_put_together_in_their_order() -> None:
+    truths = [some_truth(0), some_truth(1, ("free", "lamp", "plant", "wall"))]
+    common = scoring.collect_common_classes(truths)
+    assert common.classes == ("wall", "sofa", "lamp", "plant")
+    applied = common.apply(truths[1], "")
+    np.testing.assert_array_equal(applied.labels, np.array((0, 3, 4, 1, *[255] * 252))[truths[1].labels])
+
+
+def test_requests_that_cannot_be_scored_are_told_in_a_sentence(tmp_path: Path) -> None:
+    there = saved(some_truth(), tmp_path / "truth.npz")
+    empty = tmp_path / "capture"
+    empty.mkdir()
+    for asked, said in (
+        (ScoringRequest(grid=there, ground_truths=[there, there]), "2 ground truths are given for 1 scenes"),
+        (ScoringRequest(grid=there, ground_truths=[there], poses=["a", "b"]), "--poses is given 2 times for 1 scenes"),
+        (ScoringRequest(ground_truths=[there]), "There is nothing to score"),
+        (ScoringRequest(frames=empty, ground_truths=[there]), "need true poses"),
+        (ScoringRequest(grid=tmp_path / "none.npz", ground_truths=[there]), "no file or folder .*none"),
+        (ScoringRequest(grid=there), "no capture holds it"),
+        (ScoringRequest(grid=there, poses=[str(empty)]), "ground_truth.npz does not exist"),
+    ):
+        with pytest.raises(FreeOccError, match=said):
+            evaluate_scenes(asked)
 
 
 def test_maps_are_pooled_and_a_split_must_be_whole(bedroom: Path, tmp_path: Path) -> None:
