@@ -4,20 +4,43 @@ before it allocates memory."""
 from __future__ import annotations
 
 import math
+import re
+import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from io import BufferedIOBase
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import numpy as np
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from .atomic_files import replace_file
 from .errors import MapError
+from .regular_files import UnusableFile, open_regular
 
-_LARGEST_ARRAY = 8 << 30
+Shape = tuple[int | None, ...]
+
+_LARGEST = 8 << 30
+_MAGIC, _LONGEST_HEADER = b"\x93NUMPY", 4096
+_HEADER = re.compile(
+    r"\{'descr': *'(?P<type>[<>|=]?(?:\?|[biufUS]\d{1,9}))', *'fortran_order': *(?P<columns>True|False), *"
+    r"'shape': *\((?P<shape>[\dL, ]{0,99})\),? *\}\s*"
+)
+"""The header that NumPy writes for simple types. Its own reader evaluates it as Python, and admits records and
+objects."""
+
+_ERRORS = (
+    OSError, ValueError, EOFError, RuntimeError, OverflowError, IndexError, TypeError, struct.error, zlib.error,
+    zipfile.BadZipFile,
+)  # fmt: skip
+"""What zipfile raises for archives that are damaged, encrypted or packed in an unknown way, and NumPy for a type of no
+size."""
+
+
+class _Unusable(ValueError):
+    """An array cannot be used. The message is part of a sentence."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False) -> None:
@@ -26,34 +49,84 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False
     replace_file(path, lambda temporary: save(temporary, **arrays))
 
 
-def read_arrays(path: Path, expected: Mapping[str, tuple[str, int]]) -> dict[str, NDArray[Any]]:
-    """Read the arrays of an .npz file.
+def read_arrays(
+    path: Path, expected: Mapping[str, tuple[str, int | Shape]], also: Collection[str] = (), most_bytes: int = _LARGEST
+) -> dict[str, NDArray[Any]]:
+    """Read arrays of numbers, of truth values or of texts from an .npz file, in the machine's byte order.
 
-    expected: name -> (``dtype.kind``, number of dimensions); the file must hold each of them.
-    The headers give the sizes before anything is unpacked. Raises MapError.
+    expected: name -> (``dtype.kind``, number of dimensions or shape, in which None is any length); the file must hold
+    each of them.  also: names of arrays that are read if they are there. If both are empty, all arrays are read.
+    most_bytes: of all arrays together. Other arrays are not unpacked. Raises MapError.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            arrays = {
-                info.filename.removesuffix(".npy"): _read_array(archive, info, path) for info in archive.infolist()
-            }
+        with open_regular(path, most_bytes) as stream, zipfile.ZipFile(stream) as archive:
+            return _read(archive, expected, also, most_bytes)
     except FileNotFoundError as error:
         raise MapError(f"{path} is missing: copy the whole map folder again, or make the map again.") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+    except UnusableFile as error:
+        raise MapError(f"{path} cannot be read: {error.strerror}.") from error
+    except _Unusable as error:
         raise MapError(f"{path} is damaged: {error}.") from error
-    for name, (kind, dimensions) in expected.items():
-        if name not in arrays or arrays[name].dtype.kind != kind or arrays[name].ndim != dimensions:
-            raise MapError(f"{path} is damaged: it has no usable array '{name}'.")
+    except _ERRORS as error:
+        raise MapError(f"{path} is damaged: {' '.join(str(error).split()) or 'it ends too early'}.") from error
+
+
+def _read(
+    archive: zipfile.ZipFile, expected: Mapping[str, tuple[str, int | Shape]], also: Collection[str], most_bytes: int
+) -> dict[str, NDArray[Any]]:
+    infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+    if len(infos) < len(archive.infolist()):
+        raise _Unusable("it holds two arrays of one name")
+    arrays = {}
+    for name in {**expected, **dict.fromkeys(also)} or infos:
+        if name in infos:
+            arrays[name] = _read_array(archive, infos[name], expected.get(name), most_bytes)
+            most_bytes -= arrays[name].nbytes
+        elif name in expected:
+            raise _Unusable(f"it has no usable array '{name}'")
     return arrays
 
 
-def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> NDArray[Any]:
+def _read_array(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, expected: tuple[str, int | Shape] | None, most_bytes: int
+) -> NDArray[Any]:
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise _Unusable(f"its array {info.filename} is packed in a way that NumPy does not write")
     with archive.open(info) as stream:
-        version = npy.read_magic(stream)
-        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, _, dtype = read_header(stream)
+        dtype, in_columns, shape, offset = _header(stream, info.filename)
+        if expected is not None and not _fits(dtype, shape, *expected):
+            raise _Unusable(f"it has no usable array '{info.filename.removesuffix('.npy')}'")
         size = math.prod(shape) * dtype.itemsize
-        if dtype.hasobject or size > info.file_size or size > _LARGEST_ARRAY:
-            raise MapError(f"{path} is damaged: its array {info.filename} is not as large as its header says.")
-    with archive.open(info) as stream:
-        return np.asarray(npy.read_array(stream, allow_pickle=False))
+        if offset + size != info.file_size:
+            raise _Unusable(f"its array {info.filename} is not as large as its header says")
+        if size > most_bytes:
+            raise _Unusable(f"its array {info.filename} takes {size:,} bytes, more than is possible here")
+        data = bytearray(size)
+        if cast(BufferedIOBase, stream).readinto(data) != size or stream.read(
+            1
+        ):  # the end is read, so that the checksum is compared
+            raise _Unusable(f"its array {info.filename} ends too early")
+    array = np.frombuffer(data, dtype).reshape(shape, order="F" if in_columns else "C")
+    return array if dtype.isnative else array.astype(dtype.newbyteorder("="))
+
+
+def _header(stream: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]:
+    """Type, whether the first index varies fastest, shape, and the number of bytes before the data."""
+    start = stream.read(10)
+    long = start[6:7] > b"\x01"
+    if long:
+        start += stream.read(2)
+    length = int.from_bytes(start[8:], "little")
+    text = stream.read(min(length, _LONGEST_HEADER))
+    found = _HEADER.fullmatch(text.decode("latin-1"))
+    if start[:6] != _MAGIC or found is None:
+        raise _Unusable(f"its array {name} does not hold plain numbers or texts")
+    shape = tuple(int(part.strip("L ")) for part in found["shape"].split(",") if part.strip())
+    return np.dtype(found["type"]), found["columns"] == "True", shape, len(start) + length
+
+
+def _fits(dtype: np.dtype[Any], shape: tuple[int, ...], kind: str, wanted: int | Shape) -> bool:
+    if isinstance(wanted, int):
+        wanted = (None,) * wanted
+    lengths = len(shape) == len(wanted) and all(w in (None, n) for n, w in zip(shape, wanted, strict=True))
+    return dtype.kind == kind and lengths

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import FreeOccError
+from .regular_files import open_regular
 
 _LONGEST_HEADER = 1 << 16
 _TYPES = {
@@ -25,6 +26,9 @@ _NAMES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
+Element = tuple[str, int, tuple[tuple[str, ...], ...]]
+
+
 @dataclass(frozen=True)
 class PlyHeader:
     """The header of a PLY file. form: such as "binary_little_endian".  elements: (name, count, property lines, split
@@ -32,7 +36,7 @@ class PlyHeader:
     length: bytes of the header."""
 
     form: str
-    elements: tuple[tuple[str, int, tuple[tuple[str, ...], ...]], ...]
+    elements: tuple[Element, ...]
     length: int
 
     @property
@@ -46,52 +50,70 @@ class PlyHeader:
 
 
 def read_ply_header(path: Path) -> PlyHeader:
-    """Read the header. Raises FreeOccError: no such file, not a PLY file, or smaller than its header states."""
+    """Read the header. Raises FreeOccError: no regular file, not a PLY file, or smaller than its header states."""
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             text, end, _ = stream.read(_LONGEST_HEADER).partition(b"end_header")
             stream.seek(len(text) + len(end))
             ending = stream.readline(3)
-        size = path.stat().st_size
+            size = stream.seek(0, 2)
     except OSError as error:
         raise FreeOccError(f"Cannot read {path}: {(error.strerror or str(error)).lower()}.") from error
     lines = [tuple(line.split()) for line in text.decode("latin-1").splitlines() if line.strip()]
-    form, elements = "", []
-    try:
-        for first, *rest in lines[1:]:
-            if first == "format":
-                form = rest[0]
-            elif first == "element":
-                elements.append((rest[0], int(rest[1]), list[tuple[str, ...]]()))
-            elif first == "property":
-                kinds = rest[1:3] if rest[0] == "list" else rest[:1]
-                if not set(kinds) <= set(_TYPES):
-                    raise ValueError(" ".join(rest))
-                elements[-1][2].append(tuple(rest))
-    except (IndexError, ValueError) as error:
-        raise FreeOccError(f"{path} is not a PLY file: its header cannot be read ({error}).") from error
-    if not text.startswith(b"ply") or not end or not elements:
+    if not text.startswith(b"ply") or not end:
         raise FreeOccError(f"{path} is not a PLY file.")
-    listed = tuple((name, count, tuple(properties)) for name, count, properties in elements)
-    header = PlyHeader(form, listed, len(text) + len(end) + len(ending))
-    if min(count for _, count, _ in elements) < 0 or header.length + header.least_bytes > size:
+    try:
+        form, elements = _declarations(lines[1:])
+    except (IndexError, ValueError) as error:
+        raise FreeOccError(f"{path} is not a PLY file: its header cannot be read ({str(error)[:80]}).") from error
+    header = PlyHeader(form, elements, len(text) + len(end) + len(ending))
+    if header.length + header.least_bytes > size:
         raise FreeOccError(f"{path} is damaged: its header states more data than the {size} bytes of the file.")
     return header
 
 
-def read_ply_vertices(path: Path) -> NDArray[np.void]:
-    """(N,) vertices of a binary PLY file, as records of their properties. Raises FreeOccError."""
+def _declarations(lines: list[tuple[str, ...]]) -> tuple[str, tuple[Element, ...]]:
+    """The form and the elements that the lines of a header declare. Raises IndexError, ValueError."""
+    form, elements = "", list[tuple[str, int, list[tuple[str, ...]]]]()
+    for first, *rest in lines:
+        if first == "format":
+            form = rest[0]
+        elif first == "element":
+            if not (rest[1].isascii() and rest[1].isdigit() and len(rest[1]) < 16):
+                raise ValueError(" ".join(rest))
+            elements.append((rest[0], int(rest[1]), []))
+        elif first == "property":
+            kinds = rest[1:3] if rest[0] == "list" else rest[:1]
+            if not set(kinds) <= set(_TYPES) or len(rest) != (4 if rest[0] == "list" else 2):
+                raise ValueError(" ".join(rest))
+            elements[-1][2].append(tuple(rest))
+    if not elements:
+        raise ValueError("no elements")
+    return form, tuple((name, count, tuple(properties)) for name, count, properties in elements)
+
+
+def read_ply_vertices(path: Path, alone: bool = False) -> NDArray[np.void]:
+    """(N,) vertices of a binary PLY file, as records of their properties, in the machine's byte order.
+
+    alone: whether the file must end with the vertices. Raises FreeOccError.
+    """
     header = read_ply_header(path)
     name, count, properties = header.elements[0]
     names = [line[-1] for line in properties]
-    if name != "vertex" or len(set(names)) < len(names):
+    if name != "vertex" or not names or len(set(names)) < len(names):
         raise FreeOccError(f"{path} is not a PLY file whose first element is 'vertex'.")
     if header.form not in _ORDERS or any(len(line) != 2 for line in properties):
         raise FreeOccError(f"{path} is a PLY file of form '{header.form}': convert it to a binary one without lists.")
     if not count:
         raise FreeOccError(f"{path} is damaged or empty: its header states 0 vertices.")
     dtype = np.dtype([(name, _ORDERS[header.form] + _TYPES[kind]) for kind, name in properties])
-    return np.fromfile(path, dtype, count, offset=header.length)
+    with open_regular(path) as stream:
+        stream.seek(header.length)
+        rows = np.fromfile(stream, dtype, count)
+        longer = alone and bool(stream.read(1))
+    if len(rows) < count or longer:
+        raise FreeOccError(f"{path} is damaged: it is not as long as its header states.")
+    return rows.astype(dtype.newbyteorder("="), copy=False)
 
 
 def write_ply(

@@ -12,11 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from .regular_files import read_text
 from .transforms import quats_to_rotations, rotations_to_quats
 from .types import Trajectory
 
 NUMBERS = 8
 """Numbers per line."""
+
+_FARTHEST, _LONGEST_WORD = 1e6, 64
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes, metres, seconds)"
 """Spelled as in every earlier map, so that equal trajectories give equal files."""
@@ -37,7 +40,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Read (M,) timestamps and (M, 4, 4) poses. Raises OSError, or ValueError that says what is wrong."""
-    lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+    lines = [line.split() for line in read_text(path).splitlines()]
     rows = [line for line in lines if line and not line[0].startswith("#")]
     return tum_poses(rows)
 
@@ -47,9 +50,11 @@ def tum_poses(rows: Sequence[Sequence[str]] | NDArray[np.float64]) -> tuple[NDAr
     wrong."""
     if any(len(row) != NUMBERS for row in rows):
         raise ValueError(f"a line does not hold {NUMBERS} numbers")
+    if any(len(word) > _LONGEST_WORD for row in rows for word in row):
+        raise ValueError("a word is too long for a number")
     table = np.array(rows, np.float64).reshape(-1, NUMBERS)
-    if not np.isfinite(table).all():
-        raise ValueError("a number is not finite")
+    if not (np.isfinite(table).all() and (np.abs(table[:, 1:]) <= _FARTHEST).all()):
+        raise ValueError("a number is not finite, or a place is farther than 1000 km")
     quats_wxyz = table[:, [7, 4, 5, 6]]
     lengths = np.linalg.norm(quats_wxyz, axis=1, keepdims=True)
     if (lengths == 0).any():

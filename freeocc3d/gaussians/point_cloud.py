@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError, MapError
 from ..core.ply_files import read_ply_vertices
@@ -23,6 +24,8 @@ _ATTRIBUTES = {
     "anchor": ("anchor_cam", 3, np.float32),
 }
 """Point attribute -> (field, columns, type), in addition to ``positions`` and ``colors``."""
+
+_FARTHEST, _UNIT = 1e6, 1e-2
 
 _BYTES = 67  # per Gaussian: 14 float32, 2 int32, 3 uint8
 
@@ -61,12 +64,43 @@ def write_gaussian_ply(gaussians: Gaussians, path: Path) -> None:
         raise MapError(f"Cannot write {path}: there are no Gaussians to write, or the disk is full.")
 
 
-def read_gaussian_ply(path: Path) -> Gaussians:
-    """Reads a file of ``write_gaussian_ply``. Raises MapError."""
+def read_gaussian_ply(path: Path, keyframes: int | None = None) -> Gaussians:
+    """Reads a file of ``write_gaussian_ply``.
+
+    keyframes: how many the Gaussians may be anchored to; None = any. Raises MapError: a damaged file, another length
+    than its header states, or a value that no Gaussian can have.
+    """
     try:
-        rows = read_ply_vertices(path)
+        rows = read_ply_vertices(path, alone=True)
     except FreeOccError as error:
         raise MapError(str(error)) from error
+    try:
+        gaussians = _from_rows(rows)
+    except MapError as error:
+        raise MapError(f"{path} is damaged: {error}") from error
+    if problem := _problem(gaussians, keyframes):
+        raise MapError(f"{path} is damaged: it holds {problem}.")
+    return gaussians
+
+
+def _problem(gaussians: Gaussians, keyframes: int | None) -> str:
+    """What no Gaussian of a map can have; empty if there is nothing of the kind."""
+    lengths = np.linalg.norm(gaussians.quats_wxyz.astype(np.float64), axis=1)
+    anchors = gaussians.anchor_keyframe
+    checks = {
+        "means that are not finite": np.isfinite(gaussians.means).all(),
+        "means farther than 1000 km": np.abs(gaussians.means).max(initial=0) <= _FARTHEST,
+        "scales that are not positive": ((gaussians.scales > 0) & (gaussians.scales <= _FARTHEST)).all(),
+        "rotations that are no unit quaternions": (np.abs(lengths - 1) <= _UNIT).all(),
+        "opacities outside 0 to 1": ((gaussians.opacities >= 0) & (gaussians.opacities <= 1)).all(),
+        "anchors that are not finite": (np.abs(gaussians.anchor_cam) <= _FARTHEST).all(),
+        "anchors in keyframes that the map does not have": keyframes is None
+        or ((anchors >= 0) & (anchors < keyframes)).all(),
+    }
+    return next((what for what, right in checks.items() if not right), "")
+
+
+def _from_rows(rows: NDArray[np.void]) -> Gaussians:
     columns = {name: np.ascontiguousarray(rows[name])[:, None] for name in rows.dtype.names or ()}
     for name, parts in (("positions", "xyz"), ("colors", ("red", "green", "blue"))):
         if all(part in columns for part in parts):
@@ -79,9 +113,15 @@ def _take(columns: dict[str, np.ndarray], name: str, width: int, dtype: type) ->
     if name not in columns:
         parts = [f"{name}_{i}" for i in range(width)]
         if any(part not in columns for part in parts):
-            raise MapError(f"The Gaussians lack the attribute '{name}'.")
-        return np.concatenate([columns[part] for part in parts], axis=1).astype(dtype)
-    return np.asarray(columns[name].reshape(-1, width), dtype)
+            raise MapError(f"the Gaussians lack the attribute '{name}'.")
+        values = np.concatenate([columns[part] for part in parts], axis=1)
+    elif columns[name].shape[1] == width:
+        values = columns[name]
+    else:
+        raise MapError(f"the attribute '{name}' has {columns[name].shape[1]} columns instead of {width}.")
+    if values.dtype != dtype:
+        raise MapError(f"the attribute '{name}' is of type {values.dtype} instead of {np.dtype(dtype)}.")
+    return values
 
 
 def _tensor(array: np.ndarray) -> o3d.core.Tensor:

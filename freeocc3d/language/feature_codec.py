@@ -18,6 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import MapError
 from .word_matching import MANY
 
 MOST_BYTES = 48
@@ -38,6 +39,8 @@ _MARGIN = 0.02
 """Widens an 8-bit range on either side, because a normalized mean of features can be outside the range."""
 _ROWS = 8192  # rows in one batch, so that float32 copies of all rows never exist
 _ONE_THREAD = 1 << 18  # multiplications of a matrix product that OpenBLAS runs on one thread
+_FARTHEST = 1e4
+"""Bound of the numbers in the tables: features are unit vectors."""
 _SAMPLE = 20000  # rows to which the quantizers are fitted
 
 
@@ -135,7 +138,12 @@ class Codec:
     ) -> NDArray[np.float32]:
         """(V, W) cosines of coded features with (W, D) unit text features, without decoding. With levels c and text t
         in the codec's coordinates, the dot product is c (scale t) + offset t. Zero features give zero. inverse: the
-        ``inverse_norms`` of the codes, if known."""
+        ``inverse_norms`` of the codes, if known. Raises MapError for another D."""
+        if text.shape[1] != self.basis.shape[1]:
+            raise MapError(
+                f"The map is damaged: its features have {self.basis.shape[1]} dimensions, its encoder's words "
+                f"{text.shape[1]}."
+            )
         t = _product(text.astype(np.float32), self.basis.T)
         if _compiled(len(codes)):
             from . import coded_scores
@@ -174,8 +182,10 @@ class Codec:
         ordered = fit and np.array_equal(bits, np.repeat(_BITS, [counts[b] for b in _BITS]))
         if not ordered or any(count % (8 // b) for b, count in counts.items()):
             raise ValueError("the codec's tables do not belong together")
-        floats = (table.astype(np.float32) for table in (basis, offset, scale))
-        basis, offset, scale = floats
+        with np.errstate(over="ignore"):
+            basis, offset, scale = (table.astype(np.float32) for table in (basis, offset, scale))
+        if not all((np.abs(table) <= _FARTHEST).all() for table in (basis, offset, scale)) or not (scale > 0).all():
+            raise ValueError("the codec's tables hold numbers that no codec has")
         return cls(basis, bits.astype(np.uint8), offset, scale)
 
 

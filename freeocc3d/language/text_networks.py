@@ -11,13 +11,15 @@ import contextlib
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import read_arrays, write_arrays
 from ..core.errors import ConfigError, MapError, ModelError
+from ..core.typed_documents import InvalidDocument, as_type
 from . import model_packages
 from .encoders.base import TextEncoder, TextFeatures
 
@@ -66,6 +68,19 @@ class Wording:
         }
 
 
+class _State(msgspec.Struct):
+    """What a map keeps of an encoder whose words a text network embeds."""
+
+    threshold: Annotated[float, msgspec.Meta(ge=-1, le=1)]
+    temperature: Annotated[float, msgspec.Meta(gt=0, le=100)]
+    dimension: Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
+    templates: Annotated[list[str], msgspec.Meta(min_length=1, max_length=1000)]
+    contrast: Annotated[list[str], msgspec.Meta(max_length=10_000)]
+    model: str
+    folder: str
+    text_sha256: str
+
+
 class ModelWords(TextEncoder):
     """Any words; words that the network was not trained on get a feature, too."""
 
@@ -74,13 +89,12 @@ class ModelWords(TextEncoder):
 
     def __init__(self, state: dict[str, Any]):
         try:
-            self.threshold, self.temperature = float(state["threshold"]), float(state["temperature"])
-            self._dimension = int(state["dimension"])
-            self._templates = [str(template) for template in state["templates"]]
-            self._contrast = [str(word) for word in state["contrast"]]
-            self._model, self._folder, self._sha256 = (str(state[k]) for k in ("model", "folder", "text_sha256"))
-        except (KeyError, TypeError, ValueError) as error:
-            raise MapError(f"The map's encoder is damaged: its state has no usable {error}.") from error
+            kept = as_type(state, _State)
+        except InvalidDocument as error:
+            raise MapError(f"The map's encoder is damaged: its state has no usable value: {error}.") from error
+        self.threshold, self.temperature, self._dimension = kept.threshold, kept.temperature, kept.dimension
+        self._templates, self._contrast = kept.templates, kept.contrast
+        self._model, self._folder, self._sha256 = kept.model, kept.folder, kept.text_sha256
         key = hashlib.sha256("\n".join((self._sha256, *self._templates)).encode()).hexdigest()[:32]
         self._cache = model_packages.find_models_folder() / ".embeddings" / f"{key}.npz"
         self._known: dict[str, NDArray[np.float32]] | None = None

@@ -9,15 +9,19 @@ import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import overload
+from typing import Annotated, overload
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.atomic_files import replace_text, sync
 from ..core.checksums import hash_bytes, hash_file
 from ..core.errors import MapError
+from ..core.image_files import ImageFileError, WrongSizeError, read_image
+from ..core.regular_files import read_bytes
+from ..core.typed_documents import InvalidDocument, as_type, parse_json
 from ..core.types import Frame, Intrinsics
 
 INDEX = "keyframes.json"
@@ -25,6 +29,11 @@ _UNITS_PER_METER, _SIGMA_UNITS_PER_METER = 1000.0, 2000.0
 _SIGMA = "sigma"
 """Key of the entries that have a third image."""
 _JPEG_QUALITY = 95
+_MOST_BYTES, _FARTHEST = 64 << 20, 1e15
+_Number = Annotated[float, msgspec.Meta(ge=0, le=(1 << 31) - 1)]
+_Side = Annotated[float, msgspec.Meta(ge=1, le=1 << 16)]
+_Focal = Annotated[float, msgspec.Meta(ge=1e-3, le=1e9)]
+_Center = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 
 
 class Keyframes(Sequence[Frame]):
@@ -35,16 +44,27 @@ class Keyframes(Sequence[Frame]):
         self._entries: list[dict[str, float]] = []
         self._checksums: dict[str, str] = {}  # of the images that this object wrote
         self._unsynced: list[Path] = []
+        self._check: Callable[[Path], object] = lambda path: None
 
     @classmethod
-    def load(cls, folder: Path) -> Keyframes:
-        """Read the index of a folder. Raises MapError."""
+    def load(cls, folder: Path, check: Callable[[Path], object] = lambda path: None) -> Keyframes:
+        """Read the index of a folder. check: raises MapError for a damaged image, before it is decoded. Raises
+        MapError."""
         keyframes = cls(folder)
+        path = folder / INDEX
         try:
-            entries = json.loads((folder / INDEX).read_text(encoding="utf-8"))
-            keyframes._entries = [{str(k): float(v) for k, v in entry.items()} for entry in entries]
-        except (OSError, ValueError, AttributeError, TypeError) as error:
-            raise MapError(f"Cannot read the keyframe index {folder / INDEX}: {error}.") from error
+            entries = as_type(parse_json(read_bytes(path, _MOST_BYTES)), list[_Entry])
+        except OSError as error:
+            raise MapError(f"Cannot read the keyframe index {path}: {error.strerror}.") from error
+        except InvalidDocument as error:
+            raise MapError(f"{path} is damaged: {error}.") from error
+        if problem := _problem(entries):
+            raise MapError(f"{path} is damaged: {problem}.")
+        keyframes._entries = [
+            {name: value for name in entry.__struct_fields__ if (value := getattr(entry, name)) is not None}
+            for entry in entries
+        ]
+        keyframes._check = check
         return keyframes
 
     def append(self, frame: Frame) -> None:
@@ -64,9 +84,11 @@ class Keyframes(Sequence[Frame]):
         copied = Keyframes(folder)
         for entry in self._entries:
             color_path, *depth_paths = self._own_paths(entry)
+            self._check(color_path)
             shutil.copyfile(color_path, folder / color_path.name)
             if depth_factor == 1:
                 for path in depth_paths:
+                    self._check(path)
                     shutil.copyfile(path, folder / path.name)
             else:
                 copied._write_depth(self._read(entry).scaled(depth_factor))
@@ -76,6 +98,7 @@ class Keyframes(Sequence[Frame]):
     def only(self, frames: NDArray[np.integer]) -> Keyframes:
         """The keyframes among the given frames of the capture, in the same folder."""
         chosen = Keyframes(self.folder)
+        chosen._check = self._check
         wanted = set(frames.tolist())
         chosen._entries = [entry for entry in self._entries if int(entry["frame"]) in wanted]
         return chosen
@@ -147,21 +170,28 @@ class Keyframes(Sequence[Frame]):
 
     def _read(self, entry: dict[str, float]) -> Frame:
         index = int(entry["frame"])
-        camera = _camera(entry)
-        color_path = self._paths(index)[0]
-        color = _decode(color_path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        color = self._decoded(entry, 0, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         depth_m = self._read_units(entry, 1) / np.float32(_UNITS_PER_METER)
         sigma_m = self._read_units(entry, 2) / np.float32(_SIGMA_UNITS_PER_METER) if _SIGMA in entry else None
-        if color.shape != (*depth_m.shape, 3):
-            raise MapError(f"{color_path} does not have the size that {INDEX} states.")
-        return Frame(index, entry["timestamp"], cv2.cvtColor(color, cv2.COLOR_BGR2RGB), depth_m, camera, sigma_m)
+        rgb = cv2.cvtColor(color, cv2.COLOR_BGR2RGB)
+        return Frame(index, entry["timestamp"], rgb, depth_m, _camera(entry), sigma_m)
 
     def _read_units(self, entry: dict[str, float], image: int) -> NDArray[np.float32]:
-        camera, path = _camera(entry), self._paths(int(entry["frame"]))[image]
-        units = _decode(path, cv2.IMREAD_UNCHANGED)
-        if units.shape != (camera.height, camera.width):
-            raise MapError(f"{path} does not have the size that {INDEX} states.")
+        units = self._decoded(entry, image, cv2.IMREAD_UNCHANGED)
+        if units.dtype != np.uint16 or units.ndim != 2:
+            raise MapError(f"{self._own_paths(entry)[image]} is damaged: it is not a gray image of 16 bits.")
         return units.astype(np.float32)
+
+    def _decoded(self, entry: dict[str, float], image: int, flags: int) -> NDArray[np.generic]:
+        """One of a keyframe's images, which has the size of its camera."""
+        path, camera = self._own_paths(entry)[image], _camera(entry)
+        self._check(path)
+        try:
+            return read_image(path, flags, (camera.width, camera.height))
+        except WrongSizeError as error:
+            raise MapError(f"{path} does not have the size that {INDEX} states: {error}") from error
+        except ImageFileError as error:
+            raise MapError(str(error)) from error
 
     def _write_images(self, frame: Frame) -> None:
         bgr = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
@@ -201,12 +231,23 @@ def _camera(entry: dict[str, float]) -> Intrinsics:
     return Intrinsics(int(entry["width"]), int(entry["height"]), entry["fx"], entry["fy"], entry["cx"], entry["cy"])
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
-    try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise MapError(f"Cannot read the keyframe image {path}: {error.strerror}.") from error
-    image = cv2.imdecode(data, flags) if len(data) else None
-    if image is None:
-        raise MapError(f"The keyframe image {path} is damaged.")
-    return image
+class _Entry(msgspec.Struct, frozen=True):
+    """A keyframe in the index; all numbers are read as floats."""
+
+    frame: _Number
+    timestamp: Annotated[float, msgspec.Meta(ge=-_FARTHEST, le=_FARTHEST)]
+    width: _Side
+    height: _Side
+    fx: _Focal
+    fy: _Focal
+    cx: _Center
+    cy: _Center
+    sigma: float | None = None
+
+
+def _problem(entries: list[_Entry]) -> str:
+    """The problem of an index whose types are right; empty if it has none."""
+    numbers = np.array([(entry.frame, entry.width, entry.height) for entry in entries], np.float64).reshape(-1, 3)
+    if (numbers % 1).any():
+        return "a frame, a width or a height is not a whole number"
+    return "" if (np.diff(numbers[:, 0]) > 0).all() else "its frames are not in ascending order"

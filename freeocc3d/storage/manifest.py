@@ -6,6 +6,7 @@ knows.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_type_hints
@@ -30,6 +31,11 @@ OLDEST_VERSION = 2
 """The oldest format that is read. Format 1 packed features in another way."""
 
 _MOST_BYTES = 64 << 20
+_VOXELS, _FACTORS, _FARTHEST = (1e-6, 1e6), (1e-9, 1e9), 1e9
+"""Bounds of an edge, of the meters per unit, and of coordinates: beyond what any sensor measures, and far from where
+numbers lose their meaning."""
+_LEVELS, _ALMOST, _UNIT = 13, 1e-6, 1e-3
+_FILE = re.compile(r"(?:keyframes/)?(?!\.\.?$)[^/\\\0-\x1f]{1,200}")
 
 POSES = "camera to world"
 CODEC = "transform coding, 8, 4 and 2 bits a direction"
@@ -42,7 +48,8 @@ def _key(description: str, since: int = OLDEST_VERSION, **bounds: Any) -> msgspe
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
-Count = Annotated[int, msgspec.Meta(ge=0)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 53) - 1)]
+Frame = Annotated[int, msgspec.Meta(ge=0, le=(1 << 31) - 1)]
 Checksum = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{32}\Z")]
 
 
@@ -106,14 +113,14 @@ class NameCount(msgspec.Struct, frozen=True, kw_only=True):
     """How many keyframes have a name, and which."""
 
     count: Count
-    keyframes: tuple[int, ...] = ()
+    keyframes: tuple[Frame, ...] = ()
 
 
 class SceneWords(msgspec.Struct, frozen=True, kw_only=True):
     """Names that a vision-language model gave. keyframes: those that it named.  names: most frequent first."""
 
     model: str = ""
-    keyframes: tuple[int, ...]
+    keyframes: tuple[Frame, ...]
     names: dict[str, NameCount]
 
 
@@ -149,7 +156,7 @@ class Manifest(MapFacts, frozen=True, kw_only=True):
     finest_voxel_m: Annotated[float | None, _key("edge of the smallest voxels if sizes differ, meters", since=3)] = None
     origin: Annotated[Vector, _key("x y z of the lower corner of voxel (0, 0, 0), map's frame, meters")]
     counts: Annotated[MapCounts, _key("numbers of Gaussians, voxels, frames and submaps")]
-    keyframes: Annotated[tuple[Count, ...], _key("the capture's frames that are keyframes, ascending")]
+    keyframes: Annotated[tuple[Frame, ...], _key("the capture's frames that are keyframes, ascending")]
     files: Annotated[dict[str, Count], _key("files of the folder with their sizes, bytes")]
     checksums: Annotated[dict[str, Checksum] | None, _key("the same files with their checksums: XXH3 of 128 bits")] = (
         None
@@ -221,7 +228,7 @@ def read_manifest(folder: Path) -> Manifest:
             "again; who changed it on purpose removes that line."
         )
     version = content.get("format_version") if isinstance(content, dict) else None
-    if not isinstance(version, int):
+    if not isinstance(version, int) or isinstance(version, bool):
         raise MapError(f"{path} is not the manifest of a map: it has no format_version.")
     if version > FORMAT_VERSION:
         raise MapError(
@@ -240,15 +247,33 @@ def read_manifest(folder: Path) -> Manifest:
 
 def _problem(manifest: Manifest, folder: Path) -> str:
     """The problem of a manifest whose types are right; empty if it has none."""
-    lengths = np.array((manifest.voxel_size_m, manifest.finest_m, *manifest.origin, *manifest.up))
-    if not np.isfinite(lengths).all():
-        return "'voxel_size_m', 'finest_voxel_m', 'origin' or 'up' holds a number that is not finite"
-    if not 0 < manifest.scale.factor < np.inf:
-        return "'scale.factor' is not a finite number greater than 0"
+    counts, keyframes = manifest.counts, np.array(manifest.keyframes, np.int64)
+    ratio = manifest.voxel_size_m / manifest.finest_m
+    if not (_among(manifest.voxel_size_m, _VOXELS) and _among(manifest.finest_m, _VOXELS)):
+        return f"'voxel_size_m' or 'finest_voxel_m' is not finite, or not between {_VOXELS[0]:g} and {_VOXELS[1]:g}"
+    if not any(abs(ratio / 2**level - 1) < _ALMOST for level in range(_LEVELS)):
+        return "'finest_voxel_m' is not 'voxel_size_m' halved a few times"
+    if not np.abs(np.array(manifest.origin)).max() <= _FARTHEST:
+        return f"'origin' holds a number that is not finite, or farther than {_FARTHEST:g}"
+    if not abs(np.linalg.norm(manifest.up) - 1) < _UNIT:
+        return "'up' is not a unit vector"
+    if not _among(manifest.scale.factor, _FACTORS):
+        return f"'scale.factor' is not a finite number between {_FACTORS[0]:g} and {_FACTORS[1]:g}"
     for name in ("T_world_map", "T_gravity_map"):
         T = getattr(manifest, name)
-        if T is not None and not is_rigid(np.array(T)):
+        if T is not None and not (is_rigid(np.array(T)) and np.abs(np.array(T)).max() <= _FARTHEST):
             return f"'{name}' is not a rigid transform"
-    root = folder.resolve()
-    outside = next((name for name in manifest.files if not (folder / name).resolve().is_relative_to(root)), None)
-    return "" if outside is None else f"'files' names {outside}, which lies outside the map's folder"
+    if (np.diff(keyframes) <= 0).any() or (len(keyframes) and keyframes[-1] >= counts.frames):
+        return "'keyframes' are not frames of the capture in ascending order"
+    if not len(keyframes) <= counts.frames_with_pose <= counts.frames:
+        return "'counts' holds fewer frames than have a pose or are keyframes"
+    if manifest.refined and manifest.refined.box and not np.abs(np.array(manifest.refined.box)).max() <= _FARTHEST:
+        return "'refined.box' holds a number that is not finite"
+    if any("\0" in text for text in (manifest.capture.path, manifest.encoder.name)):
+        return "'capture.path' or 'encoder.name' holds a character that no name has"
+    outside = next((name for name in manifest.files if not _FILE.fullmatch(name)), None)
+    return "" if outside is None else f"'files' names {outside[:200]}, which lies outside the map's folder"
+
+
+def _among(value: float, bounds: tuple[float, float]) -> bool:
+    return bounds[0] <= value <= bounds[1]

@@ -8,20 +8,23 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import read_arrays, write_arrays
+from ..core.arrays import Shape, read_arrays, write_arrays
 from ..core.errors import MapError
-from ..core.types import BLOCK, OCCUPIED, Occupancy
+from ..core.types import BLOCK, OCCUPIED, UNKNOWN, Occupancy
+from ..core.voxel_keys import KEY_LIMIT, pack_index, pack_voxels
 from ..language.feature_codec import Codec, CodedFeatures
 from .manifest import Manifest
-from .map_files import FEATURES, OCCUPANCY
+from .map_files import FEATURES, MANIFEST, OCCUPANCY
 
 _DEEPEST = 12
 """Level of the smallest voxels of any map: from 4 m down to a millimeter."""
-_OCCUPANCY_ARRAYS = {
-    "keys": ("i", 2), "probability": ("f", 2), "free": ("u", 2), "hits": ("u", 2), "state": ("u", 2),
-    "colors": ("u", 2), "feature_codes": ("u", 2),
-}  # fmt: skip
-"""Arrays of occupancy.npz: kind of number and number of dimensions."""
+_MARGIN = 8
+"""Blocks next to the farthest ones that may be asked for."""
+_SAME_SIZE = 1e-6
+_CORNER = pack_index(*[-KEY_LIMIT // BLOCK] * 3)
+"""The key of the lowest block; without it, the key of a block has fewer than 59 bits."""
+_ONE_HALF = 0x3C00  # the bits of 1 in half precision; negative numbers, infinity and NaN have larger ones
+_MOST_BYTES = 8 << 30
 _FEATURE_ARRAYS = {
     "gaussian_codes": ("u", 2), "codec_basis": ("f", 2), "codec_bits": ("u", 1), "codec_offset": ("f", 1),
     "codec_scale": ("f", 1),
@@ -49,28 +52,30 @@ def write_features(folder: Path, codec: Codec, gaussian_features: NDArray[np.flo
     write_arrays(folder / FEATURES, {"gaussian_codes": codec.encode(gaussian_features), **tables}, compressed=True)
 
 
-def read_features(folder: Path) -> tuple[Codec, NDArray[np.uint8]]:
-    """Read the codec and the (N, M) coded features of the Gaussians. Raises MapError."""
-    path = folder / FEATURES
-    arrays = read_arrays(path, _FEATURE_ARRAYS)
+def read_features(path: Path, manifest: Manifest) -> tuple[Codec, NDArray[np.uint8]]:
+    """Read the codec and the (N, M) coded features of the Gaussians from features.npz. Raises MapError."""
+    expected: dict[str, tuple[str, int | Shape]] = {
+        **_FEATURE_ARRAYS,
+        "gaussian_codes": ("u", (manifest.counts.gaussians, None)),
+    }
+    arrays = read_arrays(path, expected, most_bytes=_MOST_BYTES)
     tables = {name.removeprefix("codec_"): table for name, table in arrays.items() if name.startswith("codec_")}
     try:
         codec = Codec.from_tables(tables)
     except ValueError as error:
         raise MapError(f"{path} is damaged: {error}.") from error
-    if arrays["gaussian_codes"].shape[1] != codec.code_bytes:
+    codes = arrays["gaussian_codes"]
+    if codes.shape[1] != codec.code_bytes or codes.dtype != np.uint8:
         raise MapError(f"{path} is damaged: its feature codes do not match its codec.")
-    return codec, arrays["gaussian_codes"]
+    return codec, codes
 
 
-def read_occupancy(folder: Path, manifest: Manifest, codec: Codec) -> Occupancy:
-    """Read the voxels. Their features stay coded. Raises MapError."""
-    path = folder / OCCUPANCY
-    arrays = read_arrays(path, _OCCUPANCY_ARRAYS)
-    blocks = len(arrays["keys"])
-    arrays.setdefault("levels", np.zeros(blocks, np.uint8))
-    if not _fit(arrays, blocks, codec):
-        raise MapError(f"{path} is damaged: the sizes of its arrays do not match.")
+def read_occupancy(path: Path, manifest: Manifest, codec: Codec) -> Occupancy:
+    """Read the voxels from occupancy.npz. Their features stay coded. Raises MapError."""
+    arrays = read_arrays(path, _expected(path, manifest, codec), ("levels",), most_bytes=_MOST_BYTES)
+    arrays.setdefault("levels", np.zeros(len(arrays["keys"]), np.uint8))
+    if problem := _problem(arrays, manifest):
+        raise MapError(f"{path} is damaged: {problem}.")
     return Occupancy(
         voxel_size=manifest.voxel_size_m,
         origin=np.array(manifest.origin, np.float64),
@@ -85,16 +90,50 @@ def read_occupancy(folder: Path, manifest: Manifest, codec: Codec) -> Occupancy:
     )
 
 
-def _fit(arrays: dict[str, NDArray[Any]], blocks: int, codec: Codec) -> bool:
-    """Whether the sizes of the arrays of occupancy.npz match each other and the codec."""
-    occupied = int(np.count_nonzero(arrays["state"] == OCCUPIED))
-    levels = arrays["levels"]
-    return (
-        arrays["keys"].shape == (blocks, 3)
-        and all(arrays[name].shape == (blocks, BLOCK**3) for name in ("probability", "free", "hits", "state"))
-        and arrays["colors"].shape == (occupied, 3)
-        and arrays["feature_codes"].shape == (occupied, codec.code_bytes)
-        and levels.shape == (blocks,)
-        and levels.dtype == np.uint8
-        and bool(levels.max(initial=0) <= _DEEPEST)
-    )
+def _expected(path: Path, manifest: Manifest, codec: Codec) -> dict[str, tuple[str, Shape]]:
+    """Kind and shape of each array of occupancy.npz, as the manifest's counts and the codec make them."""
+    counts = manifest.counts.voxels
+    every = counts.occupied + counts.free + counts.unknown
+    if counts.unknown:
+        blocks = every // BLOCK**3
+    else:  # as in maps of earlier versions; hardly a block is unknown throughout
+        blocks = len(read_arrays(path, {"keys": ("i", (None, 3))}, most_bytes=max(every, 1) * 3 * 8)["keys"])
+    voxels = (blocks, BLOCK**3)
+    return {
+        "keys": ("i", (blocks, 3)), "probability": ("f", voxels), "free": ("u", voxels), "hits": ("u", voxels),
+        "state": ("u", voxels), "colors": ("u", (counts.occupied, 3)),
+        "feature_codes": ("u", (counts.occupied, codec.code_bytes)),
+    }  # fmt: skip
+
+
+def _problem(arrays: dict[str, NDArray[Any]], manifest: Manifest) -> str:
+    """The problem of arrays whose kinds and shapes are right; empty if they have none."""
+    keys, levels, state, probability = (arrays[name] for name in ("keys", "levels", "state", "probability"))
+    if levels.shape != (len(keys),) or levels.dtype != np.uint8 or levels.max(initial=0) > _DEEPEST:
+        return "its array 'levels' holds no levels of its blocks"
+    deepest = int(levels.max(initial=0))
+    if abs(manifest.finest_m * 2**deepest / manifest.voxel_size_m - 1) > _SAME_SIZE:
+        return f"its levels do not make the smallest voxels that {MANIFEST} states"
+    least = KEY_LIMIT // BLOCK - _MARGIN >> (deepest - levels.astype(np.int64))
+    if ((keys < -least[:, None]) | (keys >= least[:, None])).any():
+        return "its array 'keys' holds blocks too far from the origin"
+    if len(np.unique(pack_voxels(keys) - _CORNER | levels.astype(np.int64) << 59)) < len(keys):
+        return "its array 'keys' holds a block twice"
+    counts = manifest.counts.voxels
+    occupied, free = int(np.count_nonzero(state == OCCUPIED)), state.size - int(np.count_nonzero(state))
+    unknown = int(np.count_nonzero(state == UNKNOWN))
+    if occupied + free + unknown < state.size or (occupied, free) != (counts.occupied, counts.free):
+        return f"its array 'state' does not hold the voxels that {MANIFEST} counts"
+    if not _within_one(probability):
+        return "its array 'probability' holds numbers outside 0 to 1"
+    narrow = {"state": np.uint8, "colors": np.uint8, "feature_codes": np.uint8, "free": np.uint16, "hits": np.uint16}
+    wide = next((name for name, kind in narrow.items() if arrays[name].dtype.itemsize > np.dtype(kind).itemsize), None)
+    return f"its array '{wide}' holds wider numbers than maps have" if wide else ""
+
+
+def _within_one(values: NDArray[np.floating]) -> bool:
+    """Whether all numbers are from 0 to 1. Of half precision, most are seen by their bits, which are much faster to
+    compare."""
+    if values.dtype == np.float16 and values.size and values.view(np.uint16).max() <= _ONE_HALF:
+        return True
+    return bool(((values >= 0) & (values <= 1)).all())

@@ -6,7 +6,6 @@ Reading unpickles nothing, and checks the size of an array against its file befo
 from __future__ import annotations
 
 import functools
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +16,11 @@ from ..core.errors import FreeOccError, MapError
 from ..core.tum_files import read_tum
 from ..core.types import Gaussians, Occupancy, Trajectory
 from ..settings import registry
+from .checked_files import CheckedFiles
 from .manifest import Manifest, read_manifest
-from .map_files import CONFIG, GAUSSIANS, KEYFRAMES, MANIFEST, REPORT, TRAJECTORY
+from .map_files import CONFIG, FEATURES, GAUSSIANS, KEYFRAMES, MANIFEST, OCCUPANCY, REPORT, TRAJECTORY
 from .occupancy_file import read_features, read_occupancy
+from .report_file import read_report
 
 if TYPE_CHECKING:
     from typing import Self
@@ -38,6 +39,7 @@ class SavedMap:
     def __init__(self, path: Path, manifest: Manifest):
         self.path = path
         self.manifest = manifest
+        self.files = CheckedFiles(path, manifest)
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -47,8 +49,7 @@ class SavedMap:
         """
         path = Path(path)
         opened = cls(path, read_manifest(path))
-        for name in opened.manifest.files:
-            opened._require(name)
+        opened.files.check_sizes()
         return opened
 
     @property
@@ -75,7 +76,7 @@ class SavedMap:
         """The configuration that the map was made with."""
         from ..settings import config
 
-        return config.load_saved(self.path / CONFIG)
+        return config.load_saved(self.files.path(CONFIG))
 
     @functools.cached_property
     def capture(self) -> Capture:
@@ -94,15 +95,18 @@ class SavedMap:
     @functools.cached_property
     def occupancy(self) -> Occupancy:
         """The voxels with probabilities, evidence, features and colors."""
-        return read_occupancy(self.path, self.manifest, self._codec)
+        return read_occupancy(self.files.path(OCCUPANCY), self.manifest, self._codec)
 
     @functools.cached_property
     def gaussians(self) -> Gaussians:
-        """The anchored Gaussians (imports Open3D)."""
+        """The anchored Gaussians."""
         from ..gaussians.point_cloud import read_gaussian_ply
 
-        self._require(GAUSSIANS)
-        return read_gaussian_ply(self.path / GAUSSIANS)
+        path = self.files.path(GAUSSIANS)
+        gaussians = read_gaussian_ply(path, len(self.manifest.keyframes))
+        if len(gaussians) != self.manifest.counts.gaussians:
+            raise MapError(f"{path} is damaged: it holds another number of Gaussians than {MANIFEST} states.")
+        return gaussians
 
     @functools.cached_property
     def gaussian_features(self) -> NDArray[np.float16]:
@@ -112,33 +116,38 @@ class SavedMap:
     @functools.cached_property
     def trajectory(self) -> Trajectory:
         """Poses, status and confidence of all frames of the capture."""
+        log, path = self.report["frame_log"], self.files.path(TRAJECTORY)
+        timestamps, keyframes = np.array(log["timestamp"], np.float64), np.array(self.manifest.keyframes, np.int32)
         try:
-            log = self.report["frame_log"]
-            timestamps = np.array(log["timestamp"], np.float64)
-            return Trajectory(
-                timestamps=timestamps,
-                T_world_cam=_of_frames(timestamps, *read_tum(self.path / TRAJECTORY)),
-                keyframes=np.array(self.manifest.keyframes, np.int32),
-                status=np.array(log["status"], dtype="<U12"),
-                confidence=np.array(log["confidence"], np.float32),
-            )
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            raise MapError(f"{self.path / REPORT} or {TRAJECTORY} is damaged: {error}.") from error
+            times, T = read_tum(path)
+        except (OSError, ValueError) as error:
+            raise MapError(f"{path} is damaged: {getattr(error, 'strerror', None) or error}.") from error
+        counts = self.manifest.counts
+        if len(timestamps) != counts.frames or len(times) != counts.frames_with_pose:
+            raise MapError(f"{self.path} is damaged: {REPORT}, {TRAJECTORY} and {MANIFEST} count different frames.")
+        posed = _of_frames(timestamps, times, T)
+        if not np.isfinite(posed[keyframes]).all():
+            raise MapError(f"{path} is damaged: it lacks the pose of a keyframe.")
+        return Trajectory(
+            timestamps=timestamps,
+            T_world_cam=posed,
+            keyframes=keyframes,
+            status=np.array(log["status"], dtype="<U12"),
+            confidence=np.array(log["confidence"], np.float32),
+        )
 
     @functools.cached_property
     def report(self) -> dict[str, Any]:
         """Timings, used and lost frames, memory and warnings of the run that made the map."""
-        try:
-            return dict(json.loads((self.path / REPORT).read_text(encoding="utf-8")))
-        except (OSError, ValueError) as error:
-            raise MapError(f"Cannot read {self.path / REPORT}: {error}.") from error
+        return read_report(self.files.path(REPORT))
 
     @functools.cached_property
     def keyframes(self) -> Keyframes:
         """The keyframes' images."""
-        from .keyframes import Keyframes
+        from .keyframes import INDEX, Keyframes
 
-        loaded = Keyframes.load(self.path / KEYFRAMES)
+        self.files.path(f"{KEYFRAMES}/{INDEX}")
+        loaded = Keyframes.load(self.path / KEYFRAMES, lambda path: self.files.path(f"{KEYFRAMES}/{path.name}"))
         if loaded.frames != list(self.manifest.keyframes):
             raise MapError(f"{self.path} is damaged: {MANIFEST} and the folder {KEYFRAMES} list different keyframes.")
         return loaded
@@ -189,22 +198,11 @@ class SavedMap:
 
     @functools.cached_property
     def _features(self) -> tuple[Codec, NDArray[np.uint8]]:
-        return read_features(self.path)
+        return read_features(self.files.path(FEATURES), self.manifest)
 
     @property
     def _codec(self) -> Codec:
         return self._features[0]
-
-    def _require(self, name: str) -> None:
-        expected = self.manifest.files.get(name)
-        try:
-            size = (self.path / name).stat().st_size
-        except OSError as error:
-            raise MapError(
-                f"The map {self.path} lacks its file {name}: copy the whole folder, or map again."
-            ) from error
-        if size != expected:
-            raise MapError(f"{self.path / name} is damaged: it has {size} bytes instead of {expected}.")
 
 
 def _of_frames(

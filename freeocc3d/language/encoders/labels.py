@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +16,7 @@ from ...capture.class_files import read_class_names
 from ...capture.numbered_files import list_folder
 from ...core.errors import CaptureError
 from ...core.image_files import ImageFileError, read_image
+from ...core.typed_documents import as_type
 from ...core.types import Frame
 from ...settings.option_types import FilePath, Stride
 from ...settings.typed_options import TypedOptions
@@ -91,6 +93,12 @@ class LabelsEncoder(Encoder):
         return {"classes": list(self.classes)}
 
 
+class LabelState(msgspec.Struct):
+    """What a map keeps of an encoder of classes. classes: their names."""
+
+    classes: Annotated[list[str], msgspec.Meta(min_length=1, max_length=1 << 16)]
+
+
 class LabelWords(TextEncoder):
     """Class names, their synonyms, and wider words that include several classes."""
 
@@ -145,8 +153,8 @@ def load(options: Options, capture: Capture) -> LabelsEncoder:
 
 
 def load_text(state: dict[str, Any]) -> LabelWords:
-    """Restores the text part."""
-    return LabelWords([str(name) for name in state["classes"]])
+    """Restores the text part. Raises ValueError for a state of another form."""
+    return LabelWords(as_type(state, LabelState).classes)
 
 
 def _sampled(size: int, stride: int, own_size: int) -> NDArray[np.int64]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from ...capture.base import Capture
 from ...capture.class_files import read_class_file, read_class_names
 from ...core.errors import ConfigError, FrameError
 from ...core.onnx_session import load_session
+from ...core.typed_documents import as_type
 from ...core.types import Frame
 from ...settings.option_types import Device, FilePath, Stride
 from ...settings.registry import nearest
@@ -26,7 +28,7 @@ from ...settings.typed_options import TypedOptions
 from .. import synonyms
 from ..name_embeddings import NameEmbeddings
 from .base import Encoder
-from .labels import LabelWords
+from .labels import LabelState, LabelWords
 
 REQUIRES: tuple[str, ...] = ("onnxruntime",)
 
@@ -217,6 +219,10 @@ class SegmentationNetwork:
         )
 
 
+class _State(LabelState):
+    aliases: dict[str, Annotated[int, Meta(ge=0)]] = msgspec.field(default_factory=dict)
+
+
 class SegmenterWords(LabelWords):
     """Class names, their synonyms and wider words, and names that mean a class by their text embeddings."""
 
@@ -271,9 +277,11 @@ def load(options: Options, capture: Capture | None = None) -> SegmenterEncoder:
 
 
 def load_text(state: dict[str, Any]) -> SegmenterWords:
-    """Restores the text part."""
-    aliases = {str(name): int(row) for name, row in state.get("aliases", {}).items()}
-    return SegmenterWords([str(name) for name in state["classes"]], aliases)
+    """Restores the text part. Raises ValueError for a state of another form."""
+    kept = as_type(state, _State)
+    if any(row >= len(kept.classes) for row in kept.aliases.values()):
+        raise ValueError("an alias of no class")
+    return SegmenterWords(kept.classes, kept.aliases)
 
 
 def _void(names: tuple[str, ...], options: Options) -> NDArray[np.bool_]:
