@@ -38,7 +38,7 @@ def take_stated_sigma(frame: Frame) -> NDArray[np.float32]:
 
 @njit(cache=True, nogil=True, inline="always")
 def look_up_sigma(stated_m: NDArray[np.float32], row: int, column: int, depth: float) -> float:
-    """Standard deviation of a pixel's depth, meters. Inlined, so that the caller's floating-point rules apply."""
+    """Standard deviation of a pixel's depth, meters."""
     if len(stated_m):
         return np.float64(stated_m[row, column])
     return _A + _B * (depth - _NEAREST) ** 2

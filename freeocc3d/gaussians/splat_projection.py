@@ -22,6 +22,9 @@ COLUMNS = 11
 GRADIENTS = 10
 """Number of columns of a splat, and of its gradient."""
 
+DEALT = 64
+"""Tiles and splats are dealt to so many loops, whatever the number of threads: neighbors take equally long."""
+
 _LOG_ALPHA_MIN = math.log(ALPHA_MIN)
 _STEEPEST = 1.5  # |J| <= this (fx + fy) / z while |x / z| and |y / z| are below 1: sqrt(2) rounded up
 
@@ -123,18 +126,20 @@ def project_backward(
     pinhole: Array,
     limits: Array,
     rows: NDArray[np.int64],
-    parts: Array,
+    by_tile: Array,
+    first: NDArray[np.int64],
+    places: NDArray[np.int32],
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Gradients of means, scales, quaternions, opacities and colors from the gradients of splats; rows: the Gaussian of
-    each splat."""
+    """Gradients of means, scales, quaternions, opacities and colors. rows: the Gaussian of each splat.  by_tile: (P,
+    10) gradients of the splats; splat s has those at ``places[first[s]:first[s + 1]]``."""
     n = len(means)
     d_means, d_scales = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
     d_quats, d_opacities = np.zeros((n, 4), np.float32), np.zeros(n, np.float32)
     d_colors = np.zeros((n, 3), np.float32)
     fx, fy = pinhole[0], pinhole[1]
-    for thread in prange(len(parts)):
-        _part_backward(
-            thread,
+    for share in prange(DEALT):
+        _share_backward(
+            share,
             means,
             scales,
             quats,
@@ -143,7 +148,9 @@ def project_backward(
             fx,
             fy,
             rows,
-            parts,
+            by_tile,
+            first,
+            places,
             d_means,
             d_scales,
             d_quats,
@@ -154,8 +161,8 @@ def project_backward(
 
 
 @njit(cache=True)
-def _part_backward(
-    thread: int,
+def _share_backward(
+    share: int,
     means: Array,
     scales: Array,
     quats: Array,
@@ -164,23 +171,26 @@ def _part_backward(
     fx: np.float32,
     fy: np.float32,
     rows: NDArray[np.int64],
-    parts: Array,
+    by_tile: Array,
+    first: NDArray[np.int64],
+    places: NDArray[np.int32],
     d_means: Array,
     d_scales: Array,
     d_quats: Array,
     d_opacities: Array,
     d_colors: Array,
 ) -> None:
-    """The part of ``project_backward`` for one thread: every n-th splat."""
+    """A share of ``project_backward``: every n-th splat."""
     d = np.empty(GRADIENTS, np.float32)
     M = np.empty((2, 3), np.float32)
     C = np.empty((3, 3), np.float32)  # R Q: the principal axes in the camera's frame
     D = np.empty((3, 3), np.float32)  # dL/d(Q S)
-    for s in range(thread, len(rows), len(parts)):
+    for s in range(share, len(rows), DEALT):
         g = rows[s]
-        d[:] = parts[0, s]
-        for other in range(1, len(parts)):
-            d += parts[other, s]
+        d[:] = 0
+        for place in places[first[s] : first[s + 1]]:
+            for i in range(GRADIENTS):
+                d[i] += by_tile[place, i]
         d_opacities[g] = d[5]
         for i in range(3):
             d_colors[g, i] = d[6 + i]

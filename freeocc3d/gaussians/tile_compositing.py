@@ -1,4 +1,7 @@
-"""Composites splats to pixels, and gradients back, compiled: tile by tile, nearest first until the tile is opaque."""
+"""Composites splats to pixels, and gradients back, compiled: tile by tile, nearest first until the tile is opaque.
+
+With e2, e1, e0 of a row of pixels, the exponent is -1/2 (a du^2 + 2 b du dv + c dv^2) = (e2 du + e1) du + e0.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from .rasterizers.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from .splat_projection import CONIC_A, CONIC_B, CONIC_C, GRADIENTS, LEAST, OPACITY, PIXEL_U, PIXEL_V, RED, Z
+from .splat_projection import CONIC_A, CONIC_B, CONIC_C, DEALT, GRADIENTS, LEAST, OPACITY, PIXEL_U, PIXEL_V, RED, Z
 
 TILE = 16
 """Edge of a tile in pixels, as in the 3D Gaussian Splatting paper."""
@@ -42,8 +45,11 @@ def sort_nearest_first(rows: NDArray[np.int64], bits: NDArray[np.uint32]) -> NDA
 
 
 @njit(cache=True)
-def list_by_tile(box: NDArray[np.int32], across: int, down: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Counting sort: the splats of tile t are ``listed[start[t]:start[t + 1]]``, in their order."""
+def list_by_tile(
+    box: NDArray[np.int32], across: int, down: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
+    """Counting sort. The splats of tile t are ``listed[start[t]:start[t + 1]]``, in their order; splat s is at
+    ``places[first[s]:first[s + 1]]`` of ``listed``, in the order of its tiles."""
     start = np.zeros(across * down + 1, np.int64)
     for s in range(len(box)):
         for row in range(box[s, 2] // TILE, box[s, 3] // TILE + 1):
@@ -52,17 +58,21 @@ def list_by_tile(box: NDArray[np.int32], across: int, down: int) -> tuple[NDArra
     for tile in range(across * down):
         start[tile + 1] += start[tile]
     place = start[:-1].copy()
-    listed = np.empty(start[-1], np.int32)
+    listed, places = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
+    first = np.zeros(len(box) + 1, np.int64)
+    n = 0
     for s in range(len(box)):
         for row in range(box[s, 2] // TILE, box[s, 3] // TILE + 1):
             for column in range(box[s, 0] // TILE, box[s, 1] // TILE + 1):
                 tile = row * across + column
-                listed[place[tile]] = s
+                listed[place[tile]], places[n] = s, place[tile]
                 place[tile] += 1
-    return start, listed
+                n += 1
+        first[s + 1] = n
+    return start, listed, first, places
 
 
-@njit(parallel=True, cache=True, fastmath=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def composite(
     splats: Array,
     box: NDArray[np.int32],
@@ -92,17 +102,17 @@ def composite(
             red, green, blue, z = splats[s, RED], splats[s, RED + 1], splats[s, RED + 2], splats[s, Z]
             first_of_box, last_of_box = max(box[s, 0], left), min(box[s, 1], right)
             for row in range(max(box[s, 2], top), min(box[s, 3], bottom) + 1):
-                dv = row - v
+                dv = np.float32(row) - v
                 first, last = first_of_box, last_of_box
                 if last - first > _SHORT:
                     first, last = _span(u, dv, a, b, c, least, first, last)
+                e2, e1, e0 = np.float32(-0.5) * a, -b * dv, np.float32(-0.5) * c * dv * dv
                 for column in range(first, last + 1):
                     T = before[row - top, column - left]
                     if T == 0:
                         continue
-                    du = column - u
-                    exponent = np.float32(-0.5) * (a * du * du + c * dv * dv) - b * du * dv
-                    alpha = min(np.float32(ALPHA_MAX), o * math.exp(exponent))
+                    du = np.float32(column) - u
+                    alpha = min(np.float32(ALPHA_MAX), o * math.exp((e2 * du + e1) * du + e0))
                     if alpha < np.float32(ALPHA_MIN):
                         continue
                     after = T * (np.float32(1) - alpha)
@@ -122,7 +132,7 @@ def composite(
     return out
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, error_model="numpy")
 def _span(
     u: np.float32,
     dv: np.float32,
@@ -134,15 +144,13 @@ def _span(
     high: int,
 ) -> tuple[int, int]:
     """First and last column, within low … high, of a row that an ellipse reaches; never one pixel too few."""
-    half = b * b * dv * dv - a * (c * dv * dv + np.float32(2) * least)
-    if half <= 0:
-        half = np.float32(0)
+    half = max(b * b * dv * dv - a * (c * dv * dv + np.float32(2) * least), np.float32(0))
     half = math.sqrt(half) / a + np.float32(_SLACK)
     middle = u - b * dv / a
     return max(low, math.ceil(middle - half)), min(high, math.floor(middle + half))
 
 
-@njit(parallel=True, cache=True, fastmath=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def composite_backward(
     splats: Array,
     box: NDArray[np.int32],
@@ -150,20 +158,19 @@ def composite_backward(
     listed: NDArray[np.int32],
     out: Array,
     gradient: Array,
-    threads: int,
 ) -> Array:
-    """(threads, S, 10) partial gradients of S splats.
+    """(P, 10) gradients of the P ``listed`` splats, each of what its tile shows. The caller sums a splat's gradients in
+    the order of its tiles, so that the sum does not depend on the number of threads.
 
     With v_k = dL/dw_k and S_k = sum_{j>k} w_j v_j, dL/dalpha_k = T_k v_k - S_k / (1 - alpha_k). S_k is the rest of the
     pixel's sum, which the forward pass gave."""
     height, width = out.shape[:2]
     across = (width + TILE - 1) // TILE
-    parts = np.zeros((threads, len(splats), GRADIENTS), np.float32)
-    for thread in prange(threads):
+    found = np.zeros((len(listed), GRADIENTS), np.float32)
+    for share in prange(DEALT):
         before = np.empty((TILE, TILE), np.float32)
         left_over = np.empty((TILE, TILE), np.float32)
-        mine = parts[thread]
-        for tile in range(thread, len(start) - 1, threads):
+        for tile in range(share, len(start) - 1, DEALT):
             top, left = tile // across * TILE, tile % across * TILE
             bottom, right = min(top + TILE, height) - 1, min(left + TILE, width) - 1
             before[:] = 1
@@ -185,20 +192,23 @@ def composite_backward(
                 )
                 o, least = splats[s, OPACITY], splats[s, LEAST]
                 red, green, blue, z = splats[s, RED], splats[s, RED + 1], splats[s, RED + 2], splats[s, Z]
-                d_u = d_v = d_a = d_b = d_c = d_o = d_red = d_green = d_blue = d_z = np.float32(0)
+                # Sums over the pixels of dL/d(exponent) times powers of du and dv, and the other gradients.
+                sum_u = sum_v = sum_uu = sum_uv = sum_vv = np.float32(0)
+                d_o = d_red = d_green = d_blue = d_z = np.float32(0)
                 first_of_box, last_of_box = max(box[s, 0], left), min(box[s, 1], right)
                 for row in range(max(box[s, 2], top), min(box[s, 3], bottom) + 1):
-                    dv = row - v
+                    dv = np.float32(row) - v
                     first, last = first_of_box, last_of_box
                     if last - first > _SHORT:
                         first, last = _span(u, dv, a, b, c, least, first, last)
+                    e2, e1, e0 = np.float32(-0.5) * a, -b * dv, np.float32(-0.5) * c * dv * dv
+                    row_1 = row_u = np.float32(0)
                     for column in range(first, last + 1):
                         T = before[row - top, column - left]
                         if T == 0:
                             continue
-                        du = column - u
-                        exponent = np.float32(-0.5) * (a * du * du + c * dv * dv) - b * du * dv
-                        falloff = math.exp(exponent)
+                        du = np.float32(column) - u
+                        falloff = math.exp((e2 * du + e1) * du + e0)
                         alpha = min(np.float32(ALPHA_MAX), o * falloff)
                         if alpha < np.float32(ALPHA_MIN):
                             continue
@@ -222,14 +232,17 @@ def composite_backward(
                         d_alpha = T * value - left_over[row - top, column - left] / (np.float32(1) - alpha)
                         d_o += falloff * d_alpha
                         d_exponent = alpha * d_alpha
-                        d_u += d_exponent * (a * du + b * dv)
-                        d_v += d_exponent * (b * du + c * dv)
-                        d_a -= d_exponent * np.float32(0.5) * du * du
-                        d_b -= d_exponent * du * dv
-                        d_c -= d_exponent * np.float32(0.5) * dv * dv
-                found = (d_u, d_v, d_a, d_b, d_c, d_o, d_red, d_green, d_blue, d_z)
-                for i in range(GRADIENTS):
-                    mine[s, i] += found[i]
+                        row_1 += d_exponent
+                        row_u += d_exponent * du
+                        sum_uu += d_exponent * du * du
+                    sum_u += row_u
+                    sum_v += row_1 * dv
+                    sum_uv += row_u * dv
+                    sum_vv += row_1 * dv * dv
+                own = found[entry]
+                own[PIXEL_U], own[PIXEL_V] = a * sum_u + b * sum_v, b * sum_u + c * sum_v
+                own[CONIC_A], own[CONIC_B], own[CONIC_C] = np.float32(-0.5) * sum_uu, -sum_uv, np.float32(-0.5) * sum_vv
+                own[5], own[6], own[7], own[8], own[9] = d_o, d_red, d_green, d_blue, d_z
                 if open_pixels == 0:
                     break
-    return parts
+    return found

@@ -26,6 +26,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ..core.dot_products import sum_products
 from ..core.half_floats import widen_halves
 from ..core.union_find import find_root, join_sets
 from .visibility import VisibleGaussians
@@ -203,14 +204,10 @@ def _widened(halves: NDArray[np.uint16]) -> NDArray[np.float32]:
     return wide
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _alike(a: NDArray[np.float32], b: NDArray[np.float32], least: np.float32) -> bool:
-    dot, squared_a, squared_b = np.float32(0), np.float32(0), np.float32(0)
-    for d in range(len(a)):
-        dot += a[d] * b[d]
-        squared_a += a[d] * a[d]
-        squared_b += b[d] * b[d]
-    return bool(dot > 0 and dot * dot >= least * least * squared_a * squared_b)
+    dot = sum_products(a, b)
+    return bool(dot > 0 and dot * dot >= least * least * sum_products(a, a) * sum_products(b, b))
 
 
 @njit(parallel=True, cache=True)
@@ -252,20 +249,19 @@ def _first_connected(left: NDArray[np.bool_], above: NDArray[np.bool_]) -> NDArr
     return parent
 
 
-@njit(parallel=True, cache=True, fastmath={"reassoc", "contract"})
+@njit(parallel=True, cache=True)
 def _coded(features: NDArray[np.float32], used: NDArray[np.int64]) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
     """Encodes nonzero rows of (C, D) features as (U, D) int8 and (U,) factors that give unit features."""
     codes, scales = np.empty((len(used), features.shape[1]), np.int8), np.empty(len(used), np.float32)
     for n in prange(len(used)):
         own = features[used[n]]
-        largest, squared = np.float32(0), np.float32(0)
+        largest, levels = np.float32(0), np.empty_like(own)
         for d in range(len(own)):
             largest = max(largest, abs(own[d]))
         for d in range(len(own)):
-            level = np.rint(own[d] * (np.float32(_LARGEST_CODE) / largest))
-            codes[n, d] = np.int8(level)
-            squared += level * level
-        scales[n] = 1 / math.sqrt(squared)
+            levels[d] = np.rint(own[d] * (np.float32(_LARGEST_CODE) / largest))
+            codes[n, d] = np.int8(levels[d])
+        scales[n] = 1 / math.sqrt(sum_products(levels, levels))
     return codes, scales
 
 
@@ -288,7 +284,7 @@ def _add(
         weights[g] += weight[n]
 
 
-@njit(parallel=True, cache=True, fastmath={"reassoc", "contract"})
+@njit(parallel=True, cache=True)
 def _agreement(
     rows: NDArray[np.int32],
     slots: NDArray[np.int32],
@@ -304,13 +300,12 @@ def _agreement(
         g, own = rows[n], features[slots[n]]
         if weights[g] <= weight[n]:
             continue
-        dot, squared, scale = np.float32(0), np.float32(0), scales[slots[n]]
-        factor = weight[n] * scale
-        for d in range(total.shape[1]):
-            feature = np.float32(own[d])
-            other = total[g, d] - factor * feature
-            dot += feature * other
-            squared += other * other
+        feature, others = np.empty(len(own), np.float32), np.empty(len(own), np.float32)
+        scale = scales[slots[n]]
+        for d in range(len(own)):
+            feature[d] = own[d]
+            others[d] = total[g, d] - weight[n] * scale * feature[d]
+        squared = sum_products(others, others)
         if squared > 0:
-            cosine[n] = scale * dot / np.float32(math.sqrt(squared))
+            cosine[n] = scale * sum_products(feature, others) / np.float32(math.sqrt(squared))
     return cosine

@@ -16,9 +16,14 @@ def test_a_tile_lists_the_splats_whose_box_reaches_it() -> None:
     first = rng.integers(0, (5 * TILE, 3 * TILE), (60, 2))
     last = np.minimum(first + rng.integers(0, 2 * TILE, (60, 2)), (5 * TILE - 1, 3 * TILE - 1))
     box = np.stack((first[:, 0], last[:, 0], first[:, 1], last[:, 1]), axis=1).astype(np.int32)
-    start, listed = list_by_tile(box, 5, 3)
+    start, listed, first, places = list_by_tile(box, 5, 3)
     for tile in range(15):
         row, column = divmod(tile, 5)
         reached = (box[:, :2] // TILE - column, box[:, 2:] // TILE - row)
         inside = np.logical_and.reduce([(r[:, 0] <= 0) & (r[:, 1] >= 0) for r in reached])
         np.testing.assert_array_equal(listed[start[tile] : start[tile + 1]], np.flatnonzero(inside))
+    for splat in range(60):
+        own = places[first[splat] : first[splat + 1]]
+        assert (listed[own] == splat).all()
+        assert (np.diff(own) > 0).all()
+    assert len(places) == first[-1] == start[-1]

@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...core.threads import count_threads
 from ...core.types import Intrinsics
 from ..splat_projection import Z, project_backward, project_splats
 from ..tile_compositing import TILE, composite, composite_backward, list_by_tile, sort_nearest_first
@@ -19,14 +18,12 @@ REQUIRES: tuple[str, ...] = ()
 
 Array = NDArray[np.float32]
 
-_THREADS = count_threads()
-
 
 class CpuRasterizer:
     """Sorts splats by depth once, then lists them by the tiles that they reach. It composites each tile nearest first
-    until the tile is opaque. The backward pass composites again, and each thread sums its own gradients.
+    until the tile is opaque. The backward pass composites again.
 
-    Memory: 44 bytes per splat in view, 4 per splat and tile, and for the backward pass 40 per splat and thread."""
+    Memory: 44 bytes per splat in view, 8 per splat and tile, and for the backward pass 40 per splat and tile."""
 
     def __init__(self) -> None:
         self.device = torch.device("cpu")
@@ -50,16 +47,16 @@ class _Render(torch.autograd.Function):
         rows = np.flatnonzero(box[:, 0] <= box[:, 1])
         rows = sort_nearest_first(rows, splats[rows, Z].view(np.uint32))
         splats, box = splats[rows], box[rows]
-        start, listed = list_by_tile(box, -(-camera.width // TILE), -(-camera.height // TILE))
+        start, listed, first, places = list_by_tile(box, -(-camera.width // TILE), -(-camera.height // TILE))
         out = composite(splats, box, start, listed, camera.width, camera.height)
-        ctx.saved = (means, scales, quats, T, pinhole, limits, rows, splats, box, start, listed, out)
+        ctx.saved = (means, scales, quats, T, pinhole, limits, rows, splats, box, start, listed, first, places, out)
         return torch.from_numpy(out)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        means, scales, quats, T, pinhole, limits, rows, splats, box, start, listed, out = ctx.saved
-        parts = composite_backward(splats, box, start, listed, out, _array(gradient), _THREADS)
-        found = project_backward(means, scales, quats, T, pinhole, limits, rows, parts)
+        means, scales, quats, T, pinhole, limits, rows, splats, box, start, listed, first, places, out = ctx.saved
+        by_tile = composite_backward(splats, box, start, listed, out, _array(gradient))
+        found = project_backward(means, scales, quats, T, pinhole, limits, rows, by_tile, first, places)
         return *(torch.from_numpy(array) for array in found), None, None
 
 

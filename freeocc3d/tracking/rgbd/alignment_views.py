@@ -41,7 +41,7 @@ less, pixels are in a corner of the window or nearly on a line, and do not deter
 _LEAST_FACING = 0.12
 """Smallest cosine between a plane's normal and the ray to it, 83 degrees: at a flatter angle, depth is mostly noise."""
 
-_FARTHER = 1e9  # squared pixels: more than any distance; finite, because ``fastmath`` excludes infinity
+_FARTHER = math.inf  # squared pixels
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _average_sigma(frame: Frame, step: int) -> NDArray[np.float32]:
     return np.asarray(total / np.maximum(known.sum(axis=(1, 3)), 1), np.float32)
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def fit_planes(
     depth_m: NDArray[np.float32], step: int, window: int, fx: float, fy: float, cx: float, cy: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

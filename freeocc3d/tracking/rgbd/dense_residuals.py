@@ -98,7 +98,7 @@ def make_equations() -> NormalEquations:
     return NormalEquations(np.zeros((_EXPOSURE, _EXPOSURE)), np.zeros(_EXPOSURE), np.zeros(STATISTICS))
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def linearize(
     source: Surface,
     target: Surface,
@@ -131,6 +131,8 @@ def linearize(
     count_p = 0
     soft_g = 1.0 / (GEMAN_MCCLURE * scales[0]) ** 2
     soft_p = 1.0 / (GEMAN_MCCLURE * scales[1]) ** 2
+    sure_g = scales[0] ** 2
+    sure_p = photometric / (GRAY_SIGMA * scales[1]) ** 2
     gain, offset = weighting.brightness
     J = np.zeros(_EXPOSURE)
     first = stride // 2
@@ -145,8 +147,9 @@ def linearize(
             z = T[2, 0] * ps0 + T[2, 1] * ps1 + T[2, 2] * ps2 + T[2, 3]
             if z < NEAREST_M:
                 continue
-            u = fx * x / z + cx
-            v = fy * y / z + cy
+            inverse_z = 1.0 / z
+            u = fx * x * inverse_z + cx
+            v = fy * y * inverse_z + cy
             if u < 0.5 or v < 0.5 or u > wt - 1.5 or v > ht - 1.5:
                 continue
             stats[1] += 1
@@ -162,19 +165,19 @@ def linearize(
             r = n0 * (x - q0) + n1 * (y - q1) + n2 * (z - q2)
             sigma_t = look_up_sigma(target.sigma_m, it, jt, q2)
             sigma_s = look_up_sigma(source.sigma_m, i, j, ps2)
-            sigma = math.sqrt(sigma_t * sigma_t + sigma_s * sigma_s)
-            k = abs(r) / sigma
+            variance = sigma_t * sigma_t + sigma_s * sigma_s
+            k = abs(r) / math.sqrt(variance)
             bin_ = int(k * _PER_SIGMA)
             if n0 * m0 + n1 * m1 + n2 * m2 < NORMALS_AGREE:
                 continue
             if bin_ < _BINS:
                 histogram_g[bin_] += 1
             count_g += 1
-            weight = 1.0 / (1.0 + k * k * soft_g) ** 2
+            weight = 1.0 / ((1.0 + k * k * soft_g) ** 2 * variance * sure_g)
             if k < ON_SURFACE * scales[0]:
                 stats[3] += 1
             _fill_jacobian(J, x, y, z, n0, n1, n2)
-            _add_residual(H, g, J, _POSE, weight / (sigma * sigma * scales[0] * scales[0]), r)
+            _add_residual(H, g, J, _POSE, weight, r)
             if k > SAME_SURFACE * scales[0] or photometric == 0.0:
                 continue
             ug = (u + 0.5) * shrink - 0.5
@@ -195,9 +198,9 @@ def linearize(
             if bin_ < _BINS:
                 histogram_p[bin_] += 1
             count_p += 1
-            weight_p = photometric / (1.0 + kp * kp * soft_p) ** 2 / (GRAY_SIGMA**2 * scales[1] * scales[1])
-            d0, d1 = gu * fx / z, gv * fy / z
-            d2 = -(d0 * x + d1 * y) / z
+            weight_p = sure_p / (1.0 + kp * kp * soft_p) ** 2
+            d0, d1 = gu * fx * inverse_z, gv * fy * inverse_z
+            d2 = -(d0 * x + d1 * y) * inverse_z
             _fill_jacobian(J, x, y, z, d0, d1, d2)
             J[6] = -value_s
             J[7] = -1.0
