@@ -1,6 +1,9 @@
 """Place recognition, loop closures, joint refinement, submaps: on rendered and real captures, and with wrong
 closures."""
 
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from small_captures import data_folder
@@ -10,6 +13,7 @@ from freeocc3d.core.transforms import invert, measure_pose_difference, quats_to_
 from freeocc3d.tracking import pose_graph
 from freeocc3d.tracking.pose_graph import Edge
 from freeocc3d.tracking.rgbd import joint_refinement, loop_closures, place_recognition
+from freeocc3d.tracking.rgbd.dense_alignment import ViewAlignment
 from freeocc3d.tracking.rgbd.keyframe_registration import prepare_keyframe_view
 
 FRAMES = range(0, 60, 4)
@@ -193,3 +197,120 @@ def test_a_tied_submap_is_laid_where_its_closures_say() -> None:
     placed = pose_graph.optimize_component(poses, [*own, *ties], range(10))
     relative = [invert(placed[0]) @ T for T in placed]
     assert worst(relative, [invert(true[0]) @ T for T in true])[0] < 1e-3
+
+
+# The borders of each test
+
+
+def aligned(T: np.ndarray, **changes) -> ViewAlignment:
+    """An alignment that passes every test, but for the changes."""
+    good = {"determined": True, "overlap": 0.35, "inliers": 0.75, "correlation": 0.7}
+    return ViewAlignment(T, np.diag(np.arange(1.0, 7.0)), **{**good, **changes})
+
+
+class Rooms:
+    """Keyframes on a line, of which 1 and 6 show the same place. ``wrong`` are pairs that do not align."""
+
+    def __init__(self, monkeypatch, features=20, closing=(), off=0.0, wrong=(), drift=0.0, submap=(0,) * 8) -> None:
+        self.true = [motion(20.0 * k, 0.2 * k) @ motion(0.0, 0.1) for k in range(8)]
+        self.submap, self.asked = list(submap), []
+        self.views = [SimpleNamespace(view=k) for k in range(8)]
+        T = self.relative(6, 1)
+        found = SimpleNamespace(
+            by_features=T @ motion(0.0, off), agreeing=features, aligned=aligned(T, **dict(closing))
+        )
+        monkeypatch.setattr(loop_closures, "register_by_features", lambda source, target: found)
+
+        def align(source, target, guess):
+            self.asked.append((source, target))
+            np.testing.assert_allclose(guess, self.relative(source, target), atol=1e-9)
+            good = (source, target) not in wrong
+            return aligned(guess @ motion(0.0, drift), overlap=0.9 if good else 0.1)
+
+        monkeypatch.setattr(loop_closures.dense_alignment, "align_views", align)
+
+    def relative(self, source: int, target: int) -> np.ndarray:
+        return invert(self.true[target]) @ self.true[source]
+
+    def verified(self) -> Edge | None:
+        return loop_closures.verify_closure(self.views, self.submap, self.true, 6, 1)  # type: ignore[arg-type]
+
+
+def test_a_closure_is_the_aligned_pose_and_a_neighbor_confirms_it(monkeypatch) -> None:
+    rooms = Rooms(monkeypatch)
+    edge = rooms.verified()
+    assert edge is not None
+    assert (edge.source, edge.target, edge.uncertain) == (6, 1, True)
+    np.testing.assert_array_equal(edge.T_target_source, rooms.relative(6, 1))
+    np.testing.assert_array_equal(np.diag(edge.information), np.arange(1, 7))
+    assert rooms.asked == [(5, 1)], "one neighbor is enough"
+
+
+@pytest.mark.parametrize(
+    ("changes", "closed"),
+    [
+        ({"features": 19}, False),
+        ({"closing": {"determined": False}}, False),
+        ({"closing": {"overlap": 0.34}}, False),
+        ({"closing": {"inliers": 0.74}}, False),
+        ({"closing": {"correlation": 0.69}}, False),
+        ({"closing": {"correlation": float("nan")}}, False),
+        ({"off": 0.099}, True),
+        ({"off": 0.101}, False),
+        ({"drift": 0.099}, True),
+        ({"drift": 0.101}, False),
+        ({"wrong": [(5, 1), (7, 1), (6, 0)]}, True),
+        ({"wrong": [(5, 1), (7, 1), (6, 0), (6, 2)]}, False),
+        ({"submap": (0, 0, 0, 0, 1, 1, 1, 1), "wrong": [(5, 1), (7, 1), (6, 0)]}, True),
+        ({"submap": (0, 1, 2, 3, 4, 5, 6, 7)}, False),  # no keyframe has a neighbor
+        ({"submap": (0, 0, 1, 1, 1, 2, 3, 4), "wrong": [(6, 0)]}, False),
+    ],
+)
+def test_each_test_of_a_closure_has_its_border(monkeypatch, changes, closed) -> None:
+    assert (Rooms(monkeypatch, **changes).verified() is not None) == closed
+
+
+def test_compared_are_the_most_alike_that_are_not_close_on_the_path(monkeypatch) -> None:
+    rng = np.random.default_rng(0)
+    described = [rng.integers(0, 256, (30, 32), dtype=np.uint8) for _ in range(12)]
+    keyframes = [SimpleNamespace(features=SimpleNamespace(descriptors=one)) for one in described]
+    alike = np.full((12, 12), 0.1)
+    for a, b, value in (
+        (0, 3, 0.9), (0, 4, 0.15), (0, 5, 0.149), (2, 9, 0.5), (6, 8, 0.8), (7, 9, 0.8),
+        (11, 1, 0.3), (11, 2, 0.31), (11, 3, 0.32), (11, 4, 0.33), (11, 5, 0.34),
+    ):  # fmt: skip
+        alike[a, b] = alike[b, a] = value
+    alike[1, 6:10] = alike[6:10, 1] = 0.4
+    monkeypatch.setattr(loop_closures, "compare_histograms", lambda histograms: alike)
+    submap = [0] * 8 + [1] * 4
+    with ThreadPoolExecutor(1) as pool:
+        found = loop_closures._candidates(keyframes, submap, pool)  # type: ignore[arg-type]
+        assert loop_closures._candidates(keyframes[:1], [0], pool) == []  # type: ignore[arg-type]
+    near = {(3, 0), (8, 6), (9, 7)}  # the first is too close on the path, the others are of two submaps
+    assert set(found) & near == {(8, 6), (9, 7)}
+    assert {(4, 0), (9, 2)} <= set(found)
+    assert (5, 0) not in found
+    assert {(11, n) for n in (2, 3, 4, 5)} <= set(found)
+    assert (11, 1) not in found, "four are more alike to either"
+    assert found == sorted(found)
+    assert all(later > earlier for later, earlier in found)
+
+
+@pytest.mark.parametrize(
+    ("angle", "x", "agrees"), [(9.9, 0.0, True), (10.1, 0.0, False), (0, 0.29, True), (0, 0.31, False)]
+)
+def test_two_closures_of_submaps_agree_up_to_the_drift_of_a_path(angle: float, x: float, agrees: bool) -> None:
+    poses, submap = [motion(10.0 * k, 0.5 * k) for k in range(4)], [0, 0, 1, 1]
+    T = motion(35, 1.0)  # of submap 1 in submap 0
+    first = Edge(2, 0, invert(poses[0]) @ T @ poses[2], np.eye(6), uncertain=True)
+    second = Edge(1, 3, invert(poses[3]) @ invert(T @ motion(angle, x)) @ poses[1], np.eye(6), uncertain=True)
+    assert pose_graph.drop_unsupported_closures(poses, submap, [first, second]) == ([first, second] if agrees else [])
+
+
+def test_edges_come_back_from_arrays() -> None:
+    edges = [Edge(k + 3, k, motion(10 * k, k), np.diag(np.arange(6.0) + k), uncertain=k == 1) for k in range(3)]
+    for edge, again in zip(edges, pose_graph.edges_from_arrays(pose_graph.edges_to_arrays(edges)), strict=True):
+        assert (again.source, again.target, again.uncertain) == (edge.source, edge.target, edge.uncertain)
+        np.testing.assert_array_equal(again.T_target_source, edge.T_target_source)
+        np.testing.assert_array_equal(again.information, edge.information)
+    assert pose_graph.edges_from_arrays(pose_graph.edges_to_arrays([])) == []
