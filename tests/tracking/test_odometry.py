@@ -70,15 +70,103 @@ def test_the_first_usable_frame_starts_the_map() -> None:
     assert t.trajectory(np.arange(3.0)).keyframes.tolist() == [1]
 
 
-def test_each_part_of_the_failure_test_can_fail() -> None:
-    kitchen = open_capture(data_folder() / "7scenes-kitchen")
-    good = tracker()
-    good.track(kitchen[0])
-    assert good.track(kitchen[1]).status == "tracked"
+@pytest.fixture(scope="module")
+def room():
+    return open_capture(
+        "builtin:room", None, {"synthetic": {"frames": 120, "width": 160, "height": 120, "noise": True}}
+    )
+
+
+@pytest.fixture(scope="module")
+def walk(room) -> list[Frame]:
+    """A third of the way around the room."""
+    return [room[i] for i in range(40)]
+
+
+def test_a_walk_around_a_room_is_followed_and_its_keyframes_are_tied_together(room, walk) -> None:
+    tied, chain = tracker(width=160), tracker(width=160, overlap_edges=0)
+    told = [tied.track(frame) for frame in walk]
+    for frame in walk:
+        chain.track(frame)
+    first = invert(room.pose(0))
+    trajectory = tied.trajectory(room.timestamps)
+    for i, one in enumerate(told):
+        assert one.status in ("keyframe", "tracked")
+        assert one.T_world_cam is not None
+        error = invert(first @ room.pose(i)) @ one.T_world_cam
+        assert np.linalg.norm(error[:3, 3]) < 0.03
+        np.testing.assert_allclose(trajectory.T_world_cam[i], one.T_world_cam, atol=1e-9)
+        assert 0.5 < one.confidence <= 1
+    keyframes = tied.records.keyframe_index
+    assert trajectory.keyframes.tolist() == keyframes == [i for i, one in enumerate(told) if one.status == "keyframe"]
+    assert [(edge.source, edge.target) for edge in chain.edges] == [(k, k - 1) for k in range(1, len(keyframes))]
+    certain = [edge for edge in tied.edges if not edge.uncertain]
+    assert [(edge.source, edge.target) for edge in certain] == [(k, k - 1) for k in range(1, len(keyframes))]
+    others = [edge for edge in tied.edges if edge.uncertain]
+    assert others
+    assert all(edge.source - edge.target > 1 for edge in others)
+    assert max(np.bincount([edge.source for edge in others])) <= 6
+    for edge in tied.edges:
+        source, target = (first @ room.pose(keyframes[k]) for k in (edge.source, edge.target))
+        error = invert(invert(target) @ source) @ edge.T_target_source
+        assert np.linalg.norm(error[:3, 3]) < 0.03
+    before = [T.copy() for T in tied.records.T_world_keyframe]
+    tied.optimize()
+    moved = [np.abs(a - b).max() for a, b in zip(before, tied.records.T_world_keyframe, strict=True)]
+    assert moved[0] < 1e-9
+    assert 0 < max(moved) < 0.05
+
+
+def test_each_frame_starts_from_constant_velocity_but_after_a_loss(walk, monkeypatch) -> None:
+    guesses, t = [], tracker(width=160, keyframe_overlap=0.01)
+    register = t._register
+
+    def recorded(source, target, guess):
+        guesses.append(guess)
+        return register(source, target, guess)
+
+    monkeypatch.setattr(t, "_register", recorded)
+    poses = [t.track(frame).T_world_cam for frame in walk[:4]]
+    assert len(guesses) == 3
+    np.testing.assert_allclose(guesses[0], np.eye(4))
+    for n in (1, 2):
+        np.testing.assert_allclose(guesses[n], poses[n] @ invert(poses[n - 1]) @ poses[n], atol=1e-9)
+    empty = Frame(4, 4.0, walk[4].color, np.zeros_like(walk[4].depth_m), walk[4].intrinsics)
+    assert t.track(empty).status == "lost"
+    assert len(guesses) == 5, "it is tried without velocity as well"
+    np.testing.assert_allclose(guesses[4], poses[3], atol=1e-9)
+    t.track(walk[5])
+    np.testing.assert_allclose(t._velocity, np.eye(4))
+    after = t.track(walk[6]).T_world_cam
+    np.testing.assert_allclose(guesses[-1], t.trajectory(np.arange(7.0)).T_world_cam[5], atol=1e-9)
+    np.testing.assert_allclose(t._T_keyframe_last, after, atol=1e-9)
+
+
+def test_each_part_of_the_failure_test_can_fail(walk) -> None:
+    good = tracker(width=160)
+    good.track(walk[0])
+    assert good.track(walk[1]).status == "tracked"
     for strict in ({"min_fitness": 0.999}, {"max_residual": 1e-6}, {"min_information": 1e3}):
-        t = tracker(**strict)
-        t.track(kitchen[0])
-        assert t.track(kitchen[1]).status == "lost", strict
+        t = tracker(width=160, **strict)
+        t.track(walk[0])
+        assert t.track(walk[1]).status == "lost", strict
+
+
+def test_a_tracker_that_is_restored_within_a_walk_goes_on(walk) -> None:
+    whole, part, rest = (tracker(width=160) for _ in range(3))
+    for frame in walk[:12]:
+        whole.track(frame)
+    for frame in walk[:7]:
+        part.track(frame)
+    empty = Frame(7, 7.0, walk[7].color, np.zeros_like(walk[7].depth_m), walk[7].intrinsics)
+    part.track(empty)
+    rest.restore(part.state(), walk.__getitem__)
+    for name, value in part.state().items():
+        np.testing.assert_array_equal(rest.state()[name], value)
+    told = [rest.track(frame) for frame in walk[8:12]]
+    assert all(one.status != "lost" for one in told)
+    wanted = whole.trajectory(np.arange(12.0)).T_world_cam[8:]
+    np.testing.assert_allclose([one.T_world_cam for one in told], wanted, atol=5e-3)
 
 
 def test_a_point_source_of_structure_is_not_enough() -> None:
@@ -94,24 +182,6 @@ def test_a_point_source_of_structure_is_not_enough() -> None:
     for one, status in ((t, "tracked"), (strict, "lost")):
         one.track(patches[0])
         assert one.track(patches[1]).status == status
-
-
-def test_keyframes_that_look_at_the_same_place_are_tied_together_and_that_helps() -> None:
-    capture = open_capture(data_folder() / "house" / "bedroom")
-    indices = range(0, 120, 3)
-    tied, chain = tracker(), tracker(overlap_edges=0)
-    for i in indices:
-        frame = capture[i]
-        tied.track(frame)
-        chain.track(frame)
-    assert len(chain.edges) == len(chain.records.keyframe_index) - 1
-    assert sum(edge.uncertain for edge in tied.edges) > len(chain.edges)
-    assert all(edge.source - edge.target > 1 for edge in tied.edges if edge.uncertain)
-    before = [T.copy() for T in tied.records.T_world_keyframe]
-    tied.optimize()
-    moved = [np.abs(a - b).max() for a, b in zip(before, tied.records.T_world_keyframe, strict=True)]
-    assert moved[0] < 1e-9
-    assert 0 < max(moved) < 0.05
 
 
 @pytest.mark.parametrize("width", [640, 960, 1280])

@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from freeocc3d.core.types import Frame, Trajectory
 from freeocc3d.tracking import pose_graph
 from freeocc3d.tracking.pose_graph import Edge
 from freeocc3d.tracking.rgbd import loop_closures
+from freeocc3d.tracking.rgbd.dense_alignment import ViewAlignment
+from freeocc3d.tracking.rgbd.keyframe_registration import FeatureRegistration
 from freeocc3d.tracking.trackers import rgbd
 
 
@@ -271,3 +274,163 @@ def test_one_wrong_closure_does_not_bend_a_real_path(bedroom) -> None:
         if np.linalg.norm(away[:3, 3]) > 0.2:
             assert off < 1e-3
         assert off < 0.12  # what is wrong by little may be shared out along the path
+
+
+# The borders of what counts as found
+
+
+def alignment(**changes) -> ViewAlignment:
+    good = {"determined": True, "overlap": 0.9, "inliers": 0.9, "correlation": 0.97}
+    return ViewAlignment(np.eye(4), np.eye(6), **{**good, **changes})
+
+
+def registration(off_m: float = 0.0, off_deg: float = 0.0, agreeing: int = 20, **changes) -> FeatureRegistration:
+    T = np.eye(4)
+    cos, sin = np.cos(np.deg2rad(off_deg)), np.sin(np.deg2rad(off_deg))
+    T[:2, :2], T[2, 3] = ((cos, -sin), (sin, cos)), off_m
+    return FeatureRegistration(T, agreeing, alignment(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sure", "likely"),
+    [
+        ({}, True, True),
+        ({"determined": False}, False, False),
+        ({"inliers": 0.75}, True, True),
+        ({"inliers": 0.749}, False, False),
+        ({"correlation": 0.96}, True, True),
+        ({"correlation": 0.959}, False, True),
+        ({"correlation": 0.8}, False, True),
+        ({"correlation": 0.799}, False, False),
+        ({"correlation": float("nan")}, False, False),
+        ({"overlap": 0.3}, True, True),
+        ({"overlap": 0.299}, False, True),
+    ],
+)
+def test_a_sure_pose_is_a_likely_one_that_looks_the_same(changes, sure: bool, likely: bool) -> None:
+    assert (rgbd._sure(alignment(**changes)), rgbd._likely(alignment(**changes))) == (sure, likely)
+
+
+@pytest.mark.parametrize(
+    ("changes", "confirmed", "recognized"),
+    [
+        ({}, True, True),
+        ({"agreeing": 19}, False, True),  # it overlaps much and looks the same
+        ({"agreeing": 19, "overlap": 0.5}, False, True),
+        ({"agreeing": 19, "overlap": 0.499}, False, False),
+        ({"agreeing": 19, "correlation": 0.959}, False, False),
+        ({"off_m": 0.149, "overlap": 0.2}, True, True),
+        ({"off_m": 0.151, "overlap": 0.2}, False, False),
+        ({"off_deg": 7.9, "overlap": 0.2}, True, True),
+        ({"off_deg": 8.1, "overlap": 0.2}, False, False),
+        ({"overlap": 0.15}, True, True),
+        ({"overlap": 0.149}, False, False),
+        ({"inliers": 0.6}, True, False),
+        ({"inliers": 0.599}, False, False),
+        ({"correlation": 0.5}, True, False),
+        ({"correlation": 0.499}, False, False),
+        ({"correlation": float("nan")}, True, False),  # flat intensities cannot disagree, but do not recognize a place
+    ],
+)
+def test_features_confirm_a_pose_and_a_place_is_recognized(changes, confirmed: bool, recognized: bool) -> None:
+    assert (rgbd._confirmed(registration(**changes)), rgbd._recognized(registration(**changes))) == (
+        confirmed,
+        recognized,
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "score", "confidence"),
+    [
+        ({"inliers": 0.5, "correlation": 0.6}, 0.3, 0.3),
+        ({"inliers": 0.5, "correlation": 0.6, "determined": False}, 0.3, 0.15),
+        ({"inliers": 0.5, "correlation": float("nan")}, 0.05, 0.25),
+        ({"inliers": 0.5, "correlation": -0.4}, 0.05, 0.0),
+    ],
+)
+def test_scores_rank_and_confidence_says_how_well_a_frame_fits(changes, score: float, confidence: float) -> None:
+    assert rgbd._score(alignment(**changes)) == pytest.approx(score)
+    assert rgbd._confidence(alignment(**changes)) == pytest.approx(confidence)
+
+
+def moved(x: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+@pytest.mark.parametrize(
+    ("dense", "by_features", "lost", "taken"),
+    [
+        ({}, None, 0, "dense"),
+        ({"x": 0.099}, {"agreeing": 99}, 0, "dense"),  # features are not asked
+        ({"x": 0.101}, {"agreeing": 99}, 0, "features"),
+        ({"x": 0.101}, None, 0, "dense"),  # far from the prediction, but it looks the same
+        ({"x": 0.101, "correlation": 0.959}, None, 0, None),
+        ({"x": 0.099, "correlation": 0.8}, None, 0, "dense"),
+        ({"x": 0.099, "correlation": 0.799}, None, 0, None),
+        ({"correlation": float("nan")}, None, 0, "dense"),
+        ({"correlation": float("nan")}, None, 1, None),
+        ({}, None, 1, "dense"),
+        ({"correlation": 0.9}, None, 1, None),
+        ({"inliers": 0.749}, None, 0, None),
+        ({"overlap": 0.299}, None, 0, None),
+        ({"correlation": 0.9}, {"inliers": 0.95, "correlation": 0.9}, 0, "features"),  # they score higher
+        ({"correlation": 0.9}, {"inliers": 0.85, "correlation": 0.9}, 0, "dense"),
+        ({"correlation": 0.5}, {"agreeing": 19}, 0, None),
+    ],
+)
+def test_a_frame_follows_the_prediction_or_what_features_say(dense, by_features, lost, taken, monkeypatch) -> None:
+    dense = dict(dense)
+    x = dense.pop("x", 0.0)
+    t = tracker()
+    t.keyframes, t._current, t._frames_lost = [SimpleNamespace(view="target")], 0, lost
+    t._T_keyframe_last, t._velocity = moved(1.0), moved(0.5)
+    given = replace(alignment(**dense), T_target_source=moved(1.5 + x))
+    found = None if by_features is None else registration(**by_features)
+
+    def align(source, target, guess):
+        assert (source, target) == ("source", "target")
+        np.testing.assert_allclose(guess, moved(1.5))  # constant velocity
+        return given
+
+    monkeypatch.setattr(rgbd.dense_alignment, "align_views", align)
+    monkeypatch.setattr(rgbd, "register_by_features", lambda source, target: found)
+    got = t._follow(SimpleNamespace(view="source", full=None))  # type: ignore[arg-type]
+    assert got is (given if taken == "dense" else found.aligned if taken == "features" else None)
+
+
+def test_a_lost_frame_is_compared_with_the_last_keyframes_and_the_most_alike(monkeypatch) -> None:
+    t = tracker()
+    t.keyframes = [SimpleNamespace(features=n) for n in range(60)]  # type: ignore[misc]
+    t._current = 58
+    common = {n: n % 7 for n in range(60)} | {30: 50, 3: 40, 12: 30, 21: 20, 40: 10}
+    monkeypatch.setattr(loop_closures, "count_common_features", lambda mine, other: common[other])
+    seen = SimpleNamespace(full=SimpleNamespace(features=SimpleNamespace(pixels=np.zeros((5, 2)))))
+    assert t._alike(seen) == [59, 57, 56, 30, 3, 12, 21]  # type: ignore[arg-type]
+    t._current = 10
+    t.keyframes = t.keyframes[:3]
+    assert t._alike(seen) == [2, 1, 0]  # type: ignore[arg-type]
+    seen.full.features.pixels = np.zeros((0, 2))
+    t.keyframes = [SimpleNamespace(features=n) for n in range(60)]  # type: ignore[misc]
+    assert t._alike(seen) == [59, 58, 57, 56]  # type: ignore[arg-type]
+
+
+def test_a_walk_around_a_rendered_room_is_followed_through_a_gap() -> None:
+    room = open_capture(
+        "builtin:room", None, {"synthetic": {"frames": 120, "width": 320, "height": 240, "noise": True}}
+    )
+    indices = range(0, 24, 2)
+    frames = [replace(room[i], index=n) for n, i in enumerate(indices)]
+    frames[5] = replace(frames[5], depth_m=np.zeros_like(frames[5].depth_m))
+    t, trajectory = follow(frames)
+    assert trajectory.status[5] == "interpolated"
+    assert trajectory.has_pose.all()
+    assert len(trajectory.keyframes) >= 2
+    meters, degrees = worst(trajectory, room, indices, gaps=False)
+    assert meters < 0.01
+    assert degrees < 0.3
+    again = tracker()
+    again.restore(t.state(), frames.__getitem__)
+    for name, value in t.state().items():
+        np.testing.assert_array_equal(again.state()[name], value)
