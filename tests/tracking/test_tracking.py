@@ -7,11 +7,12 @@ from small_captures import data_folder, write_seven_scenes
 
 from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import TrackingError
-from freeocc3d.core.transforms import invert, quats_to_rotations
-from freeocc3d.core.types import Frame
+from freeocc3d.core.transforms import invert, project, quats_to_rotations
+from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.settings import registry
 from freeocc3d.tracking import pose_graph
 from freeocc3d.tracking.base import Tracker
+from freeocc3d.tracking.given_poses import GivenTracker
 from freeocc3d.tracking.overlap import DepthView, measure_mutual_overlap, measure_overlap, sample_points
 from freeocc3d.tracking.pose_graph import Edge
 from freeocc3d.tracking.records import Records
@@ -125,3 +126,105 @@ def test_records_tell_submaps_and_which_closures_hold() -> None:
     assert (trajectory.status[12:] == "apart").all()
     assert trajectory.keyframes.tolist() == [0, 4, 8]
     assert Records().submaps() == []
+
+
+# Overlap and given poses, at their borders
+
+
+@pytest.mark.parametrize("step", [8, 16])
+def test_sampled_points_lie_on_the_pixels_around_which_a_step_is_centered(step: int) -> None:
+    camera = Intrinsics(64, 48, 50.0, 40.0, 31.0, 20.0)
+    depth = np.random.default_rng(0).uniform(1, 3, (48, 64)).astype(np.float32)
+    depth[step // 2, step // 2] = 0
+    points = sample_points(depth, camera, step)
+    pixels, z = project(points.astype(float), camera)
+    wanted = [(u, v) for v in range(step // 2, 48, step) for u in range(step // 2, 64, step)][1:]
+    np.testing.assert_allclose(pixels, wanted, atol=1e-4)
+    np.testing.assert_allclose(z, [depth[v, u] for u, v in wanted])
+
+
+@pytest.mark.parametrize(
+    ("pixel", "depth_m", "seen"),
+    [
+        ((-0.49, 10), 2.0, True),
+        ((-0.51, 10), 2.0, False),
+        ((39.49, 10), 2.0, True),
+        ((39.51, 10), 2.0, False),
+        ((10, -0.49), 2.0, True),
+        ((10, -0.51), 2.0, False),
+        ((10, 29.49), 2.0, True),
+        ((10, 29.51), 2.0, False),
+        ((10, 10), 2.19, True),
+        ((10, 10), 2.21, False),
+        ((10, 10), 1.81, True),
+        ((10, 10), 1.79, False),
+        ((10, 10), 0.0, True),  # a missing depth does not disagree
+    ],
+)
+def test_a_point_is_seen_within_the_image_where_the_depth_agrees_or_is_missing(pixel, depth_m, seen: bool) -> None:
+    camera = Intrinsics(40, 30, 30.0, 25.0, 19.0, 14.0)
+    u, v = pixel
+    point = np.float32([(2 * (u - 19.0) / 30, 2 * (v - 14.0) / 25, 2.0)])
+    view = DepthView(np.full((30, 40), depth_m, np.float32), camera, point)
+    assert measure_overlap(point, np.eye(4), view) == seen
+    both = np.concatenate((point, np.float32([(0.1, 0.1, -2.0), (0.0, 0.0, 0.0)])))  # behind the camera, and in it
+    assert measure_overlap(both, np.eye(4), view) == pytest.approx(seen / 3)
+
+
+def test_of_two_overlaps_the_smaller_counts_whichever_it_is() -> None:
+    camera = Intrinsics(40, 30, 30.0, 30.0, 19.5, 14.5)
+    near, far = (
+        DepthView(depth, camera, sample_points(depth, camera, 2))
+        for depth in (np.full((30, 40), 1.0, np.float32), np.full((30, 40), 2.0, np.float32))
+    )
+    back = np.eye(4)
+    back[2, 3] = 1.0  # the near camera in the far one: both see the wall at 2 m
+    assert measure_overlap(near.points, back, far) == 1.0
+    share = measure_overlap(far.points, invert(back), near)
+    assert 0.2 < share < 0.35
+    assert measure_mutual_overlap(near, far, back) == measure_mutual_overlap(far, near, invert(back)) == share
+
+
+def given(poses, overlap: float = 0.8) -> GivenTracker:
+    return GivenTracker(np.stack(poses), overlap)
+
+
+def test_given_poses_make_keyframes_of_frames_that_show_other_things() -> None:
+    poses = [motion(angle, 0.0) for angle in (0, 2, 30, 31)]
+    poses[1] = poses[1] + 1e-5  # files round poses
+    unknown = np.full((4, 4), np.nan)
+    t = given([unknown, *poses])
+    statuses = [t.track(wall_frame(2.0, index)) for index in range(5)]
+    assert [one.status for one in statuses] == ["lost", "keyframe", "tracked", "keyframe", "tracked"]
+    assert [one.confidence for one in statuses] == [0, 1, 1, 1, 1]
+    trajectory = t.trajectory(np.arange(5.0))
+    assert trajectory.keyframes.tolist() == [1, 3]
+    np.testing.assert_allclose(trajectory.T_world_cam[1:], poses, atol=3e-5)
+    np.testing.assert_allclose(t.poses_ahead()[1:], poses)
+    again = given([unknown, *poses])
+    frames = [wall_frame(2.0, index) for index in range(5)]
+    again.restore(t.state(), frames.__getitem__)
+    assert again.track(wall_frame(2.0, 4)).status == "tracked", "the last keyframe is the fourth frame"
+
+
+@pytest.mark.parametrize(("share", "status"), [(0.049, "lost"), (0.051, "keyframe")])
+def test_a_first_frame_needs_some_depth_and_a_later_one_none(share: float, status: str) -> None:
+    frame = wall_frame(2.0)
+    frame.depth_m.flat[round(share * frame.depth_m.size) :] = 0
+    assert given([np.eye(4)]).track(frame).status == status
+    t = given([np.eye(4), motion(90, 0.0)])
+    t.track(wall_frame(2.0))
+    empty = Frame(1, 1.0, frame.color, np.zeros_like(frame.depth_m), frame.intrinsics)
+    assert t.track(empty).status == "tracked"
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_given_pose_may_lie_two_kilometers_away_and_no_farther(axis: int) -> None:
+    for meters, right in ((1999.0, True), (-1999.0, True), (2001.0, False), (-2001.0, False)):
+        T = np.eye(4)
+        T[axis, 3] = meters
+        if right:
+            assert given([T]).track(wall_frame(2.0)).status == "keyframe"
+        else:
+            with pytest.raises(TrackingError, match="common offset"):
+                given([T]).track(wall_frame(2.0))
