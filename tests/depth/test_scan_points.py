@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from textured import CAMERA, Rectangle, looking, render
 
-from freeocc3d.depth.cross_view_check import DepthImage
+from freeocc3d.depth.cross_view_check import DepthImage, confirm_depth
 from freeocc3d.depth.scan_points import confirm_points, merge_points
 
 ROOM = [Rectangle((-3, -3, 3.0), (6, 0, 0), (0, 6, 0)), Rectangle((-0.3, -0.4, 1.5), (0.6, 0, 0), (0, 0.8, 0), seed=1)]
@@ -74,3 +74,30 @@ def test_what_lies_beyond_all_measure_or_is_nothing_is_left_out() -> None:
     nothing = np.zeros((0, 3)), np.zeros(0)
     assert len(merge_points([nothing, nothing], depth_m=1.0).points) == 0
     assert len(merge_points([], depth_m=1.0).points) == 0
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_first_and_the_last_cell_along_an_axis_hold_points_and_none_lie_beyond(axis: int) -> None:
+    """Cells of a centimeter, 2^20 of them along an axis."""
+    reach = (1 << 19) * 0.01
+    at = np.array((-reach - 0.005, -reach + 0.005, 0.005, reach - 0.005, reach + 0.005))
+    points = np.full((5, 3), 0.005)
+    points[:, axis] = at
+    found = merge_points([(points, np.full(5, 0.01))] * 2, 1.0)
+    np.testing.assert_allclose(np.sort(found.points[:, axis]), at[1:4], rtol=1e-9)
+    np.testing.assert_allclose(np.delete(found.points, axis, axis=1), 0.005)
+
+
+@pytest.mark.parametrize(("views", "kept"), [(1, False), (2, True)])
+def test_confirmed_points_have_the_mean_depth_and_its_deviation_in_meters(views: int, kept: bool) -> None:
+    own, others = _depth(0.0), [_depth(0.2), _depth(-0.2)]
+    points, sigma = confirm_points(own, others[:views], agreeing=2)
+    assert bool(len(points)) == kept
+    if kept:
+        T = own.T_world_cam
+        z = (points - T[:3, 3]) @ T[:3, 2]
+        inverse = confirm_depth(own, others, 0.01).sigma.numpy()
+        assert inverse.min() * z.min() ** 2 <= sigma.min() * 1.0001
+        flat = np.abs(points[:, 2] - 3.0) < 0.02
+        assert flat.mean() > 0.5
+        np.testing.assert_allclose(sigma[flat], 9 * np.median(inverse), rtol=0.3)

@@ -52,3 +52,15 @@ def test_a_file_gives_back_what_was_saved(tmp_path: Path) -> None:
     (tmp_path / "found.npz").write_bytes(b"PK")
     with pytest.raises(MapError, match="damaged"):
         Reconstruction.load(tmp_path / "found.npz")
+
+
+def test_a_depth_is_the_way_along_the_cameras_axis_and_grows_with_the_scale() -> None:
+    found = reconstruction()
+    found.T_world_cam[0, :3, :3] = ((0, 0, -1), (1, 0, 0), (0, -1, 0))  # looks along -x
+    found.T_world_cam[0, :3, 3] = 4, 0, 0
+    np.testing.assert_allclose(found.depths(), [4, 3, 5, 7])
+    larger = found.scaled(3.0)
+    np.testing.assert_allclose(larger.depths(), [12, 9, 15, 21])
+    np.testing.assert_allclose(larger.T_world_cam[0, :3, :3], found.T_world_cam[0, :3, :3])
+    np.testing.assert_allclose(found.points[2], (0, 1, 7))
+    assert np.median(found.normalized().depths()) == pytest.approx(2.0)
