@@ -87,6 +87,15 @@ def _read(
     return arrays
 
 
+def is_whole(path: Path) -> bool:
+    """Whether no byte of the arrays in an .npz file was lost or changed since it was written."""
+    try:
+        with open_regular(path) as stream, zipfile.ZipFile(stream) as archive:
+            return archive.testzip() is None
+    except _ERRORS:
+        return False
+
+
 def _read_array(
     archive: zipfile.ZipFile, info: zipfile.ZipInfo, expected: tuple[str, int | Shape] | None, most_bytes: int
 ) -> NDArray[Any]:

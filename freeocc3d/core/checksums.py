@@ -26,3 +26,16 @@ def hash_file(path: Path) -> str:
 def hash_bytes(data: bytes) -> str:
     """The checksum of bytes, as ``hash_file`` gives it."""
     return xxhash.xxh3_128_hexdigest(data)
+
+
+def seal(text: str) -> str:
+    """The text below a line with its checksum."""
+    return f"{hash_bytes(text.encode())}\n{text}"
+
+
+def unseal(data: bytes) -> bytes:
+    """The text of ``seal``, encoded. Raises ValueError if a byte was lost or changed."""
+    checksum, _, text = data.partition(b"\n")
+    if checksum != hash_bytes(text).encode():
+        raise ValueError("its checksum is another")
+    return text

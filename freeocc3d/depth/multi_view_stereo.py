@@ -91,7 +91,7 @@ class StereoDepth:
                 "places. Move the camera sideways; do not only turn it."
             )
         self._compute("measured", able, functools.partial(self._measure, chosen=chosen, apart=apart), progress)
-        if not self._surface_path.exists():
+        if not (self._surface_path.exists() and self._layout_path.exists()):
             points = self._points(able, chosen, progress)
             if len(points.points) < _LEAST_POINTS:
                 raise TrackingError(
@@ -208,6 +208,10 @@ class StereoDepth:
     def _surface_path(self) -> Path:
         return self.folder / "surface.npz"
 
+    @property
+    def _layout_path(self) -> Path:
+        return self.folder / "layout.npz"
+
     def _surface(self) -> WatertightSurface:
         stored = read_arrays(self._surface_path, _SURFACE)
         vertices, triangles = stored["vertices"], stored["triangles"]
@@ -223,15 +227,15 @@ class StereoDepth:
         return WatertightSurface(vertices, stored["sigma_m"], triangles, float(stored["cell_m"][0]))
 
     def _layout(self) -> Layout:
-        path = self.folder / "layout.npz"
+        path = self._layout_path
         try:
             return Layout.from_arrays(read_arrays(path, Layout.EXPECTED))
         except ValueError as error:
             raise MapError(f"{path} is damaged: it holds {error}.") from error
 
     def _save(self, surface: WatertightSurface, planes: Layout) -> None:
-        """Save both files, the surface last: if it exists, both exist."""
-        write_arrays(self.folder / "layout.npz", planes.to_arrays())
+        """Save both files."""
+        write_arrays(self._layout_path, planes.to_arrays())
         arrays = {name: getattr(surface, name) for name in ("vertices", "sigma_m", "triangles")}
         write_arrays(self._surface_path, {**arrays, "cell_m": np.array([surface.cell_m])})
 

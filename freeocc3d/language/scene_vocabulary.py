@@ -21,7 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.atomic_files import replace_text
+from ..core.checksums import seal, unseal
 from ..core.errors import ConfigError
+from ..core.regular_files import TEXT_BYTES, read_bytes
 from ..core.types import Frame
 from ..core.warnings import Notice
 from ..settings.stages import VocabularyOptions as Options
@@ -103,12 +105,12 @@ class Namer:
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:16]
 
     def _keep(self, path: Path, answers: dict[int, list[str]]) -> None:
-        replace_text(path, json.dumps({"of": self._marks(), "answers": answers}))
+        replace_text(path, seal(json.dumps({"of": self._marks(), "answers": answers})))
 
     def _restored(self, path: Path) -> dict[int, list[str]]:
         """Answers of an interrupted run to the same questions; empty if there is no readable file."""
         try:
-            kept = json.loads(path.read_text(encoding="utf-8"))
+            kept = json.loads(unseal(read_bytes(path, TEXT_BYTES)))
             if kept["of"] != self._marks():
                 return {}
             return {int(frame): [str(name) for name in names] for frame, names in kept["answers"].items()}

@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import read_arrays, write_arrays
+from ..core.arrays import is_whole, read_arrays, write_arrays
 from ..core.atomic_files import exchange, is_temporary, replace_text, sync
-from ..core.checksums import hash_bytes, hash_file
+from ..core.checksums import hash_file, seal, unseal
 from ..core.errors import MapError
 from ..core.progress import Progress
 from ..core.regular_files import read_bytes
@@ -199,7 +199,8 @@ class WorkFolder:
     def restore_tracking(self) -> dict[str, NDArray[Any]] | None:
         """The state of the last checkpoint; None if there is no valid one."""
         for name in self._tracking_files:
-            state = read_arrays(self.folder / name, {})
+            with np.load(self.folder / name, allow_pickle=False) as arrays:
+                state = dict(arrays)
             log = json.loads(str(state.pop("log")))
             self.broken = {int(index): text for index, text in log["broken"].items()}
             damage = [notice for notice in self.warnings if notice.code == "checkpoint-damaged"]
@@ -252,11 +253,15 @@ class WorkFolder:
 
     def begin_offline(self) -> Path:
         """The folder for what a tracker computes of the whole scan before its first frame. From now on the run can be
-        resumed; the content of the folder says how far it is."""
-        (self.folder / _OFFLINE).mkdir(exist_ok=True)
+        resumed; the content of the folder says how far it is. Damaged files are removed from it."""
+        folder = self.folder / _OFFLINE
+        folder.mkdir(exist_ok=True)
+        for path in folder.rglob("*.npz"):
+            if not is_whole(path):
+                path.unlink()
         if "tracking" not in self._marks:
             self._mark("tracking")
-        return self.folder / _OFFLINE
+        return folder
 
     def mark_complete(self) -> None:
         """Record that the map is whole: from now on a resumed run only gives it its name. Raises OSError."""
@@ -330,16 +335,12 @@ class WorkFolder:
         kept = {name: mark for name, mark in self._marks.items() if order.index(name) < order.index(stage)}
         self._marks = {**kept, stage: _Mark(self._fingerprints[stage], files)}
         sync(self.folder)
-        stages = json.dumps(msgspec.to_builtins(self._marks))
-        replace_text(self.folder / _MARKS, f"{hash_bytes(stages.encode())}\n{stages}\n")
+        replace_text(self.folder / _MARKS, seal(json.dumps(msgspec.to_builtins(self._marks))))
 
 
 def _read_marks(path: Path) -> dict[Stage, _Mark]:
     """The saved stages. Raises OSError, ValueError."""
-    checksum, _, stages = read_bytes(path, _LARGEST_MARKS).partition(b"\n")
-    if hash_bytes(stages.rstrip(b"\n")).encode() != checksum:
-        raise ValueError("its checksum is another")
-    return msgspec.json.decode(stages, type=dict[Stage, _Mark])
+    return msgspec.json.decode(unseal(read_bytes(path, _LARGEST_MARKS)), type=dict[Stage, _Mark])
 
 
 def _refuse_output(output: Path, overwrite: bool) -> None:

@@ -5,6 +5,8 @@ Frame n of the capture is image n + 1, with the name ``image_name(n)``. COLMAP's
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -30,10 +32,13 @@ def image_name(frame: int) -> str:
 
 
 class SfmDatabase:
-    """An open database, closed at the end of ``with``. It keeps the content of an interrupted run."""
+    """An open database, closed at the end of ``with``. It keeps the content of an interrupted run, unless its file was
+    damaged."""
 
     def __init__(self, path: Path):
         self.path = path
+        if not _is_whole(path):
+            path.unlink(missing_ok=True)
         self._database = pycolmap.Database.open(path)
 
     def __enter__(self) -> SfmDatabase:
@@ -127,3 +132,12 @@ class SfmDatabase:
         """Width and height of the images."""
         camera = self._database.read_camera(CAMERA)
         return camera.width, camera.height
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether SQLite can read the whole file."""
+    try:
+        with contextlib.closing(sqlite3.connect(path)) as database:
+            return database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    except sqlite3.Error:
+        return False

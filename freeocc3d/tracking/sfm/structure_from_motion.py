@@ -7,6 +7,7 @@ stage saves its result in a folder and does not run again.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import json
@@ -21,8 +22,10 @@ from numpy.typing import NDArray
 
 from ...capture.base import Capture
 from ...core.atomic_files import replace_text
-from ...core.errors import FrameError
+from ...core.checksums import seal, unseal
+from ...core.errors import FrameError, MapError
 from ...core.progress import Progress
+from ...core.regular_files import TEXT_BYTES, read_bytes
 from ...core.threads import count_threads
 from ...core.types import Intrinsics
 from ...core.warnings import Notice
@@ -63,7 +66,8 @@ def reconstruct_poses(
     ModelError.
     """
     if (folder / _RESULT).is_file():
-        return Reconstruction.load(folder / _RESULT)
+        with contextlib.suppress(MapError):  # damaged: made again
+            return Reconstruction.load(folder / _RESULT)
     what = str(capture.path)
     diagnosis.check_count(len(frames), what)
     chosen = _chosen(capture, frames, folder / _CHOSEN, recipe.frames, progress)
@@ -116,10 +120,10 @@ def _apart(models: Sequence[pycolmap.Reconstruction], has_pose: NDArray[np.bool_
 
 def _chosen(capture: Capture, frames: Sequence[int], path: Path, budget: int, progress: Progress) -> list[int]:
     """The frames to reconstruct; the choice is saved at ``path``."""
-    if path.is_file():
-        return list(json.loads(path.read_text(encoding="utf-8")))
+    with contextlib.suppress(OSError, ValueError):  # there is none, or it is damaged
+        return list(json.loads(unseal(read_bytes(path, TEXT_BYTES))))
     found = frame_selection.choose_frames(capture, frames, budget, progress)
-    replace_text(path, json.dumps(found))
+    replace_text(path, seal(json.dumps(found)))
     return found
 
 
