@@ -58,7 +58,7 @@ def test_points_of_the_tracker_are_taken_and_frames_get_depth(tmp_path: Path, mo
     assert StereoStub.taken is POINTS
     frame = source.complete(wall_frame(1.0))
     assert (frame.depth_m == 2.0).all()
-    assert (frame.depth_sigma_m > 0).all()
+    assert (frame.depth_sigma_m == np.float32(0.0005)).all(), "half a millimeter at the surest"
 
 
 def test_a_tracker_without_poses_ahead_is_refused(tmp_path: Path) -> None:

@@ -75,3 +75,13 @@ def test_medians_are_those_of_a_plain_implementation() -> None:
     torch.testing.assert_close(filter_median(image), filter_median_reference(image))
     padded = np.pad(image.numpy(), 2, mode="edge")
     assert float(filter_median(image)[4, 0]) == np.median(padded[4:9, 0:5])
+
+
+def test_nothing_is_measured_beyond_the_range() -> None:
+    view, others, depth = _views([SLANTED])
+    near, far = np.percentile(depth, (30, 70))
+    found = measure_depth(view, others, others, near, far)
+    known = found.inverse > 0
+    assert ((1 / found.inverse[known] > near) & (1 / found.inverse[known] < far)).all()
+    within = (depth > near) & (depth < far)
+    assert (known & within).sum() > 0.5 * within.sum()
