@@ -14,8 +14,10 @@ from freeocc3d.capture.base import Capture, Options
 from freeocc3d.core.errors import ConfigError, FrameError, MapError, TrackingError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.transforms import invert, project, transform
-from freeocc3d.core.types import Frame
+from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.depth import multi_view_stereo
+from freeocc3d.depth.cross_view_check import DepthImage
+from freeocc3d.depth.photo_consistency import StereoView
 from freeocc3d.depth.sparse_points import triangulate
 from freeocc3d.depth.stereo_source import StereoSource
 from freeocc3d.tracking.trackers import known
@@ -206,3 +208,37 @@ def test_a_camera_that_only_turns_measures_nothing(tmp_path: Path) -> None:
 def test_options_out_of_range(given) -> None:
     with pytest.raises(ConfigError):
         multi_view_stereo.Options(**given)
+
+
+@pytest.mark.parametrize(
+    ("size", "given", "made"),
+    [
+        (480, (640, 480), (480, 360)),
+        (480, (480, 640), (360, 480)),
+        (480, (321, 201), (320, 200)),
+        (33, (66, 44), (32, 22)),
+    ],
+)
+def test_images_are_shrunk_to_even_sides_and_never_enlarged(size: int, given, made) -> None:
+    width, height = given
+    view = StereoView(np.zeros((height, width, 3), np.uint8), Intrinsics(width, height, 1.0, 1.0, 0.0, 0.0), np.eye(4))
+    small = multi_view_stereo._shrunk(view, size)
+    assert (small.intrinsics.width, small.intrinsics.height) == small.color.shape[::-1] == made
+
+
+def test_depth_is_interpolated_on_a_surface_and_never_across_its_edge() -> None:
+    inverse = np.full((4, 8), 0.5, np.float32)
+    inverse[:, 2:] = 0.505  # a percent: one surface
+    inverse[:, 4:] = 0.57  # twelve percent: another
+    inverse[:, 6:] = 0
+    sigma = np.tile(np.float32([1, 2, 3, 4, 5, 6, 7, 8]) * 0.001, (4, 1))
+    image = DepthImage(inverse, sigma, Intrinsics(8, 4, 1.0, 1.0, 0.0, 0.0), np.eye(4))
+    between, spread = multi_view_stereo._enlarged(image, 16, 8)
+    assert between.shape == spread.shape == (8, 16)
+    np.testing.assert_allclose(
+        between[3], [0.5] * 3 + [0.50125, 0.50375] + [0.505] * 3 + [0.57] * 4 + [0] * 4, atol=1e-6
+    )
+    np.testing.assert_allclose(spread[3], np.repeat(sigma[0], 2))
+    depth, deviation = multi_view_stereo._meters(between, spread)
+    np.testing.assert_allclose(depth[3, [0, 8, 15]], (2.0, 1 / 0.57, 0.0), rtol=1e-6)
+    np.testing.assert_allclose(deviation[3, [0, 8, 15]], (0.004, 0.005 / 0.57**2, 0.0), rtol=1e-6)

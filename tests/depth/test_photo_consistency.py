@@ -1,11 +1,20 @@
 """Matching scores against a plain per-pixel reference."""
 
 import numpy as np
+import pytest
 import torch
 from textured import CAMERA, Rectangle, looking, render
 
 from freeocc3d.core.transforms import back_project, invert, project, transform
-from freeocc3d.depth.photo_consistency import NOISE, Matcher, average_best_half, average_box, average_box_reference
+from freeocc3d.core.types import Intrinsics
+from freeocc3d.depth.photo_consistency import (
+    NOISE,
+    Matcher,
+    StereoView,
+    average_best_half,
+    average_box,
+    average_box_reference,
+)
 
 WALL = [Rectangle((-3, -3, 2.0), (6, 0, 0.5), (0, 6, 0))]
 RADIUS = 2
@@ -85,3 +94,13 @@ def test_means_are_those_that_pooling_gives() -> None:
     images = torch.from_numpy(np.random.default_rng(0).random((3, 17, 23), np.float32)) - 0.5
     for radius in (1, 2, 3):
         torch.testing.assert_close(average_box(images, radius), average_box_reference(images, radius))
+
+
+def test_a_steps_pixel_is_that_of_the_middle_baseline() -> None:
+    camera, image = Intrinsics(8, 6, 5.0, 5.0, 3.5, 2.5), np.zeros((6, 8), np.float32)
+    others = []
+    for x in (0.1, 0.5, 2.0):
+        T = np.eye(4)
+        T[1, 3] = x
+        others.append(StereoView(image, camera, T))
+    assert Matcher(StereoView(image, camera, np.eye(4)), others, 1).pixel == pytest.approx(1 / (5.0 * 0.5))
