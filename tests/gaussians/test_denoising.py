@@ -95,3 +95,14 @@ def test_nothing_to_look_at_changes_nothing() -> None:
     found = denoising.denoise(points, points, iter(()), 0.05)
     np.testing.assert_array_equal(found.points, points)
     assert found.keyframe[0] == -1
+
+
+@pytest.mark.parametrize("z", [0.002, 0.02, 2.0])
+def test_a_pixel_without_depth_says_nothing_however_near_the_point_is(z: float) -> None:
+    frame = wall_frame(2.0)
+    frame.depth_m[:] = 0
+    points = np.array([(0.0, 0.0, z)])
+    found = denoising.denoise(points, points, posed([frame], [np.eye(4)]), 0.15)
+    assert found.weights.tolist() == [0.0]
+    assert found.keyframe.tolist() == [-1]
+    np.testing.assert_array_equal(found.points, points)

@@ -157,3 +157,36 @@ def test_isotropic_gaussians_are_spheres_of_their_neighbors_distance() -> None:
     inner = np.abs(g.means[:, :2]).max(axis=1) < 0.5
     assert np.median(g.scales[inner]) == pytest.approx(0.04, rel=0.2)
     assert len(anchors.make_isotropic(random_gaussians(1, 0))) == 1
+
+
+@pytest.mark.parametrize("means", ["anchored", "free"])
+def test_shapes_and_opacities_stay_within_their_bounds(means: str) -> None:
+    """Free scales change by a factor of four at most; anchored ones by two, before their precision is restored."""
+    cloud = random_gaussians(40, seed=1)
+    made = {"anchored": fitting._Anchored, "free": fitting._Free}[means](cloud, fitting.Options(), torch.device("cpu"))
+    rng = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for name, tensor in made.optimized.items():
+            if name != "quats":
+                tensor.copy_(20 * torch.randn(tensor.shape, generator=rng))
+        if means == "free":
+            made.optimized["quats"].mul_(3.0)
+    given = {name: tensor.clone() for name, tensor in made.optimized.items()}
+    made.clamp()
+    now = {name: tensor.detach() for name, tensor in made.optimized.items()}
+    torch.testing.assert_close(now["logits"], given["logits"].clip(-6, 6))
+    if means == "free":
+        logs = torch.log(torch.from_numpy(cloud.scales))
+        wanted = torch.clip(given["shape"], logs - np.log(4), logs + np.log(4))
+        torch.testing.assert_close(now["shape"], wanted)
+        assert (now["shape"] != given["shape"]).float().mean() > 0.8
+        torch.testing.assert_close(now["quats"].norm(dim=1), torch.ones(40))
+        torch.testing.assert_close(now["means"], given["means"])
+    else:
+        torch.testing.assert_close(now["outline"], given["outline"].clip(-np.log(2), np.log(2)))
+        torch.testing.assert_close(now["turn"], given["turn"])
+        precision = (1 / made.shapes()[1].detach()[:, :2] ** 2).mean(dim=1)
+        before = torch.from_numpy(1 / cloud.scales[:, :2] ** 2)
+        change = torch.exp(-2 * now["outline"])
+        restored = (before * change / change.mean(dim=1, keepdim=True)).mean(dim=1)
+        torch.testing.assert_close(precision, restored, rtol=1e-4, atol=1e-4)
