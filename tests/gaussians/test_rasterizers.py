@@ -159,3 +159,11 @@ def test_gsplat_and_the_reference_on_cuda_give_the_same_images() -> None:
     out = stacked(gsplat.load(gsplat.Options()).render(base.Splats(*on_gpu), T.cuda(), CAMERA))
     # It bounds splats by whole pixels, so that a few at the very edge of alpha are left out.
     assert float((out - expected).abs().mean()) < 1e-3
+
+
+def test_slopes_are_limited_to_fifteen_percent_beyond_each_edge_of_the_image() -> None:
+    left, right, top, bottom = base.compute_slope_limits(CAMERA)
+    u = np.array((left, right)) * CAMERA.fx + CAMERA.cx
+    v = np.array((top, bottom)) * CAMERA.fy + CAMERA.cy
+    np.testing.assert_allclose(u, (-0.5 - 0.15 * 45, 44.5 + 0.15 * 45))
+    np.testing.assert_allclose(v, (-0.5 - 0.15 * 37, 36.5 + 0.15 * 37))
