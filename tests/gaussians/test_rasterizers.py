@@ -1,5 +1,8 @@
 """Rasterizers: the oracle against finite differences and analytic cases, the compiled one against the oracle."""
 
+import sys
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -167,3 +170,23 @@ def test_slopes_are_limited_to_fifteen_percent_beyond_each_edge_of_the_image() -
     v = np.array((top, bottom)) * CAMERA.fy + CAMERA.cy
     np.testing.assert_allclose(u, (-0.5 - 0.15 * 45, 44.5 + 0.15 * 45))
     np.testing.assert_allclose(v, (-0.5 - 0.15 * 37, 36.5 + 0.15 * 37))
+
+
+def test_gsplat_is_asked_for_its_pixel_centers_and_its_answer_is_taken_apart(monkeypatch) -> None:
+    asked = {}
+
+    def rasterization(**given):
+        asked.update(given)
+        out = torch.arange(37 * 45 * 4, dtype=torch.float32).reshape(1, 37, 45, 4)
+        return out, torch.full((1, 37, 45, 1), 0.5), {}
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    arrays, T = scene(3)
+    found = gsplat.GsplatRasterizer("cpu").render(base.Splats(*arrays), T, CAMERA)
+    expected = torch.arange(37 * 45 * 4, dtype=torch.float32).reshape(37, 45, 4)
+    torch.testing.assert_close(found.image, expected[..., :3])
+    torch.testing.assert_close(found.depth, expected[..., 3])
+    torch.testing.assert_close(found.alpha, torch.full((37, 45), 0.5))
+    torch.testing.assert_close(asked["Ks"], torch.tensor([[(40.0, 0.0, 22.2), (0.0, 38.0, 19.4), (0.0, 0.0, 1.0)]]))
+    torch.testing.assert_close(asked["viewmats"], T[None])
+    assert (asked["width"], asked["height"], asked["near_plane"], asked["eps2d"]) == (45, 37, 0.01, 0.3)
