@@ -58,7 +58,10 @@ def open_regular(path: Path, limit: int | None = None) -> Iterator[BinaryIO]:
 def read_bytes(path: Path, limit: int) -> bytes:
     """The content of a regular file of at most ``limit`` bytes. Raises OSError, as ``check_regular`` does."""
     with open_regular(path, limit) as stream:
-        data = stream.read(limit + 1)
+        size = os.fstat(stream.fileno()).st_size
+        data = stream.read(size + 1)  # not limit + 1: the stream takes memory for all that it is asked for
+        if len(data) > size:
+            data += stream.read(limit + 1 - len(data))
     if len(data) > limit:  # it grew meanwhile, or it is one of the files whose size is not known before
         raise _too_large(path, limit)
     return data

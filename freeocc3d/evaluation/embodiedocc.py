@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import difflib
 import glob
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -22,6 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError
+from ..core.regular_files import read_text
+from ..core.typed_documents import parse_json
 from ..core.types import UNKNOWN
 from .restricted_unpickler import load_pickle, shorten
 from .scored_classes import EMBODIEDOCC
@@ -103,11 +104,11 @@ def read_split(path: Path) -> list[str]:
     without a scene, no entries.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-        entries = json.loads(text) if path.suffix == ".json" else [line.split("#")[0] for line in text.splitlines()]
+        text = read_text(path)
+        entries = parse_json(text) if path.suffix == ".json" else [line.split("#")[0] for line in text.splitlines()]
     except OSError as error:
         raise FreeOccError(f"Cannot read the split {path}: {(error.strerror or str(error)).lower()}.") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise FreeOccError(f"The split {path} is damaged: it is not UTF-8 text or not valid JSON.") from error
     if not isinstance(entries, list) or not all(isinstance(entry, str) for entry in entries):
         raise FreeOccError(f"The split {path} must be a list of scene names.")

@@ -16,6 +16,12 @@ from ..core.types import UNKNOWN
 from .embodiedocc import load_global_package
 from .true_occupancy import GroundTruth
 
+_NAMES = (
+    "labels", "classes", "frames_mask", "origin", "voxel_size", "occupancy", "T_world_map", "means", "scales",
+    "quats_wxyz", "opacities", "semantics",
+)  # fmt: skip
+_MOST_BYTES, _FARTHEST = 3 << 29, 1e6
+
 
 def load_ground_truth(path: str | Path, classes: tuple[str, ...] | None = None) -> GroundTruth:
     """Reads ``ground_truth.npz`` or a data set's ``global_occ_package/<scene>.pkl``. It reads arrays only and runs no
@@ -63,13 +69,14 @@ def save_ground_truth(truth: GroundTruth, path: Path, overwrite: bool = False) -
 
 
 def read_grid_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Returns all arrays of an .npz file by name, after a check of their sizes. Raises FreeOccError."""
+    """Returns the arrays of an .npz file that hold a grid or Gaussians, by name, after a check of their sizes. Raises
+    FreeOccError."""
     if not path.is_file():
         raise FreeOccError(f"Cannot read {path}: there is no such file.")
     if not zipfile.is_zipfile(path):
         raise FreeOccError(f"{path} is damaged or not an .npz file of named arrays.")
     try:
-        return read_arrays(path, {})
+        return read_arrays(path, {}, _NAMES, _MOST_BYTES)
     except MapError as error:
         raise FreeOccError(str(error)) from error
 
@@ -78,7 +85,7 @@ def read_lattice(arrays: dict[str, NDArray[Any]], path: Path) -> tuple[NDArray[n
     """Returns origin (3,) and voxel size of a grid, meters. Raises FreeOccError."""
     origin = require_array(arrays, "origin", path)
     size = require_array(arrays, "voxel_size", path)
-    if origin.dtype.kind != "f" or origin.shape != (3,) or not np.isfinite(origin).all():
+    if origin.dtype.kind != "f" or origin.shape != (3,) or not (np.abs(origin) <= _FARTHEST).all():
         raise FreeOccError(f"'origin' of {path} must be three finite numbers in meters.")
     if size.dtype.kind != "f" or size.shape != () or not 1e-3 <= size <= 10:
         raise FreeOccError(f"'voxel_size' of {path} must be one number of meters, from 0.001 to 10.")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..capture import associate
 from ..core.errors import FreeOccError
+from ..core.transforms import is_rigid
 from ..core.types import BLOCK, OCCUPIED, UNKNOWN, Gaussians, PosedFrame
 from ..core.voxel_keys import unpack_voxels
 from ..gaussians import anchors
@@ -29,6 +30,8 @@ from .confusion import Prediction
 from .ground_truth import read_grid_arrays, read_lattice, require_array
 from .scored_classes import ClassMap
 from .true_occupancy import GroundTruth
+
+_MOST_CLASSES = 1 << 16
 
 _SAME_SIZE, _SAME_LATTICE = 1e-4, 1e-3
 
@@ -158,7 +161,10 @@ def predict_from_grid(
     ):
         raise FreeOccError(f"{path} must hold 'occupancy' or 'labels', whole numbers (X, Y, Z).")
     points = alignment.to_estimate(truth.centers())
-    T = np.asarray(arrays.get("T_world_map", np.eye(4)), np.float64)
+    T = arrays.get("T_world_map", np.eye(4))
+    if T.dtype.kind != "f" or not is_rigid(T.astype(np.float64)):
+        raise FreeOccError(f"'T_world_map' of {path} is not a rigid transform.")
+    T = T.astype(np.float64)
     inside_grid = ((points - T[:3, 3]) @ T[:3, :3] - origin) / size
     index = np.floor(inside_grid).astype(np.int64)
     inside = ((index >= 0) & (index < grid.shape)).all(axis=-1)
@@ -174,10 +180,14 @@ def predict_from_grid(
         )
     if labels is None or "classes" not in arrays:
         return Prediction(occupied), note
-    names = [str(name).lower() for name in arrays["classes"].tolist()]
+    if arrays["classes"].dtype.kind != "U" or arrays["classes"].ndim != 1:
+        raise FreeOccError(f"'classes' of {path} must be a list of names, got {arrays['classes'].dtype}.")
+    if labels.dtype.kind not in "ui" or labels.min(initial=0) < 0 or labels.max(initial=0) >= _MOST_CLASSES:
+        raise FreeOccError(f"'labels' of {path} must be whole numbers from 0 to {_MOST_CLASSES - 1}.")
+    names = [str(name).lower() for name in arrays["classes"].tolist()[:_MOST_CLASSES]]
     # Class names begin at label 1 in an export, at label 0 in a ground truth.
     names = names[1:] if "occupancy" not in arrays else names
-    table = np.zeros(max(256, int(labels.max(initial=0)) + 1), np.uint8)
+    table = np.zeros(_MOST_CLASSES + 1, np.uint8)
     table[1 : len(names) + 1] = [classes.labels.get(name, 0) for name in names]
     if not table.any():
         return Prediction(occupied), note
@@ -251,15 +261,25 @@ def _read_frame(path: Path, classes: ClassMap) -> tuple[Gaussians, NDArray[np.fl
         if values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
             raise FreeOccError(f"'{name}' of {path} must be finite numbers of shape {shape}, got {values.shape}.")
     fields = {name: arrays[name].astype(np.float32) for name in shapes}
+    opacities, lengths = fields["opacities"], np.linalg.norm(fields["quats_wxyz"].astype(np.float64), axis=1)
+    sound = (fields["scales"] > 0).all() and (lengths > 0).all() and ((opacities >= 0) & (opacities <= 1)).all()
+    if not sound or not np.isfinite(fields["means"]).all() or not np.isfinite(fields["scales"]).all():
+        raise FreeOccError(
+            f"{path} holds Gaussians that cannot be: scales must be positive, opacities 0 to 1, rotations not zero."
+        )
     gaussians = Gaussians(
         **fields,
         colors=np.full((n, 3), 128, np.uint8),
         anchor_keyframe=np.full(n, -1, np.int32),
         anchor_cam=fields["means"],
     )
-    if "labels" in arrays:
-        return gaussians, encode_one_hot(arrays["labels"].astype(np.int64), classes, path)
+    if (labels := arrays.get("labels")) is not None:
+        if labels.dtype.kind not in "ui" or labels.shape != (n,):
+            raise FreeOccError(f"'labels' of {path} must be {n} whole numbers, got {labels.dtype} {labels.shape}.")
+        return gaussians, encode_one_hot(labels.astype(np.int64), classes, path)
     semantics = arrays.get("semantics")
+    if semantics is not None and (semantics.dtype.kind != "f" or not np.isfinite(semantics).all()):
+        raise FreeOccError(f"'semantics' of {path} must be finite numbers, got {semantics.dtype}.")
     if semantics is not None and semantics.shape != (n, len(classes.classes)):
         raise FreeOccError(f"'semantics' of {path} must be {(n, len(classes.classes))}, got {semantics.shape}.")
     return gaussians, None if semantics is None else semantics.astype(np.float32)

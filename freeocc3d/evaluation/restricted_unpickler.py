@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError
+from ..core.regular_files import check_regular, read_bytes
 
 _LARGEST_FILE = 1 << 30
 """Largest file, bytes. EmbodiedOcc's largest grid, 200 x 220 x 90 voxels with float64 centers and int64 labels, takes
@@ -170,9 +171,9 @@ def load_pickle(path: Path) -> object:
     Raises FreeOccError: no such file, too large, damaged, or it asks for anything else.
     """
     try:
-        if path.stat().st_size > _LARGEST_FILE:
+        if check_regular(path).st_size > _LARGEST_FILE:
             raise FreeOccError(f"{path} is larger than 1 GiB, so it is not the ground truth of a scene.")
-        data = path.read_bytes()
+        data = read_bytes(path, _LARGEST_FILE)
     except OSError as error:
         raise FreeOccError(f"Cannot read {path}: {(error.strerror or str(error)).lower()}.") from error
     try:

@@ -19,14 +19,15 @@ from ..core.types import Gaussians
 
 _SH_C0 = 0.5 / math.sqrt(math.pi)
 _LEAST_OPACITY = 1e-6  # its logit, and the logit of 1 minus it, are finite
+_MOST_LABELS = 1 << 31
 _NEEDED = ("x", "y", "z", "opacity", "scale_0", "rot_0", "rot_1", "rot_2", "rot_3")
 
 
 def read_standard_ply(path: Path) -> tuple[Gaussians, NDArray[np.int64] | None]:
     """Reads the Gaussians of a 3DGS PLY in its own world, and (N,) the values of its property ``label``, if it has one.
 
-    Leaves out Gaussians with a value that is not finite. The Gaussians are anchored to no keyframe. Raises FreeOccError
-    if the file does not exist, is damaged, or lacks a property.
+    Leaves out Gaussians with a value that is not finite, or without any extent. The Gaussians are anchored to no
+    keyframe. Raises FreeOccError if the file does not exist, is damaged, or lacks a property.
     """
     rows = _rows(path)
     names = rows.dtype.names or ()
@@ -47,10 +48,17 @@ def read_standard_ply(path: Path) -> tuple[Gaussians, NDArray[np.int64] | None]:
             anchor_keyframe=np.full(len(rows), -1, np.int32),
             anchor_cam=means.astype(np.float32),
         )
-    finite = np.isfinite(gaussians.opacities)
+    finite = np.isfinite(gaussians.opacities) & (gaussians.scales > 0).all(axis=1)
     for values in (gaussians.means, gaussians.scales, gaussians.quats_wxyz):
         finite &= np.isfinite(values).all(axis=1)
-    return gaussians[finite], rows["label"][finite].astype(np.int64) if "label" in names else None
+    return gaussians[finite], _labels(rows["label"][finite]) if "label" in names else None
+
+
+def _labels(values: NDArray[np.generic]) -> NDArray[np.int64]:
+    """Labels as whole numbers; -1, which is no label, for values that are none."""
+    if values.dtype.kind != "f":
+        return values.astype(np.int64)
+    return np.where(np.abs(values) < _MOST_LABELS, np.nan_to_num(values), -1).astype(np.int64)
 
 
 def write_standard_ply(gaussians: Gaussians, path: Path) -> None:

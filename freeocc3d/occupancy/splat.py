@@ -33,10 +33,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.types import Gaussians
+from ..core.errors import FreeOccError
+from ..core.types import BLOCK, Gaussians
+from ..core.voxel_keys import KEY_LIMIT
 from ..settings.stages import OccupancyOptions as Options
 from . import splat_kernels
 from .gaussian_bins import INTEGRATED, MODES, POISSON, PROBABILISTIC, RELEASED, Bins, prepare_gaussians, sort_by_block
+
+_MOST_TOUCHED = 1 << 28
+"""Pairs of a Gaussian and a block that it touches; a Gaussian of a map touches about ten."""
 
 
 def check(options: Options) -> None:
@@ -57,9 +62,11 @@ def bin_gaussians(
     """Sorts Gaussians into blocks of the lattice whose voxel (0, 0, 0) has its lower corner at ``origin``.
 
     shape: limits the evaluation to the voxels (0, 0, 0) … shape - 1; all by default.
-    least_scale: s_min, meters.
+    least_scale: s_min, meters. Raises FreeOccError if they reach farther than voxels have keys, or touch too many
+    blocks.
     """
     check(options)
+    _refuse_far(gaussians, origin, options, least_scale)
     mode = MODES[options.projection]
     scales, share = widen_scales(gaussians.scales, least_scale, options)
     means, form, log_weight, lo, hi = prepare_gaussians(
@@ -68,12 +75,33 @@ def bin_gaussians(
     )  # fmt: skip
     if shape is not None:
         lo, hi = np.maximum(lo, np.int32(0)), np.minimum(hi, np.array(shape, np.int32) - 1)
+    _refuse_many(lo, hi, options)
     packed, start, gaussian = sort_by_block(lo, hi)
     squared_cutoff = np.float32(np.inf if mode == RELEASED else options.cutoff**2)
     return Bins(
         packed, start, gaussian, means, form, lo, hi, gaussians.opacities, share, log_weight, mode,
         squared_cutoff, options.device,
     )  # fmt: skip
+
+
+def _refuse_far(gaussians: Gaussians, origin: NDArray[np.float64], options: Options, least_scale: float) -> None:
+    if not len(gaussians):
+        return
+    reach = np.abs(gaussians.means - origin).max() + options.cutoff * max(gaussians.scales.max(), least_scale)
+    if not reach / options.voxel_size < KEY_LIMIT - BLOCK:
+        raise FreeOccError(
+            f"Gaussians reach {reach:.3g} m from the origin, too far for voxels of {options.voxel_size:g} m: they are "
+            "damaged, or the voxels too small."
+        )
+
+
+def _refuse_many(lo: NDArray[np.int32], hi: NDArray[np.int32], options: Options) -> None:
+    touched = np.maximum((hi >> 3).astype(np.float64) - (lo >> 3) + 1, 0).prod(axis=1).sum()
+    if touched > _MOST_TOUCHED:
+        raise FreeOccError(
+            f"Gaussians touch {touched:.3g} blocks of voxels of {options.voxel_size:g} m, more than memory holds: "
+            "choose larger voxels."
+        )
 
 
 def widen_scales(

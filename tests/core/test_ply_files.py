@@ -1,5 +1,7 @@
 """PLY files: what is written reads back, and the size of a file is checked against its header."""
 
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -41,9 +43,49 @@ def test_what_is_written_reads_back_and_in_open3d(tmp_path: Path) -> None:
             b"property list uchar int vertex_indices\nend_header\n12345678",
             "damaged",
         ),
+        (b"ply\nformat ascii 1.0\nelement vertex -1\nproperty float x\nend_header\n", "header cannot be read"),
+        (b"ply\nformat ascii 1.0\nelement vertex " + b"9" * 5000 + b"\nend_header\n", "header cannot be read"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float\nend_header\n", "header cannot be read"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x y\nend_header\n", "header cannot be read"),
+        (b"ply\nelement\nend_header\n", "header cannot be read"),
+        (b"ply\n" + b"x" * 100_000 + b"\nend_header\n", "not a PLY"),
     ],
 )
 def test_headers_that_the_file_does_not_bear_out_are_refused(tmp_path: Path, text: bytes, said: str) -> None:
     (tmp_path / "a.ply").write_bytes(text)
     with pytest.raises(FreeOccError, match=said):
         read_ply_header(tmp_path / "a.ply")
+
+
+def test_a_file_that_must_end_with_its_vertices_has_just_their_length(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, vertices(4))
+    whole = path.read_bytes()
+    assert len(read_ply_vertices(path, alone=True)) == 4
+    path.write_bytes(whole + b"x")
+    assert len(read_ply_vertices(path)) == 4
+    with pytest.raises(FreeOccError, match="not as long as its header states"):
+        read_ply_vertices(path, alone=True)
+    for cut in (1, 10, len(whole) // 2):
+        path.write_bytes(whole[:-cut])
+        with pytest.raises(FreeOccError, match=r"damaged|not a PLY"):
+            read_ply_vertices(path)
+
+
+def test_big_endian_vertices_come_in_the_order_of_the_machine(tmp_path: Path) -> None:
+    rows = vertices(3)
+    header = b"ply\nformat binary_big_endian 1.0\nelement vertex 3\n" + b"".join(
+        f"property {kind} {name}\n".encode()
+        for name, kind in zip(rows.dtype.names or (), ("float", "float", "float", "uchar", "int"), strict=True)
+    )
+    (tmp_path / "a.ply").write_bytes(header + b"end_header\n" + rows.astype(rows.dtype.newbyteorder(">")).tobytes())
+    found = read_ply_vertices(tmp_path / "a.ply")
+    assert found.dtype.isnative
+    np.testing.assert_array_equal(found, rows)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to(path.name)])
+def test_what_is_no_regular_file_is_not_opened(tmp_path: Path, make: Callable[[Path], object]) -> None:
+    make(tmp_path / "a.ply")
+    with pytest.raises(FreeOccError, match="Cannot read"):
+        read_ply_vertices(tmp_path / "a.ply")

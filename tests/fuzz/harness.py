@@ -220,7 +220,8 @@ class _Worker:
         return ""
 
     def _told(self) -> str:
-        tail = self.log.read_bytes()[-4000:].decode("utf-8", "replace").strip().splitlines()[-12:]
+        lines = self.log.read_bytes()[-8000:].decode("utf-8", "replace").strip().splitlines()
+        tail = [line[:200] for line in lines if not line.startswith("Extension modules")][-16:]
         return "\n".join([f"exit {self.process.exitcode}", *tail])
 
     def close(self) -> None:

@@ -30,6 +30,7 @@ RAW_JSON = (
     "NaN", "Infinity", "-Infinity", "[" * 20_000, '{"a":' * 5000, "9" * 5000, "1e999", "-", "nul", "'x'", '"\\ud800"',
     "[" * 90 + "]" * 90, "1.0.0", "01", "\x00", "", "{}", "[]", "null", "true", '"x"', "-1", "1e308",
 )  # fmt: skip
+_MOST_PLACES = 20_000
 ENCODINGS = ("utf-16", "utf-32", "utf-8-sig", "cp037")
 
 
@@ -62,6 +63,8 @@ def change_value(rng: random.Random, content: Any) -> tuple[Any, str]:
 
     def walk(node: Any) -> None:
         for key, value in list(node.items() if isinstance(node, dict) else enumerate(node)):
+            if len(places) > _MOST_PLACES:  # an earlier change made a bomb
+                return
             places.append((node, key))
             if isinstance(value, dict | list):
                 walk(value)

@@ -27,7 +27,7 @@ def main() -> int:
     for place, part in enumerate(chosen):
         share = asked.inputs // len(chosen) + (place < asked.inputs % len(chosen))
         numbers = range(share) if asked.only is None else range(asked.only, asked.only + 1)
-        results += harness.run_part(part, numbers, asked.seed, asked.jobs, _tell)
+        results += harness.run_part(part, numbers, asked.seed, asked.jobs, _Told(part, len(numbers)))
         if asked.only is not None:
             print(results[-1].outcome, results[-1].description, results[-1].detail, sep="\n")
     failures = [result for result in results if result.outcome not in harness.SOUND]
@@ -48,9 +48,18 @@ def _arguments() -> argparse.ArgumentParser:
     return parser
 
 
-def _tell(result: harness.Result) -> None:
-    if result.outcome not in harness.SOUND:
-        print(harness.failure(result), flush=True)
+class _Told:
+    """Shows each failure when it is there, and how far a part is."""
+
+    def __init__(self, part: str, inputs: int):
+        self._part, self._inputs, self._done = part, inputs, 0
+
+    def __call__(self, result: harness.Result) -> None:
+        self._done += 1
+        if result.outcome not in harness.SOUND:
+            print(harness.failure(result), flush=True)
+        if self._done % 500 == 0:
+            print(f"{self._part}: {self._done} of {self._inputs}", file=sys.stderr, flush=True)
 
 
 def _document(seed: int, results: list[harness.Result], failures: list[harness.Result]) -> dict[str, object]:

@@ -1,8 +1,14 @@
 """Keyframes on disk: what is saved reads back, also scaled, and damage is reported."""
 
 import json
+import os
+import struct
+import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scenes import wall_frame, with_sigma
@@ -68,3 +74,60 @@ def test_a_resumed_run_writes_only_damaged_images_again_with_the_same_content(ke
     assert {path: path.read_bytes() for path in resumed.paths()} == before
     assert resumed.frames == [0, 7]
     assert resumed.checkpoint() == checkpoint
+
+
+def huge(path: Path) -> None:
+    """A small PNG whose header states ten thousand million pixels."""
+    header = b"IHDR" + struct.pack(">II5B", 100_000, 100_000, 16, 0, 0, 0, 0)
+    data = bytearray(path.read_bytes())
+    data[12:33] = header + struct.pack(">I", zlib.crc32(header))
+    path.write_bytes(data)
+
+
+def encoded(values: np.ndarray, form: str = ".png") -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(cv2.imencode(form, values)[1].tobytes())
+
+
+DEPTHS: dict[str, Callable[[Path], object]] = {
+    "huge": huge,
+    "of another size": encoded(np.zeros((60, 80), np.uint16)),
+    "of 8 bits": encoded(np.zeros((120, 160), np.uint8)),
+    "in color": encoded(np.zeros((120, 160, 3), np.uint16)),
+    "cut off": lambda path: path.write_bytes(path.read_bytes()[:-50]),
+    "empty": lambda path: path.write_bytes(b""),
+    "a text": lambda path: path.write_text("depth"),
+    "missing": Path.unlink,
+}
+
+
+@pytest.mark.parametrize("kind", DEPTHS)
+def test_images_are_refused_before_they_are_decoded(kept: Keyframes, kind: str) -> None:
+    path = kept.folder / "000000.depth.png"
+    assert kept[0].depth_m.shape == (120, 160)
+    DEPTHS[kind](path)
+    with pytest.raises(MapError, match=r"000000\.depth\.png"):
+        Keyframes.load(kept.folder).depth_m(0)
+
+
+def test_a_pipe_among_the_images_does_not_block(kept: Keyframes) -> None:
+    path = kept.folder / "000000.color.jpg"
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(MapError, match="a pipe"):
+        _ = Keyframes.load(kept.folder)[0]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("frame", -1), ("frame", 2**31), ("frame", 0.5), ("frame", None), ("frame", "0"), ("frame", 7),
+        ("timestamp", float("nan")), ("timestamp", 1e300), ("width", 0), ("width", 1e9), ("width", 3.5), ("height", []),
+        ("fx", 0), ("fx", -5.0), ("fx", float("inf")), ("fy", float("nan")), ("cx", 1e300), ("cy", "x"), ("sigma", "x"),
+    ],
+)  # fmt: skip
+def test_an_index_of_what_no_camera_has_is_refused(kept: Keyframes, key: str, value: Any) -> None:
+    entries = json.loads((kept.folder / INDEX).read_text())
+    entries[0][key] = value
+    (kept.folder / INDEX).write_text(json.dumps(entries))
+    with pytest.raises(MapError, match=r"keyframes\.json is damaged: "):
+        Keyframes.load(kept.folder)

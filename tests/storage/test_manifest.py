@@ -84,7 +84,31 @@ def test_a_map_from_before_scales_and_gravity_frames_is_read(tmp_path: Path) -> 
     [
         ("voxel_size_m", "big", "'voxel_size_m' has text instead of a number"),
         ("voxel_size_m", 0, "'voxel_size_m' has a number that is not > 0.0"),
-        ("finest_voxel_m", float("inf"), "not finite"),
+        ("voxel_size_m", float("nan"), "'voxel_size_m'"),
+        ("voxel_size_m", float("inf"), "'voxel_size_m'"),
+        ("voxel_size_m", 1e-300, "'voxel_size_m'"),
+        ("voxel_size_m", 1e300, "'voxel_size_m'"),
+        ("voxel_size_m", 10**400, "'voxel_size_m'|64 bits"),
+        ("voxel_size_m", True, "'voxel_size_m' has true or false"),
+        ("finest_voxel_m", 0.2, "'finest_voxel_m' is not 'voxel_size_m' halved"),
+        ("finest_voxel_m", 0.07, "'finest_voxel_m' is not 'voxel_size_m' halved"),
+        ("finest_voxel_m", 0.1 / 2**13, "'finest_voxel_m' is not 'voxel_size_m' halved"),
+        ("origin", [0.0, 0.0, 1e300], "'origin'"),
+        ("origin", [float("nan"), 0.0, 0.0], "'origin'"),
+        ("up", [0.0, 0.0, 0.0], "'up' is not a unit vector"),
+        ("up", [0.0, 0.0, 1e300], "'up' is not a unit vector"),
+        ("T_gravity_map", [[1.0, 0, 0, 1e300], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]], "'T_gravity_map'"),
+        ("keyframes", [2, 0], "'keyframes' are not frames of the capture in ascending order"),
+        ("keyframes", [0, 0], "'keyframes' are not frames of the capture in ascending order"),
+        ("keyframes", [0, 240], "'keyframes' are not frames of the capture in ascending order"),
+        ("keyframes", [0, 2**40], r"'keyframes\[1\]' has a number that is not <="),
+        ("keyframes", [0, 1, 2, 3], "'counts' holds fewer frames"),
+        ("capture", {"path": "a\0b", "format": "x"}, "a character that no name has"),
+        ("refined", {"map": 3}, "'refined.map' has a whole number instead of text"),
+        ("refined", {"map": "x", "box": [0, 0, 0, 1, 1, float("inf")]}, "'refined.box'"),
+        ("vocabulary", {"model": 3, "keyframes": [], "names": {}}, "'vocabulary.model' has a whole number"),
+        ("encoder", {"name": ["color"], "state": {}}, "'encoder.name' has a list"),
+        ("finest_voxel_m", float("inf"), "'finest_voxel_m'"),
         ("origin", [0.0, 0.0], "'origin' has 2 entries instead of 3"),
         ("up", None, "'up' has nothing instead of a list"),
         ("encoder", {"state": {}}, "'encoder' lacks 'name'"),
@@ -125,3 +149,35 @@ def test_a_key_that_every_map_has_is_missed(tmp_path: Path) -> None:
         (tmp_path / "map.yaml").write_text(yaml.safe_dump({key: v for key, v in content.items() if key != name}))
         with pytest.raises(MapError, match=f"lacks '{name}'"):
             read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("voxel_size_m: 2024-13-45", "'voxel_size_m' has text instead of a number"),
+        ("voxel_size_m: !!int abc", "'abc' is not a whole number"),
+        ("voxel_size_m: !!float x", "'x' is not a float"),
+        ("voxel_size_m: !!timestamp x", "'voxel_size_m' has text instead of a number"),
+        ("voxel_size_m: !!bool x", "'x' is not a bool"),
+        ("voxel_size_m: " + "9" * 5000, "64 bits"),
+        ("voxel_size_m: " + "[" * 3000, "line"),
+        ("voxel_size_m: 0.1\nvoxel_size_m: 0.2", "the key 'voxel_size_m' stands twice"),
+        ("voxel_size_m: &a [*a]", "stands for nothing"),
+        ("? [voxel_size_m]\n: 3", "a key is a list"),
+        ("voxel_size_m: \x00", "map.yaml"),
+    ],
+)
+def test_values_that_yaml_libraries_stumble_over_are_told(tmp_path: Path, line: str, said: str) -> None:
+    write_manifest(tmp_path, tiny_manifest())
+    lines = (tmp_path / "map.yaml").read_text().splitlines()[:-1]
+    text = "\n".join(line if one.startswith("voxel_size_m") else one for one in lines)
+    (tmp_path / "map.yaml").write_text(text)
+    with pytest.raises(MapError, match=rf"map\.yaml is damaged: .*{said}|{said}"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize("data", [b"\xff\xfe\x00", b"\x80abc", "format_version: 2".encode("utf-16")])
+def test_a_manifest_in_another_encoding_is_told(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "map.yaml").write_bytes(data)
+    with pytest.raises(MapError, match=r"map\.yaml"):
+        read_manifest(tmp_path)
