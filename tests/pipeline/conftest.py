@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
+import json
 
+import cv2
 import pytest
 from pipeline_runs import ROOM
 from small_captures import data_folder
@@ -19,13 +20,20 @@ def room(tmp_path_factory) -> Map:
 
 @pytest.fixture(scope="session")
 def glued(tmp_path_factory):
-    """A folder that holds two places: 15 frames of the bedroom, then 8 of the living room."""
+    """A folder that holds two places, at half their size: 15 frames of the bedroom, then 8 of the living room."""
     folder = tmp_path_factory.mktemp("glued") / "scan"
     (folder / "results").mkdir(parents=True)
     house = data_folder() / "house"
-    shutil.copy(house / "bedroom" / "cam_params.json", folder)
+    parameters = json.loads((house / "bedroom" / "cam_params.json").read_text())
+    camera = parameters["camera"]
+    camera.update({name: camera[name] // 2 for name in ("w", "h")}, fx=camera["fx"] / 2, fy=camera["fy"] / 2)
+    camera.update({name: (camera[name] + 0.5) / 2 - 0.5 for name in ("cx", "cy")})
+    (folder / "cam_params.json").write_text(json.dumps(parameters))
     shown = [*((house / "bedroom", i) for i in range(0, 60, 4)), *((house / "living", i) for i in range(0, 32, 4))]
     for n, (source, i) in enumerate(shown):
         for kind in ("frame{:06d}.jpg", "depth{:06d}.png"):
-            shutil.copy(source / "results" / kind.format(i), folder / "results" / kind.format(n))
+            image = cv2.imread(str(source / "results" / kind.format(i)), cv2.IMREAD_UNCHANGED)
+            how = cv2.INTER_AREA if image.ndim == 3 else cv2.INTER_NEAREST
+            small = cv2.resize(image, (camera["w"], camera["h"]), interpolation=how)
+            cv2.imwrite(str(folder / "results" / kind.format(n)), small)
     return folder

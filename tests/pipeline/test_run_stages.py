@@ -18,6 +18,8 @@ from freeocc3d.pipeline.mapper import Mapper
 from freeocc3d.storage import writer
 from freeocc3d.storage.manifest import NameCount
 
+ONE_PASS = {"fitting": {"passes": 1}}
+
 
 class Stopper(Progress):
     """Ctrl-C after some frames of a stage."""
@@ -124,12 +126,12 @@ def test_a_run_with_two_submaps_resumes_to_the_same(tmp_path, glued, monkeypatch
     def full(*arguments) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    whole = freeocc3d.reconstruct(glued, tmp_path / "whole")
+    whole = freeocc3d.reconstruct(glued, tmp_path / "whole", ONE_PASS)
     with monkeypatch.context() as patched:
         patched.setattr(writer, "write_manifest", full)
         with pytest.raises(MapError, match="disk is full"):
-            freeocc3d.reconstruct(glued, tmp_path / "map")
-    resumed = freeocc3d.reconstruct(glued, tmp_path / "map", resume=True)
+            freeocc3d.reconstruct(glued, tmp_path / "map", ONE_PASS)
+    resumed = freeocc3d.reconstruct(glued, tmp_path / "map", ONE_PASS, resume=True)
     assert content(resumed.path) == content(whole.path)
 
 
