@@ -75,6 +75,8 @@ def test_what_is_written_is_the_standard_and_reads_back(tmp_path: Path) -> None:
     assert header[3:] == [f"property float {name}" for name in names.split()]
     values = np.fromfile(tmp_path / "p.ply", "<f4", offset=(tmp_path / "p.ply").stat().st_size - 200 * 17 * 4)
     assert np.isfinite(values).all()
+    logit = np.log(1e-6)  # as close to 0 and to 1 as an opacity is written
+    np.testing.assert_allclose(values.reshape(200, 17)[:2, 9], (logit, -logit), atol=0.1)
     np.testing.assert_allclose(0.5 + 0.28209479177387814 * values.reshape(200, 17)[0, 6:9], (1, 0, 0), atol=1e-6)
     read, _ = read_standard_ply(tmp_path / "p.ply")
     np.testing.assert_array_equal(read.means, written.means)

@@ -91,6 +91,7 @@ def test_each_kind_of_change(source: str, changed: set[str]) -> None:
     [
         '"""Says 1 + 1."""',
         "x: Grid[3]",
+        "X = Annotated[int, Meta(ge=1)]",
         "def f(a: Grid[3]) -> Grid[2]:\n    pass",
         "@njit(cache=2)\ndef f():\n    pass",
         "raise ValueError(1 + 1)",

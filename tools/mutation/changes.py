@@ -162,7 +162,7 @@ def _is_silent(node: ast.AST) -> bool:
     if isinstance(node, ast.Assign) and isinstance(node.value, ast.BinOp):
         return isinstance(node.value.op, ast.BitOr) and ast.unparse(node.targets[0])[:1].isupper()  # a union of types
     if isinstance(node, ast.Subscript):
-        return ast.unparse(node.value) == "Literal"
+        return ast.unparse(node.value) in ("Literal", "Annotated")
     return isinstance(node, ast.Call) and _name(node.func) in _SAYING
 
 
