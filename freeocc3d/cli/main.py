@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import io
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from .. import __version__
-from ..core.errors import FreeOccError
+from ..core.errors import FreeOccError, Interrupted, is_interrupt
 from . import models
 from .console import flag
 from .demo import demo
@@ -23,9 +24,26 @@ from .query import query
 from .reconstruct import reconstruct
 from .refine import refine
 from .scale import scale
+from .stopping import Stopping
 from .view import view
 
+
+class _Commands(TyperGroup):
+    """Takes interrupts out before typer does, which would print "Aborted." and exit with 1."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            if isinstance(error, FreeOccError) or not is_interrupt(error):
+                raise
+            raise Interrupted("Stopped.") from error
+        except KeyboardInterrupt as error:
+            raise Interrupted("Stopped.") from error
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="Turns a captured indoor scan into an occupancy map that answers words. It needs no training and no poses.",
     no_args_is_help=True,
     add_completion=False,
@@ -51,20 +69,23 @@ app.add_typer(models.app, name="models")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command; a known error is one line on stderr and exit code 1, or with --debug its traceback."""
+    """Run the command; a known error is one line on stderr and exit code 1, or with --debug its traceback. After
+    SIGTERM and SIGHUP it is 128 plus the signal's number."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
     # What a terminal cannot show is written as escapes.
     for stream, errors in ((sys.stdin, "replace"), (sys.stdout, "backslashreplace")):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors=errors)
+    stopping = Stopping()
     try:
-        app(args=[argument for argument in arguments if argument != "--debug"], prog_name="freeocc3d")
+        with stopping:
+            app(args=[argument for argument in arguments if argument != "--debug"], prog_name="freeocc3d")
     except FreeOccError as error:
         if debug:
             raise
         print(f"freeocc3d: {' '.join(str(error).split())}", file=sys.stderr)
-        raise SystemExit(1) from None
+        raise SystemExit(stopping.status) from None
 
 
 if __name__ == "__main__":

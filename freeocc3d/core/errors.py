@@ -51,3 +51,8 @@ class ExportError(FreeOccError):
 
 class Interrupted(FreeOccError):
     """The user stopped a run. The work done so far is kept, and the run can be resumed."""
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Whether the error is Ctrl-C or comes of it: a compiled function raises a SystemError with Ctrl-C as its cause."""
+    return isinstance(error, KeyboardInterrupt) or (error is not None and is_interrupt(error.__cause__))

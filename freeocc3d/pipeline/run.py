@@ -10,7 +10,7 @@ from typing import Any
 from .. import __version__
 from ..capture import Capture, check_depth_scale, open_capture, select_frames
 from ..capture.focal_correction import Reregistered
-from ..core.errors import Interrupted, MapError, TrackingError
+from ..core.errors import Interrupted, MapError, TrackingError, is_interrupt
 from ..core.progress import Progress
 from ..language.encoders.base import Encoder
 from ..query.scan_map import Map, load_map
@@ -58,7 +58,7 @@ def reconstruct(
         work.discard()  # it holds nothing useful
         raise
     except (KeyboardInterrupt, SystemError) as error:
-        if not _is_interrupt(error):
+        if not is_interrupt(error):
             raise
         kept = f"The work up to the last checkpoint is in {work.folder}: continue with the same command and --resume."
         raise Interrupted(
@@ -72,11 +72,6 @@ def reconstruct(
         ) from error
     finally:
         work.close()
-
-
-def _is_interrupt(error: BaseException | None) -> bool:
-    """Whether the error is Ctrl-C. A compiled function raises a SystemError with Ctrl-C as its cause."""
-    return isinstance(error, KeyboardInterrupt) or (error is not None and _is_interrupt(error.__cause__))
 
 
 def _run(capture: Capture, settings: Settings, work: WorkFolder, progress: Progress) -> None:
