@@ -30,6 +30,8 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
+from .core.threads import limit_pools
+
 if TYPE_CHECKING:
     from .pipeline.run import reconstruct
     from .query.scan_map import Map, load_map
@@ -38,6 +40,7 @@ __version__ = "0.1.0"
 
 # Numba tries an installed TBB first and warns on stderr if it is too old; the wheels bring OpenMP anyway.
 os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
+limit_pools()
 
 __all__ = ["Map", "__version__", "load_map", "reconstruct"]
 

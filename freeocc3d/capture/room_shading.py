@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from .builtin_room import BOOKS, CHECKER, PAINTING, PATCHES, PLAIN, PLASTER, SIZE, STRIPES, WOOD
 
 _LIGHT = (0.34, -0.24, 0.91)  # unit vector toward the light, the same for all points, as for a distant lamp

@@ -9,9 +9,9 @@ Source: C. V. Nguyen, S. Izadi, D. Lovell, Modeling Kinect Sensor Noise for Impr
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from .compiling import njit
 from .types import Frame
 
 AXIAL_NOISE = (0.0012, 0.0019, 0.4)

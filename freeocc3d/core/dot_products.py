@@ -7,8 +7,9 @@ result where it is compiled, and another one where it comes from the cache withi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from .compiling import njit
 
 
 @njit(cache=True, nogil=True)

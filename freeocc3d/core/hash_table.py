@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from .compiling import njit
 from .voxel_keys import pack_index
 
 packed_key = njit(cache=True, nogil=True)(pack_index)

@@ -1,7 +1,8 @@
-"""Counts the processors that this process may use."""
+"""Counts the processors that this process may use, and makes all libraries keep to them."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections.abc import Iterator
@@ -9,12 +10,35 @@ from pathlib import Path
 
 _MOUNT = Path("/sys/fs/cgroup")
 
+_POOLS = (
+    "OMP_NUM_THREADS",  # torch, Open3D
+    "NUMBA_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+    "VTK_SMP_MAX_THREADS",
+)
+
 
 def count_threads() -> int:
     """Number of processors that this process may use, at least 1: those of its affinity, limited by the CPU quota of
-    its control groups, rounded up. Containers set this quota (``docker run --cpus``)."""
-    allowed = len(os.sched_getaffinity(0))
-    return max(1, min([allowed, *(math.ceil(quota) for quota in _quotas(Path("/proc/self/cgroup"), _MOUNT))]))
+    its control groups, rounded up, and by ``$OMP_NUM_THREADS``. Containers set the quota (``docker run --cpus``)."""
+    quotas = (math.ceil(quota) for quota in _quotas(Path("/proc/self/cgroup"), _MOUNT))
+    return max(1, min([len(os.sched_getaffinity(0)), *quotas, *_wish()]))
+
+
+def limit_pools() -> None:
+    """Tell libraries that are imported later the number of threads, where it is less than the number of processors."""
+    threads = count_threads()
+    if threads < len(os.sched_getaffinity(0)):
+        for name in _POOLS:
+            os.environ.setdefault(name, str(threads))
+
+
+def _wish() -> Iterator[int]:
+    wish = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
+    if wish.isdecimal() and int(wish[:9]) > 0:
+        yield int(wish[:9])
 
 
 def _quotas(membership: Path, mount: Path) -> Iterator[float]:
@@ -30,9 +54,10 @@ def _quotas(membership: Path, mount: Path) -> Iterator[float]:
         root = mount / controllers if controllers else mount
         own = root / path.lstrip("/")
         for group in (own, *(parent for parent in own.parents if parent.is_relative_to(root))):
-            quota = _version_1(group) if controllers else _version_2(group)
-            if quota is not None:
-                yield quota
+            with contextlib.suppress(ValueError, ZeroDivisionError):  # not the file that Linux writes
+                quota = _version_1(group) if controllers else _version_2(group)
+                if quota is not None:
+                    yield quota
 
 
 def _version_1(group: Path) -> float | None:

@@ -6,8 +6,9 @@ Source: R. Tarjan, Efficiency of a Good But Not Linear Set Union Algorithm, J. A
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from .compiling import njit
 
 
 @njit(cache=True)

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from ..core.compiling import njit
 
 _NEAR, _FAR, _FAR_OUTERMOST = 0.97, 1.05, 1.1  # limits of a plane's depth, times the surface's depth
 
@@ -100,7 +101,7 @@ class Layout:
         return _nearest(origin, directions, times, *self._packed)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _nearest(origin, directions, times, normals, offsets, axes, corners, squares, shapes, support, starts, far):  # type: ignore[no-untyped-def]
     found = np.zeros(len(directions))
     for ray in range(len(directions)):

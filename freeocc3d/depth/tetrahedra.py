@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
+
+from ..core.compiling import njit
 
 BEHIND = 3.0
 """Standard deviations behind a point at which space is full."""

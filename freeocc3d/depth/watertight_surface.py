@@ -12,11 +12,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
+from ..core.compiling import njit
 from .scan_points import ScanPoints
 from .tetrahedra import CellVotes, Tetrahedra, collect_votes, tetrahedralize
 

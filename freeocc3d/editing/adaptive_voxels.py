@@ -15,10 +15,11 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..core.compiling import njit
 from ..core.depth_noise import compute_sensor_sigma
 from ..core.errors import MapError
 from ..core.hash_table import build_table, find_row, packed_key

@@ -18,11 +18,12 @@ from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from ..capture import open_capture, read_ahead, select_frames
 from ..capture.base import Capture
+from ..core.compiling import njit
 from ..core.errors import ConfigError, FrameError, FreeOccError
 from ..core.progress import Progress
 from ..core.transforms import back_project, invert, transform

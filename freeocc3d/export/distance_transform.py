@@ -8,8 +8,10 @@ Source: P. Felzenszwalb and D. Huttenlocher, Distance Transforms of Sampled Func
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
+
+from ..core.compiling import njit
 
 _NONE = np.int32(2**31 - 1)
 """Squared distance if no voxel of the other kind exists."""

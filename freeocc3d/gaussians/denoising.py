@@ -20,9 +20,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from ..core.depth_noise import compute_sigma_image, look_up_sigma, take_stated_sigma
 from ..core.transforms import invert
 from ..core.types import PosedFrame

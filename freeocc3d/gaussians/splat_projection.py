@@ -10,9 +10,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from .rasterizers.base import ALPHA_MIN, BLUR, NEAR
 
 PIXEL_U, PIXEL_V, CONIC_A, CONIC_B, CONIC_C, OPACITY, LEAST, RED, Z = 0, 1, 2, 3, 4, 5, 6, 7, 10

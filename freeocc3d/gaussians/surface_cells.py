@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from ..core.depth_noise import compute_sigma_image, look_up_sigma, take_stated_sigma
 from ..core.hash_table import build_table, find_slot, packed_key
 from ..core.transforms import back_project, transform

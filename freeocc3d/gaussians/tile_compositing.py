@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from .rasterizers.base import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .splat_projection import CONIC_A, CONIC_B, CONIC_C, DEALT, GRADIENTS, LEAST, OPACITY, PIXEL_U, PIXEL_V, RED, Z
 

@@ -23,9 +23,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from ..core.dot_products import sum_products
 from ..core.half_floats import widen_halves
 from ..core.union_find import find_root, join_sets

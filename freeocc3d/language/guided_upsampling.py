@@ -14,8 +14,10 @@ import math
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
+
+from ..core.compiling import njit
 
 RADIUS = 2
 """Number of patches to each side that count."""

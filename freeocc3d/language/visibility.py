@@ -16,9 +16,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from ..core.transforms import invert, quats_to_rotations
 from ..core.types import Frame, Gaussians
 from ..settings.stages import LanguageOptions

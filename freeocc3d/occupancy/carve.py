@@ -6,9 +6,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from ..core.transforms import back_project, invert, transform
 from ..core.types import BLOCK, Frame
 from ..core.voxel_keys import unpack_voxels

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from ..core.hash_table import build_table, find_row, packed_key
 from ..core.types import BLOCK
 from ..core.union_find import find_root, join_sets

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from ..core.hash_table import build_table, find_row, packed_key
 from ..core.threads import count_threads
 from .voxel_blocks import find_touched_blocks, unite_keys

@@ -17,9 +17,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from ..core.types import BLOCK
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange, types
+from numba import prange, types
 from numba.extending import overload
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from ..core.half_floats import widen_halves
 from ..core.types import BLOCK
 from .gaussian_mass import integrate_boxes

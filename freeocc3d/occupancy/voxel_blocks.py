@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ..core.compiling import njit
 from ..core.hash_table import packed_key, put_key
 from ..core.types import BLOCK
 

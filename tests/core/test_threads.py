@@ -46,3 +46,33 @@ def test_quotas_of_version_1_are_read(tmp_path: Path) -> None:
 def test_without_control_groups_there_is_no_quota(tmp_path: Path) -> None:
     assert list(threads._quotas(tmp_path / "self", tmp_path)) == []
     assert threads.count_threads() >= 1
+
+
+@pytest.mark.parametrize("text", ["", "max", "1", "a b", "100000 0", "1e9 x"])
+def test_a_file_that_is_not_a_quota_limits_nothing(tmp_path: Path, text: str) -> None:
+    write(tmp_path / "self", "0::/\n")
+    write(tmp_path / "fs" / "cpu.max", text)
+    assert list(threads._quotas(tmp_path / "self", tmp_path / "fs")) == []
+
+
+@pytest.mark.parametrize(("wish", "expected"), [("1", 1), ("3,2", 3), ("9", 4), ("0", 4), ("many", 4), ("", 4)])
+def test_the_user_limits_them(monkeypatch: pytest.MonkeyPatch, wish: str, expected: int) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1, 2, 3})
+    monkeypatch.setattr(threads, "_quotas", lambda membership, mount: iter(()))
+    monkeypatch.setenv("OMP_NUM_THREADS", wish)
+    assert threads.count_threads() == expected
+
+
+def test_a_quota_limits_the_threads_of_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1, 2, 3})
+    monkeypatch.setattr(threads, "_quotas", lambda membership, mount: iter((1.5,)))
+    monkeypatch.setattr(os, "environ", {"MKL_NUM_THREADS": "1"})
+    threads.limit_pools()
+    assert os.environ == {name: "1" if name == "MKL_NUM_THREADS" else "2" for name in threads._POOLS}
+
+
+def test_without_a_limit_libraries_choose(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "_quotas", lambda membership, mount: iter(()))
+    monkeypatch.setattr(os, "environ", {})
+    threads.limit_pools()
+    assert not os.environ

@@ -11,9 +11,10 @@ from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from ...core.compiling import njit
 from ...core.depth_noise import compute_sensor_sigma
 from ...core.errors import CaptureError
 from ...core.transforms import back_project, invert

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ...core.compiling import njit
 from ...core.depth_noise import NOT_STATED
 from ...core.types import Frame, Intrinsics
 from .dense_residuals import Surface

@@ -18,9 +18,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ...core.compiling import njit
 from ...core.transforms import nearest_rigid
 from .alignment_views import AlignmentView
 from .dense_residuals import NormalEquations, Surface, Weighting, linearize, make_equations

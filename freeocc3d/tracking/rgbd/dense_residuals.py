@@ -18,9 +18,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ...core.compiling import njit
 from ...core.depth_noise import MAD_TO_SIGMA, look_up_sigma
 
 NEAREST_M = 0.1

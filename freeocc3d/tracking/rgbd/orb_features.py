@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ...core.compiling import njit
 from ...core.types import Frame, Intrinsics
 from .alignment_views import AlignmentView
 from .dense_residuals import NEAREST_M
