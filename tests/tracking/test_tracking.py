@@ -228,3 +228,51 @@ def test_a_given_pose_may_lie_two_kilometers_away_and_no_farther(axis: int) -> N
         else:
             with pytest.raises(TrackingError, match="common offset"):
                 given([T]).track(wall_frame(2.0))
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2, 3, 4])
+def test_up_to_three_lost_frames_in_a_row_are_interpolated(lost: int) -> None:
+    """Frames 0, 2, 4 … of a capture: what was left out is no gap."""
+    records = Records()
+    records.add_lost(0)
+    records.add_keyframe(2, motion(10, 0.5), 0.8)
+    for n in range(lost):
+        records.add_lost(4 + 2 * n)
+    records.add_tracked(4 + 2 * lost, 0, motion(40, 1.0), 0.6)
+    records.add_lost(6 + 2 * lost)
+    trajectory = records.trajectory(np.arange(20.0))
+    filled = 0 < lost <= 3
+    inside = [4 + 2 * n for n in range(lost)]
+    assert trajectory.status[inside].tolist() == ["interpolated" if filled else "lost"] * lost
+    np.testing.assert_allclose(trajectory.confidence[inside], 0.3 if filled else 0.0)
+    assert trajectory.status[[0, 6 + 2 * lost]].tolist() == ["lost", "lost"]
+    assert trajectory.status[3] == "unused"
+    end = motion(10, 0.5) @ motion(40, 1.0)
+    for n, row in enumerate(inside if filled else []):
+        share = (n + 1) / (lost + 1)
+        wanted = motion(10 + 40 * share, 0.0)
+        wanted[:3, 3] = (1 - share) * motion(10, 0.5)[:3, 3] + share * end[:3, 3]
+        np.testing.assert_allclose(trajectory.T_world_cam[row], wanted, atol=1e-9)
+
+
+def test_frames_of_another_place_are_no_gap() -> None:
+    """Four frames of a second submap between two of the first, which is the larger one."""
+    records = Records()
+    for index in (0, 1, 2, 3, 4):
+        records.add_keyframe(index, motion(0, 0.1 * index), 1.0, submap=0)
+    for index in (5, 6, 7, 8):
+        records.add_keyframe(index, motion(0, 9.0), 1.0, submap=1)
+    records.add_keyframe(9, motion(0, 1.0), 1.0, submap=0)
+    trajectory = records.trajectory(np.arange(10.0))
+    assert trajectory.status.tolist() == 5 * ["keyframe"] + 4 * ["apart"] + ["keyframe"]
+    assert not trajectory.has_pose[5:9].any()
+    assert trajectory.keyframes.tolist() == [0, 1, 2, 3, 4, 9]
+    assert (trajectory.confidence[5:9] == 0).all()
+
+
+def test_poses_of_a_chain_stay_for_it_has_no_error_to_spread() -> None:
+    poses = [motion(0, 0.5 * k) for k in range(4)]
+    edges = [Edge(k, k - 1, motion(1, 0.51), np.diag([1e4] * 6), uncertain=False) for k in range(1, 4)]
+    for few, chain in ((poses, edges), (poses[:2], edges[:1] * 3)):
+        for found, pose in zip(pose_graph.optimize(list(few), chain), few, strict=True):
+            np.testing.assert_array_equal(found, pose)
