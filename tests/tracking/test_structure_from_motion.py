@@ -1,4 +1,4 @@
-"""Decisions on the way to a reconstruction: which pairs, which camera, what is apart. The tracker's test runs COLMAP."""
+"""Decisions on the way to a reconstruction: pairs, cameras, what is apart. The tracker's test runs COLMAP itself."""
 
 from __future__ import annotations
 
