@@ -196,10 +196,12 @@ class _Worker:
         """Wait for the answer: what is wrong if none comes. The time counts that the input would take on an idle
         machine: in which the process computes, or sleeps with no thread that could compute."""
         start = before = time.monotonic()
-        own, computed = 0.0, _computed_s(self._pid)
+        own, computed = 0.0, sum(map(_computed_s, _family(self._pid)))
         while not self.pipe.poll(0.25):
-            now, total = time.monotonic(), _computed_s(self._pid)
-            own += now - before if _sleeps(self._pid) else min(total - computed, now - before)
+            family = _family(self._pid)
+            now, total = time.monotonic(), sum(map(_computed_s, family))
+            asleep = all(map(_sleeps, family))
+            own += now - before if asleep else max(0.0, min(total - computed, now - before))
             before, computed = now, total
             if own > limit_s or now - start > self.limits.endless_s:
                 os.kill(self._pid, signal.SIGABRT)  # its handler writes where it is
@@ -232,6 +234,16 @@ class _Worker:
         if self.process.is_alive():
             self.process.kill()
             self.process.join(5)
+
+
+def _family(pid: int) -> list[int]:
+    """A process and those that it or they started."""
+    found = [pid]
+    for member in found:
+        for path in Path(f"/proc/{member}/task").glob("*/children"):
+            with contextlib.suppress(OSError):
+                found += map(int, path.read_text().split())
+    return found
 
 
 def _computed_s(pid: int) -> float:
