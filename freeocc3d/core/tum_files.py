@@ -19,7 +19,7 @@ from .types import Trajectory
 NUMBERS = 8
 """Numbers per line."""
 
-_FARTHEST, _LONGEST_WORD = 1e6, 64
+_FARTHEST, _LONGEST_WORD = 1e9, 64
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes, metres, seconds)"
 """Spelled as in every earlier map, so that equal trajectories give equal files."""
@@ -50,11 +50,11 @@ def tum_poses(rows: Sequence[Sequence[str]] | NDArray[np.float64]) -> tuple[NDAr
     wrong."""
     if any(len(row) != NUMBERS for row in rows):
         raise ValueError(f"a line does not hold {NUMBERS} numbers")
-    if any(len(word) > _LONGEST_WORD for row in rows for word in row):
+    if not isinstance(rows, np.ndarray) and any(len(word) > _LONGEST_WORD for row in rows for word in row):
         raise ValueError("a word is too long for a number")
     table = np.array(rows, np.float64).reshape(-1, NUMBERS)
     if not (np.isfinite(table).all() and (np.abs(table[:, 1:]) <= _FARTHEST).all()):
-        raise ValueError("a number is not finite, or a place is farther than 1000 km")
+        raise ValueError("a number is not finite, or a place is too far away")
     quats_wxyz = table[:, [7, 4, 5, 6]]
     lengths = np.linalg.norm(quats_wxyz, axis=1, keepdims=True)
     if (lengths == 0).any():

@@ -25,7 +25,7 @@ _ATTRIBUTES = {
 }
 """Point attribute -> (field, columns, type), in addition to ``positions`` and ``colors``."""
 
-_FARTHEST, _UNIT = 1e6, 1e-2
+_FARTHEST, _UNIT = 1e9, 1e-2
 
 _BYTES = 67  # per Gaussian: 14 float32, 2 int32, 3 uint8
 
@@ -89,7 +89,7 @@ def _problem(gaussians: Gaussians, keyframes: int | None) -> str:
     anchors = gaussians.anchor_keyframe
     checks = {
         "means that are not finite": np.isfinite(gaussians.means).all(),
-        "means farther than 1000 km": np.abs(gaussians.means).max(initial=0) <= _FARTHEST,
+        "means that are too far away": np.abs(gaussians.means).max(initial=0) <= _FARTHEST,
         "scales that are not positive": ((gaussians.scales > 0) & (gaussians.scales <= _FARTHEST)).all(),
         "rotations that are no unit quaternions": (np.abs(lengths - 1) <= _UNIT).all(),
         "opacities outside 0 to 1": ((gaussians.opacities >= 0) & (gaussians.opacities <= 1)).all(),

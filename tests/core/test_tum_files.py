@@ -26,11 +26,21 @@ def test_tum_poses_come_back(tmp_path) -> None:
         ("0 0 0 0 0 0 0 0", "a quaternion is all zeros"),
         ("0 0 0 nan 0 0 0 1", "not finite"),
         ("a " * 8, "convert"),
+        (f"0 1e10 {'0 ' * 5} 1", "too far away"),
+        ("9" * 5000 + " 0" * 7, "too long for a number"),
     ],
 )
 def test_what_is_no_pose_is_reported(line: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         tum_poses([line.split()])
+
+
+def test_tables_of_numbers_are_poses_as_lines_are() -> None:
+    line = [3.5, 1, 2, 3, 0, 0, 0, 2]
+    for found, expected in zip(tum_poses(np.array([line])), tum_poses([[str(n) for n in line]]), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    with pytest.raises(ValueError, match="not finite"):
+        tum_poses(np.array([[np.nan, *line[1:]]]))
 
 
 def test_a_file_without_poses_holds_none(tmp_path) -> None:

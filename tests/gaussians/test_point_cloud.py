@@ -39,8 +39,8 @@ def with_first(g: Gaussians, name: str, value: float) -> Gaussians:
     ("name", "value", "said"),
     [
         ("means", np.nan, "means that are not finite"),
-        ("means", 1e38, "farther than 1000 km"),
-        ("means", 1e7, "farther than 1000 km"),
+        ("means", 1e38, "means that are too far away"),
+        ("means", 1e10, "means that are too far away"),
         ("scales", 0, "scales that are not positive"),
         ("scales", -1, "scales that are not positive"),
         ("scales", np.nan, "scales that are not positive"),

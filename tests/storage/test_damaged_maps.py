@@ -271,7 +271,7 @@ def test_an_array_larger_than_the_manifest_counts_is_not_unpacked(copy: Path) ->
         (lambda lines: lines[:1], "count different frames"),
         (lambda lines: [*lines[:-1], "1 2 3"], "8 numbers"),
         (lambda lines: [*lines[:-1], "nan 0 0 0 0 0 0 1"], "not finite"),
-        (lambda lines: [*lines[:-1], f"0 1e30 {' 0' * 5} 1"], "farther"),
+        (lambda lines: [*lines[:-1], f"0 1e30 {' 0' * 5} 1"], "too far away"),
         (lambda lines: [line.replace(line.split()[0], "123.5") for line in lines], "lacks the pose of a keyframe"),
     ],
 )
