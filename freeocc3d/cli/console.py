@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from pathlib import Path
@@ -25,6 +26,12 @@ Set = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Set one option; repeatable. See 'freeocc3d list'."),
 ]
 Overwrite = Annotated[bool, flag("--overwrite", "Replace what exists.")]
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Print to stderr. A log that is full or that nobody reads any more ends no work."""
+    with contextlib.suppress(OSError):
+        print(text, end=end, file=sys.stderr, flush=True)
 
 
 class ConsoleProgress(Progress):
@@ -53,7 +60,7 @@ class ConsoleProgress(Progress):
 
     def warn(self, text: str) -> None:
         self._clear()
-        print(f"warning: {text}", file=sys.stderr)
+        say(f"warning: {text}")
 
     def close(self) -> None:
         """End the line of the current stage."""
@@ -61,7 +68,7 @@ class ConsoleProgress(Progress):
             self._clear()
             seconds = time.monotonic() - self._start
             steps = f", {self._total} steps" if self._total else ""
-            print(f"{self._name}: {seconds:.1f} s{steps}", file=sys.stderr)
+            say(f"{self._name}: {seconds:.1f} s{steps}")
         self._name = ""
 
     def _draw(self, done: int) -> None:
@@ -72,8 +79,8 @@ class ConsoleProgress(Progress):
             elapsed = self._drawn - self._start
             left = elapsed / done * (self._total - done) if done else 0.0
             line += f" [{'=' * filled}{' ' * (30 - filled)}] {done}/{self._total}, {left:.0f} s left"
-        print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+        say(f"\r\x1b[K{line}", end="")
 
     def _clear(self) -> None:
         if self._on_terminal:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            say("\r\x1b[K", end="")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from ..core.atomic_files import refuse_existing
-from .console import ConsoleProgress, MapPath, Overwrite, Set
+from .console import ConsoleProgress, MapPath, Overwrite, Set, say
 
 
 def export(
@@ -44,6 +43,6 @@ def export(
     for note in export_map(loaded, format_name, output, options, overwrite=overwrite):
         progress.warn(note)
     if not loaded.metric:
-        print("note: the map's scale is unknown, so lengths are not meters (see freeocc3d scale).", file=sys.stderr)
+        say("note: the map's scale is unknown, so lengths are not meters (see freeocc3d scale).")
     files = [path for path in output.rglob("*") if path.is_file()] if output.is_dir() else [output]
     print(f"{output}: {sum(path.stat().st_size for path in files):,} bytes")

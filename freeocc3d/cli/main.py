@@ -4,6 +4,7 @@ commands."""
 from __future__ import annotations
 
 import io
+import os
 import sys
 from typing import Annotated, Any
 
@@ -11,9 +12,9 @@ import typer
 from typer.core import TyperGroup
 
 from .. import __version__
-from ..core.errors import FreeOccError, Interrupted, is_interrupt
+from ..core.errors import FreeOccError, Interrupted, is_interrupt, printable
 from . import models
-from .console import flag
+from .console import flag, say
 from .demo import demo
 from .evaluate import evaluate
 from .export import export
@@ -73,19 +74,47 @@ def main(arguments: list[str] | None = None) -> None:
     SIGTERM and SIGHUP it is 128 plus the signal's number."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
-    # What a terminal cannot show is written as escapes.
-    for stream, errors in ((sys.stdin, "replace"), (sys.stdout, "backslashreplace")):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors=errors)
+    _prepare_streams()
     stopping = Stopping()
     try:
         with stopping:
-            app(args=[argument for argument in arguments if argument != "--debug"], prog_name="freeocc3d")
-    except FreeOccError as error:
+            try:
+                app(args=[argument for argument in arguments if argument != "--debug"], prog_name="freeocc3d")
+            finally:
+                sys.stdout.flush()
+    except (FreeOccError, OSError) as error:
         if debug:
             raise
-        print(f"freeocc3d: {' '.join(str(error).split())}", file=sys.stderr)
+        say(f"freeocc3d: {_sentence(error)}")
+        if isinstance(error, OSError):  # what is left to print would fail again when Python ends
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         raise SystemExit(stopping.status) from None
+
+
+def _prepare_streams() -> None:
+    """Open what a service has closed, lest a file take its number and libraries print into it. What a terminal cannot
+    show is written as escapes."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w" if number else "r"))  # noqa: SIM115
+    for stream, errors in ((sys.stdin, "replace"), (sys.stdout, "backslashreplace")):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=errors)
+
+
+def _sentence(error: FreeOccError | OSError) -> str:
+    """What to tell. An OSError that no command has turned into its own sentence is of the answer, if it names no
+    file."""
+    if isinstance(error, FreeOccError):
+        return " ".join(str(error).split())
+    reason = printable(error.strerror or str(error))
+    if error.filename is None:
+        return f"The answer cannot be written: {reason}."
+    return f"{printable(str(error.filename))} cannot be used: {reason}."
 
 
 if __name__ == "__main__":
