@@ -286,6 +286,11 @@ def test_compared_are_the_most_alike_that_are_not_close_on_the_path(monkeypatch)
     with ThreadPoolExecutor(1) as pool:
         found = loop_closures._candidates(keyframes, submap, pool)  # type: ignore[arg-type]
         assert loop_closures._candidates(keyframes[:1], [0], pool) == []  # type: ignore[arg-type]
+        few = [SimpleNamespace(features=SimpleNamespace(descriptors=one[:20])) for one in (described[0], described[4])]
+        monkeypatch.setattr(loop_closures, "compare_histograms", lambda histograms: np.ones((2, 2)))
+        assert loop_closures._candidates(few, [0, 1], pool) == [(1, 0)]  # type: ignore[arg-type]
+        few[0].features.descriptors = described[0][:19]
+        assert loop_closures._candidates(few, [0, 1], pool) == [], "two poses need forty features"  # type: ignore[arg-type]
     near = {(3, 0), (8, 6), (9, 7)}  # the first is too close on the path, the others are of two submaps
     assert set(found) & near == {(8, 6), (9, 7)}
     assert {(4, 0), (9, 2)} <= set(found)

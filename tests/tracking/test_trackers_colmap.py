@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 from photographs import Photographs, turning, walk
 
+from freeocc3d.capture import Options as CaptureOptions
 from freeocc3d.capture.lenses import Lens
 from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, TrackingError
 from freeocc3d.core.progress import Progress
@@ -304,3 +305,16 @@ def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         model_of(true[:1], camera, [name]).write_binary(str(folder))
         with pytest.raises(FreeOccError, match=sentence):
             colmap_reconstruction.read_model(folder, capture)
+
+
+@pytest.mark.parametrize(("scale", "metric"), [(None, False), (2.0, True)])
+def test_poses_are_metric_only_if_the_captures_scale_is_given(scale: float | None, metric: bool) -> None:
+    class Scan:
+        options = CaptureOptions(scale=scale)
+
+        def __len__(self) -> int:
+            return 3
+
+    tracker = ColmapTracker(Options(), Scan())  # type: ignore[arg-type]
+    assert (tracker.offline, tracker.metric) == (True, metric)
+    assert np.isnan(tracker.poses_ahead()).all()
