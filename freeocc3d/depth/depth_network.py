@@ -7,7 +7,6 @@ Depth Estimation, PAMI 2022). The stereo depth of each frame determines both.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..core.depth_noise import MAD_TO_SIGMA
 from ..core.errors import ModelError
-from ..core.onnx_session import load_session
+from ..core.onnx_session import Network, load_network
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, the training data of the encoders
 _FREE_SIZE, _PATCH = 518, 14
@@ -34,12 +33,13 @@ _METRIC = {"depth": True, "inverse": False}
 class DepthNetwork:
     """Calls the network. Its metadata ``output`` is "inverse" (the default) or "depth"."""
 
-    def __init__(self, session: Any, path: Path):
-        inputs, self._session = session.get_inputs(), session
-        if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].shape[1] != 3:
+    def __init__(self, network: Network):
+        path, inputs, self._network = network.path, list(network.inputs.items()), network
+        if len(inputs) != 1 or len(inputs[0][1]) != 4 or inputs[0][1][1] != 3 or not network.outputs:
             raise ModelError(f"{path} is not a depth network: it must take one image, (1, 3, H, W).")
-        self._path, self._input = path, inputs[0]
-        said = session.get_modelmeta().custom_metadata_map.get("output", "inverse")
+        self._path, (self._input, self._shape) = path, inputs[0]
+        self._output = next(iter(network.outputs))
+        said = network.session.get_modelmeta().custom_metadata_map.get("output", "inverse")
         if said not in _METRIC:
             raise ModelError(f"{path}: the metadata 'output' must be inverse or depth, not {said}.")
         self._is_depth = _METRIC[said]
@@ -49,15 +49,12 @@ class DepthNetwork:
         rows, columns = self._size(color)
         image = cv2.resize(color, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         image = (image - np.array(_MEAN, np.float32)) / np.array(_DEVIATION, np.float32)
-        try:
-            output = self._session.run(None, {self._input.name: image.transpose(2, 0, 1)[None]})[0]
-        except Exception as error:  # onnxruntime's exceptions share no base class
-            raise ModelError(f"{self._path} fails on an image of {columns} x {rows} pixels: {error}") from error
+        (output,) = self._network.run([self._output], {self._input: image.transpose(2, 0, 1)[None]}, finite=False)
         found = np.asarray(output, np.float32)
         found = (
             found.reshape(found.shape[-2:]) if found.ndim >= 2 and found.size == np.prod(found.shape[-2:]) else found
         )
-        if found.ndim != 2 or not np.isfinite(found).all():
+        if found.ndim != 2 or not found.size or not np.isfinite(found).all():
             raise ModelError(
                 f"{self._path} is not a depth network: its output of shape {output.shape} is not a depth map."
             )
@@ -66,7 +63,7 @@ class DepthNetwork:
 
     def _size(self, color: NDArray[np.uint8]) -> tuple[int, int]:
         """Rows and columns of the input: fixed by the network, else multiples of a vision transformer's patch."""
-        rows, columns = self._input.shape[2:]
+        rows, columns = self._shape[2:]
         if isinstance(rows, int) and isinstance(columns, int):
             return rows, columns
         by = _FREE_SIZE / max(color.shape[:2])
@@ -76,7 +73,7 @@ class DepthNetwork:
 
 def load_depth_network(path: Path, device: str = "cpu") -> DepthNetwork:
     """Load the network in an ONNX file. Raises ModelError, ConfigError."""
-    return DepthNetwork(load_session(path, device), path)
+    return DepthNetwork(load_network(path, device))
 
 
 def fuse_guess(

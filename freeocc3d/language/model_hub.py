@@ -11,13 +11,20 @@ import hashlib
 import os
 import re
 import shutil
+import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Annotated, Any
+from urllib.parse import quote, urlsplit
+
+import msgspec
 
 from ..core.errors import ModelError
 from ..core.progress import Progress
+from ..core.regular_files import check_regular
 from . import model_packages
+from .timed_requests import Answer, NoAnswer, fetch
+from .vision_server import shorten_to_line
 
 NAMES = {
     "clip-b16-openai": "timm/vit_base_patch16_clip_224.openai",
@@ -34,7 +41,15 @@ CHECKPOINTS = ".checkpoints"
 
 _CONFIGS = ("config.json", "open_clip_config.json", "preprocessor_config.json", "README.md")
 _WEIGHTS = ("open_clip_model.safetensors", "model.safetensors")
-_TIMEOUT_S = 15
+_TIMEOUT_S = 15.0
+"""Time for a listing, and for each ``_LEAST_BYTES`` of a file."""
+_LEAST_BYTES = 1 << 14
+_LARGEST_LISTING = 16 << 20
+_LARGEST = 1 << 40
+"""Bytes of the largest file."""
+_ATTEMPTS = 5
+_PARTIAL = 206
+"""The status of an answer with the rest of a file."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +66,12 @@ class _Remote:
         return (self.sha256 or self.blob or "")[:12]
 
     def is_content_of(self, path: Path) -> bool:
+        if path.is_symlink() or check_regular(path).st_size != self.size:
+            return False
         if self.sha256:
             return model_packages.hash_file(path) == self.sha256
-        content = path.read_bytes()
-        return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest() == self.blob
+        start = hashlib.sha1(b"blob %d\0" % self.size, usedforsecurity=False)
+        return model_packages.hash_file(path, start) == self.blob
 
 
 def pull_package(name: str, revision: str = "main", progress: Progress | None = None) -> Path:
@@ -118,79 +135,134 @@ def _endpoint() -> str:
     return os.environ.get("HF_ENDPOINT", "https://huggingface.co").rstrip("/")
 
 
+class _Sibling(msgspec.Struct):
+    """A file as the hub lists it, see https://huggingface.co/docs/hub/api."""
+
+    rfilename: str
+    size: Annotated[int, msgspec.Meta(ge=0, le=_LARGEST)] | None = None
+    blobId: str | None = None
+    lfs: dict[str, Any] | None = None
+
+
+class _Listing(msgspec.Struct):
+    siblings: list[_Sibling] = []
+
+
 def _listed(repository: str, revision: str) -> dict[str, _Remote]:
-    """The repository's files by name, without those in subfolders."""
-    hub = _library()
+    """The repository's files by name, without those in subfolders. Raises ModelError."""
+    url = f"{_endpoint()}/api/models/{repository}/revision/{quote(revision, safe='')}?blobs=true"
+    received = bytearray()
+
+    def receive(_: Answer, piece: bytes) -> None:
+        received.extend(piece)
+        if len(received) > _LARGEST_LISTING:
+            raise NoAnswer("it lists more files than a repository has")
+
     try:
-        info = hub.HfApi(endpoint=_endpoint()).model_info(
-            repository, revision=revision, files_metadata=True, timeout=_TIMEOUT_S
-        )
-    except Exception as error:  # raised by the library's transport, which changes between versions
-        raise _told(error, repository, revision) from error
+        answer = fetch(_request(url), receive, _TIMEOUT_S, redirects=True)
+        if not answer.succeeded:
+            raise _refused(answer.status, repository, revision)
+        listing = msgspec.json.decode(received, type=_Listing)
+    except (TimeoutError, NoAnswer, msgspec.MsgspecError, RecursionError) as error:
+        raise _told(error, repository) from error
+    remotes = [
+        _Remote(file.rfilename, file.size or 0, _digest((file.lfs or {}).get("sha256")), _digest(file.blobId))
+        for file in listing.siblings
+    ]
     return {
-        file.rfilename: _Remote(file.rfilename, file.size or 0, file.lfs.sha256 if file.lfs else None, file.blob_id)
-        for file in info.siblings or []
-        if Path(file.rfilename).name == file.rfilename and not file.rfilename.startswith(".")
+        remote.name: remote
+        for remote in remotes
+        if model_packages.is_plain_name(remote.name) and (remote.sha256 or remote.blob)
     }
+
+
+def _digest(stated: object) -> str | None:
+    """A hash that the hub states; None if it is none."""
+    return stated if isinstance(stated, str) and re.fullmatch("[0-9a-f]{40}([0-9a-f]{24})?", stated) else None
 
 
 def _fetch(repository: str, revision: str, remote: _Remote, folder: Path, progress: Progress) -> None:
     """Fetches one file into the folder; continues an earlier download of the same content."""
     path = folder / remote.name
-    if path.is_file() and remote.is_content_of(path):
+    if path.exists() and remote.is_content_of(path):
         return
     progress.stage(f"{remote.name} ({remote.size / 1e6:.1f} MB)")
-    hub = _library()
-    from huggingface_hub.file_download import http_get
-    from huggingface_hub.utils import build_hf_headers
-
     incomplete = folder / f"{remote.name}.{remote.identity}.incomplete"
     free = shutil.disk_usage(folder).free
     if remote.size > free:
         raise ModelError(f"{remote.name} needs {remote.size:,} bytes, but {folder} has {free:,} free: make room.")
+    if incomplete.is_symlink() or (incomplete.exists() and check_regular(incomplete).st_size > remote.size):
+        incomplete.unlink()
     with incomplete.open("ab") as stream:
-        done = stream.tell()
-        if done > remote.size:
-            done = 0
-            stream.truncate(0)
-        try:
-            url = hub.hf_hub_url(repository, remote.name, revision=revision, endpoint=_endpoint())
-            headers = build_hf_headers()
-            if done < remote.size:
-                http_get(url, stream, resume_size=done, headers=headers, expected_size=remote.size)
-        except OSError as error:
-            if error.filename is not None:  # an error of the disk, not of the network
-                raise
-            raise _told(error, repository, revision) from error
-        except Exception as error:
-            raise _told(error, repository, revision) from error
+        for _ in range(_ATTEMPTS):  # a connection that breaks is taken up again, if it gave something
+            if stream.tell() < remote.size:
+                _continue(repository, revision, remote, stream)
+    if incomplete.stat().st_size < remote.size:
+        raise _told(NoAnswer("the connection breaks again and again"), repository)
     if not remote.is_content_of(incomplete):
         incomplete.unlink()
         raise ModelError(f"{remote.name} of {repository} does not match the hub's hash and was deleted: pull again.")
     incomplete.rename(path)
 
 
-def _library() -> Any:
+def _continue(repository: str, revision: str, remote: _Remote, stream: IO[bytes]) -> None:
+    """Fetches the rest of a file, as far as the connection lasts. Raises ModelError."""
+    start = stream.tell()
+    request = _request(f"{_endpoint()}/{repository}/resolve/{quote(revision, safe='')}/{quote(remote.name)}")
+    if start:
+        request.add_header("Range", f"bytes={start}-")
+
+    def receive(answer: Answer, piece: bytes) -> None:
+        if stream.tell() == start and start and answer.status != _PARTIAL:
+            stream.seek(stream.truncate(0))  # the server sends the whole file
+        if stream.tell() + len(piece) > remote.size:
+            raise NoAnswer(f"it sends more than the {remote.size:,} bytes of {remote.name} that it lists")
+        stream.write(piece)
+
     try:
-        import huggingface_hub
-        from huggingface_hub.utils import logging
-    except ImportError as error:
-        raise ModelError("Pulling models needs huggingface_hub: pip install 'freeocc3d[models]'.") from error
-    logging.set_verbosity_error()  # this module reports the errors
-    return huggingface_hub
+        answer = fetch(request, receive, _TIMEOUT_S, least_bytes=_LEAST_BYTES, redirects=True)
+    except (TimeoutError, NoAnswer) as error:
+        if stream.tell() <= start:
+            raise _told(error, repository) from error
+        return
+    if not answer.succeeded:
+        raise _refused(answer.status, repository, revision)
+    if stream.tell() <= start:
+        raise _told(NoAnswer(f"it sends nothing of {remote.name}"), repository)
 
 
-def _told(error: Exception, repository: str, revision: str) -> ModelError:
-    """Describes a failure on the way to the hub in one sentence."""
-    status = getattr(getattr(error, "response", None), "status_code", None)
+def _request(url: str) -> urllib.request.Request:
+    """A request with the token of the user, if one is logged in. Raises ModelError."""
+    if urlsplit(url).scheme not in ("http", "https") or not url.isascii() or not url.isprintable() or " " in url:
+        raise ModelError(f"HF_ENDPOINT must be an address such as https://huggingface.co, not '{_endpoint()}'.")
+    headers = {"User-Agent": "freeocc3d"}
+    try:
+        from huggingface_hub import get_token
+    except ImportError:
+        token = os.environ.get("HF_TOKEN")
+    else:
+        token = get_token()
+    if token and token.isascii() and token.isprintable():
+        headers["Authorization"] = f"Bearer {token}"
+    return urllib.request.Request(url, headers=headers)
+
+
+def _refused(status: int, repository: str, revision: str) -> ModelError:
     if status in (401, 403, 404):
         return ModelError(
             f"{_endpoint()} has no readable repository {repository} with revision {revision}: check its name, or log "
             "in with 'hf auth login'."
         )
-    if status is not None:
-        return ModelError(f"{_endpoint()} answered {status} to the request for {repository}: try again later.")
-    said = " ".join(str(error).split())[:120] or type(error).__name__
+    return ModelError(f"{_endpoint()} answered {status} to the request for {repository}: try again later.")
+
+
+def _told(error: Exception, repository: str) -> ModelError:
+    """Describes a failure on the way to the hub in one sentence."""
+    said = shorten_to_line(str(error), 120)
+    if isinstance(error, TimeoutError):
+        said = f"it does not answer within {_TIMEOUT_S:g} s"
+    elif isinstance(error, msgspec.MsgspecError | RecursionError):
+        said = "it does not answer like a hub"
     return ModelError(
         f"Cannot fetch {repository} from {_endpoint()}: {said}. Fetched data are kept: pull again when the network "
         f"works, or copy the model's folder to {model_packages.find_models_folder()}."

@@ -11,29 +11,36 @@ package is ever unpickled.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-import yaml
+import msgspec
+from msgspec import Meta
 
 from ..core.errors import ModelError
-from ..core.onnx_session import load_session
+from ..core.onnx_session import Network, load_network
+from ..core.regular_files import open_regular, read_text
+from ..core.typed_documents import InvalidDocument, as_type, parse_json
+from ..core.yaml_documents import parse_yaml
 from ..settings.registry import nearest
 
 MANIFESTS = ("manifest.yaml", "manifest.json")
 FORMAT = 1
-SUFFIXES = (".onnx", ".safetensors", ".json", ".yaml")
+_WEIGHTS = ".onnx.data"
+SUFFIXES = (".onnx", ".safetensors", ".json", ".yaml", _WEIGHTS)
+"""Suffixes of the files that a package may contain. Weights beside a network, of more than two gigabytes, are no part
+of their own."""
 Precision = Literal["fp32", "fp16", "int8"]
 """Precision of a package's weights."""
-"""Suffixes of the files that a package may contain."""
 
 _LARGEST_MANIFEST = 1 << 20
 _CHUNK = 1 << 20
+_LONGEST_NAME = 200
+_LEAST_STD, _MOST_LEVEL = 1e-3, 1000.0
 
 
 @dataclass(frozen=True)
@@ -116,25 +123,30 @@ class Package:
 
     def file(self, part: str) -> Path:
         """The part's file, after a check of its content. Raises ModelError."""
-        path = self.folder / self.parts[part]
+        return self.checked(self.parts[part])
+
+    def checked(self, name: str) -> Path:
+        """A file of the package, after a check of its content. Raises ModelError."""
+        path, stated = self.folder / name, self.files[name]
+        if path.is_symlink():
+            raise ModelError(f"{path} is a link, but a package holds its files itself: copy the file.")
         found = hash_file(path)
-        if found != self.files[self.parts[part]]:
+        if found != stated:
             raise ModelError(
-                f"{path} is damaged: its sha256 is {found[:12]}…, but the manifest states "
-                f"{self.files[self.parts[part]][:12]}…. Pull or export the model again."
+                f"{path} is damaged: its sha256 is {found[:12]}…, but the manifest states {stated[:12]}…. Pull or "
+                "export the model again."
             )
         return path
 
-    def session(self, part: str, device: str = "cpu") -> Any:
-        """The part's network, after a check of its inputs, outputs and dimension. Raises ModelError."""
+    def session(self, part: str, device: str = "cpu") -> Network:
+        """The part's network, after a check of its files, inputs, outputs and dimension. Raises ModelError."""
         path = self.file(part)
-        session = load_session(path, device)
-        expected = KINDS[self.kind][part]
-        inputs = [node.name for node in session.get_inputs()]
-        outputs = {node.name: node.shape for node in session.get_outputs()}
-        if sorted(inputs) != sorted(expected.inputs) or set(expected.outputs) - set(outputs):
+        weights = [self.checked(name).name for name in self.files if name.endswith(_WEIGHTS)]
+        network = load_network(path, device, weights)
+        expected, outputs = KINDS[self.kind][part], network.outputs
+        if sorted(network.inputs) != sorted(expected.inputs) or set(expected.outputs) - set(outputs):
             raise ModelError(
-                f"{path} takes {', '.join(inputs)} and gives {', '.join(outputs)}, but the {part} network of a "
+                f"{path} takes {', '.join(network.inputs)} and gives {', '.join(outputs)}, but the {part} network of a "
                 f"'{self.kind}' model takes {', '.join(expected.inputs)} and gives {', '.join(expected.outputs)}. "
                 "Export it again with 'freeocc3d models export'."
             )
@@ -147,7 +159,7 @@ class Package:
                     f"{path} gives {name} of {last} dimensions, but the manifest states {self.dimension}: export the "
                     "image and text networks from one model."
                 )
-        return session
+        return network
 
 
 def find_models_folder() -> Path:
@@ -206,9 +218,8 @@ def list_installed() -> dict[str, Package | ModelError]:
 
 def verify_files(package: Package) -> None:
     """Compares every file's content with the manifest's hash. Raises ModelError for the first that differs."""
-    by_file = {name: part for part, name in package.parts.items()}
     for name in package.files:
-        package.file(by_file[name])
+        package.checked(name)
 
 
 def read_package(folder: Path) -> Package:
@@ -218,7 +229,7 @@ def read_package(folder: Path) -> Package:
     """
     if not folder.is_dir():
         raise ModelError(f"The model folder {folder} does not exist.")
-    path = next((folder / name for name in MANIFESTS if (folder / name).is_file()), None)
+    path = next((folder / name for name in MANIFESTS if (folder / name).exists()), None)
     if path is None:
         raise ModelError(
             f"{folder} is not a model package: it has no {MANIFESTS[0]}. 'freeocc3d models export' writes one."
@@ -233,85 +244,95 @@ def read_package(folder: Path) -> Package:
 def load_manifest(path: Path) -> Any:
     """The content of a manifest file. Raises ModelError."""
     try:
-        if path.stat().st_size > _LARGEST_MANIFEST:
-            raise ModelError(f"{path} is not a manifest: it is larger than a megabyte.")
-        text = path.read_text(encoding="utf-8")
-        return json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
-    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
+        text = read_text(path, _LARGEST_MANIFEST)
+        return parse_json(text) if path.suffix == ".json" else parse_yaml(text)
+    except OSError as error:
+        raise ModelError(f"Cannot read {path}: {error.strerror}.") from error
+    except ValueError as error:  # no text, JSON or YAML
         raise ModelError(f"Cannot read {path}: {' '.join(str(error).split())}.") from error
+
+
+class _Manifest(msgspec.Struct):
+    """The content of a manifest, see ``Package``."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=200)]
+    kind: str
+    dimension: Annotated[int, Meta(ge=1, le=1 << 16)]
+    precision: Annotated[str, Meta(max_length=200)]
+    licence: Annotated[str, Meta(max_length=1000)]
+    source: Annotated[str, Meta(max_length=1000)]
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+    patch: Annotated[int, Meta(ge=1, le=1024)]
+    input_size: Annotated[int, Meta(ge=1, le=1 << 14)]
+    parts: dict[str, str]
+    files: dict[str, str]
+    prefix_tokens: Annotated[int, Meta(ge=0, le=1024)] = 0
+    logit_scale: Annotated[float, Meta(ge=1e-3, le=1e6)] = 100.0
 
 
 def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:
     """The package that a manifest describes; errors name ``path``. Raises ModelError."""
-
-    def refuse(why: str) -> ModelError:
-        return ModelError(f"{path} is not a usable manifest: {why}.")
-
-    def get(key: str, kind: type, default: Any = None) -> Any:
-        value = manifest.get(key, default)
-        value = float(value) if kind is float and isinstance(value, int) else value
-        if not isinstance(value, kind) or isinstance(value, bool):
-            raise refuse(f"'{key}' is missing or not of type {kind.__name__}")
-        return value
-
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise refuse(f"it must contain format: {FORMAT}")
-    kind = get("kind", str)
-    if kind not in KINDS:
-        raise refuse(f"kind '{kind}' is not one of {', '.join(KINDS)}")
-    parts, files = get("parts", dict), get("files", dict)
-    needed = {*KINDS[kind], *(["tokenizer"] if "text" in KINDS[kind] else [])}
-    if lacking := sorted(needed - set(parts)):
-        raise refuse(f"'parts' lacks {', '.join(lacking)}")
-    for name, digest in files.items():
-        if not isinstance(name, str) or Path(name).name != name or name.startswith(".") or "\\" in name:
-            raise refuse(f"'{name}' is not the plain name of a file in its folder")
-        if not name.endswith(SUFFIXES):
-            raise refuse(f"'{name}' does not end with {', '.join(SUFFIXES)}")
-        if not isinstance(digest, str) or len(digest) != 64 or set(digest) - set("0123456789abcdef"):
-            raise refuse(f"the sha256 of '{name}' is not 64 hexadecimal digits")
-    if sorted(map(str, parts.values())) != sorted(files):
-        raise refuse("'parts' and 'files' must name the same files")
-    mean, std = (get(key, list) for key in ("mean", "std"))
-    if any(len(values) != 3 or not all(isinstance(v, int | float) for v in values) for values in (mean, std)):
-        raise refuse("'mean' and 'std' must be three numbers")
-    if not all(math.isfinite(v) for v in (*mean, *std)):
-        raise refuse("'mean' and 'std' must be finite")
-    dimension, patch, input_size = (get(key, int) for key in ("dimension", "patch", "input_size"))
-    prefix_tokens, logit_scale = get("prefix_tokens", int, 0), get("logit_scale", float, 100.0)
-    if min(dimension, patch, input_size, *std, logit_scale) <= 0 or max(dimension, input_size) > 1 << 16:
-        raise refuse("'dimension', 'patch', 'input_size', 'std' and 'logit_scale' must be greater than 0, and usual")
-    if prefix_tokens < 0 or input_size < patch:
-        raise refuse("'prefix_tokens' must not be negative, and 'input_size' must not be less than 'patch'")
-    return Package(
-        folder=folder,
-        name=get("name", str),
-        kind=kind,
-        dimension=dimension,
-        precision=get("precision", str),
-        licence=get("licence", str),
-        source=get("source", str),
-        mean=tuple(float(v) for v in mean),
-        std=tuple(float(v) for v in std),
-        patch=patch,
-        input_size=input_size,
-        prefix_tokens=prefix_tokens,
-        logit_scale=logit_scale,
-        parts=parts,
-        files=files,
-    )
-
-
-def hash_file(path: Path) -> str:
-    """Hexadecimal digest of a file's content. Raises ModelError."""
-    digest = hashlib.sha256()
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT or isinstance(manifest["format"], bool):
+        raise ModelError(f"{path} is not a usable manifest: it must contain format: {FORMAT}.")
     try:
-        with path.open("rb") as stream:
+        said = as_type(manifest, _Manifest)
+        _check_parts(said)
+        numbers = *said.mean, *said.std, said.logit_scale
+        if not all(map(math.isfinite, numbers)):
+            raise InvalidDocument("its numbers must be finite")
+        if min(said.std) < _LEAST_STD or max(map(abs, numbers[:-1])) > _MOST_LEVEL:
+            raise InvalidDocument(f"'mean' and 'std' must be levels in 0…1, and 'std' at least {_LEAST_STD:g}")
+        if said.input_size < said.patch:
+            raise InvalidDocument("'input_size' must not be less than 'patch'")
+    except InvalidDocument as error:
+        raise ModelError(f"{path} is not a usable manifest: {error}.") from error
+    return Package(folder=folder, **msgspec.structs.asdict(said))
+
+
+def _check_parts(said: _Manifest) -> None:
+    """Raises InvalidDocument for parts and files that are not those of the kind, or no plain files."""
+    if said.kind not in KINDS:
+        raise InvalidDocument(f"kind '{said.kind[:80]}' is not one of {', '.join(KINDS)}")
+    needed = {*KINDS[said.kind], *(["tokenizer"] if "text" in KINDS[said.kind] else [])}
+    if lacking := sorted(needed - set(said.parts)):
+        raise InvalidDocument(f"'parts' lacks {', '.join(lacking)}")
+    for name, digest in said.files.items():
+        if not is_plain_name(name):
+            raise InvalidDocument(f"'{shorten_name(name)}' is not the plain name of a file in its folder")
+        if not name.endswith(SUFFIXES):
+            raise InvalidDocument(f"'{name}' does not end with {', '.join(SUFFIXES)}")
+        if len(digest) != 64 or set(digest) - set("0123456789abcdef"):
+            raise InvalidDocument(f"the sha256 of '{name}' is not 64 hexadecimal digits")
+    if sorted(said.parts.values()) != sorted(name for name in said.files if not name.endswith(_WEIGHTS)):
+        raise InvalidDocument("'parts' and 'files' must name the same files")
+
+
+def is_plain_name(name: str) -> bool:
+    """Whether a name from elsewhere is that of a file in a folder, and nothing else."""
+    return Path(name).name == name and not name.startswith(".") and "\\" not in name and _is_short(name)
+
+
+def shorten_name(name: str) -> str:
+    """A name from elsewhere, for a message."""
+    return name if _is_short(name) else repr(name[:80])[1:-1]
+
+
+def _is_short(name: str) -> bool:
+    return len(name) <= _LONGEST_NAME and name.isprintable()
+
+
+def hash_file(path: Path, digest: Any = None) -> str:
+    """Hexadecimal digest of a file's content: of SHA-256, or of a digest that holds what comes before. Raises
+    ModelError."""
+    digest = hashlib.sha256() if digest is None else digest
+    try:
+        with open_regular(path) as stream:
             while chunk := stream.read(_CHUNK):
                 digest.update(chunk)
     except OSError as error:
         raise ModelError(f"Cannot read {path}: {error.strerror}.") from error
-    return digest.hexdigest()
+    return str(digest.hexdigest())
 
 
 def _folders() -> list[Path]:

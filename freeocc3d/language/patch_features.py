@@ -9,10 +9,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import ConfigError
+from ..core.memory import available_memory
 from .model_packages import Package
 
 _BATCH_PATCHES = 4096
 """Number of windows to encode at once, so that memory does not grow with the frame."""
+
+
+def _check_size(rows: int, columns: int, h: int, w: int, package: Package) -> None:
+    """Raises ConfigError if the frame's image, its features, or the attention of a window do not fit into memory."""
+    image, features = rows * columns * package.patch**2 * 12, rows * columns * package.dimension * 8
+    if (needed := image + features + 8 * (h * w) ** 2) > (free := available_memory()):
+        raise ConfigError(
+            f"'short_side' and 'window' make windows of {h} x {w} patches, whose attention needs about "
+            f"{needed / 1e9:.1f} GB of memory; {free / 1e9:.1f} GB are free: choose smaller ones."
+        )
 
 
 @dataclass(frozen=True)
@@ -36,6 +48,7 @@ class Tiling:
         rows, columns = (max(1, round(size * scale / package.patch)) for size in (height, width))
         most = max(1, window // package.patch) if window else max(rows, columns)
         h, w = min(most, rows), min(most, columns)
+        _check_size(rows, columns, h, w, package)
         return cls((rows, columns), (h, w), _starts(rows, h), _starts(columns, w), package.patch)
 
     def image(self, rgb: NDArray[np.uint8], mean: tuple[float, ...], std: tuple[float, ...]) -> NDArray[np.float32]:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ from ..core.atomic_files import replace_text
 from ..core.checksums import seal, unseal
 from ..core.errors import ConfigError
 from ..core.regular_files import TEXT_BYTES, read_bytes
+from ..core.typed_documents import as_type, parse_json
 from ..core.types import Frame
 from ..core.warnings import Notice
 from ..settings.stages import VocabularyOptions as Options
@@ -39,6 +41,8 @@ QUESTION = (
 _MOST_NAMES = 100
 """Most names in one picture: a model that lists more repeats itself."""
 _LONGEST_NAME = 40
+_LONGEST_ANSWER = 16_384
+"""Characters of an answer that are read; a longer one repeats itself."""
 _MOST_WORDS = 4
 _MOSTLY = 0.8
 """Share of the entries of a list without JSON that must be names, because sentences have commas, too."""
@@ -48,6 +52,13 @@ _MOST_FAILURES = 3
 """After this many questions in a row without an answer, the others are not asked."""
 _WIDTH = 768  # of the pictures in the questions
 _JPEG_QUALITY = 85
+
+
+class _Kept(msgspec.Struct):
+    """The file of answers. of: identifies the questions.  answers: names by frame."""
+
+    of: str
+    answers: dict[str, list[str]]
 
 
 class Namer:
@@ -110,11 +121,9 @@ class Namer:
     def _restored(self, path: Path) -> dict[int, list[str]]:
         """Answers of an interrupted run to the same questions; empty if there is no readable file."""
         try:
-            kept = json.loads(unseal(read_bytes(path, TEXT_BYTES)))
-            if kept["of"] != self._marks():
-                return {}
-            return {int(frame): [str(name) for name in names] for frame, names in kept["answers"].items()}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            kept = as_type(parse_json(unseal(read_bytes(path, TEXT_BYTES))), _Kept)
+            return {int(frame): names for frame, names in kept.answers.items()} if kept.of == self._marks() else {}
+        except (OSError, ValueError):
             return {}
 
 
@@ -155,7 +164,9 @@ def parse_names(text: str) -> list[str] | None:
     Accepts a JSON list, alone or with words around it, a JSON object that contains one, lines with bullets or numbers,
     and names separated by commas. Ignores what a model thinks aloud first (<think>).
     """
-    text = re.sub(r"<think>.*?(</think>|\Z)", " ", text, flags=re.DOTALL)
+    text = re.sub(r"<think>.*?(</think>|\Z)", " ", text, flags=re.DOTALL).strip()
+    if len(text) > _LONGEST_ANSWER:
+        text = text[: max(text.rfind(mark, 0, _LONGEST_ANSWER) for mark in (",", "\n")) + 1]
     names = list(filter(None, map(_name, _json_list(text))))
     for entries in (_lines(text), text.strip().rstrip(".").split(",")):
         if not names:
@@ -180,7 +191,8 @@ def _json_list(text: str) -> list[Any]:
 
 def _lines(text: str) -> list[str]:
     """The text after the bullets or numbers of a list."""
-    return re.findall(r"^\s*(?:[-*•]|\d{1,3}[.)])\s+(.+?)\s*$", text, flags=re.MULTILINE)
+    found = (re.match(r"(?:[-*•]|\d{1,3}[.)])\s+(.+)", line.strip()) for line in text.splitlines())
+    return [match[1] for match in found if match]
 
 
 def _name(entry: Any) -> str:

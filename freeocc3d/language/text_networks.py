@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 
 from ..core.arrays import read_arrays, write_arrays
 from ..core.errors import ConfigError, MapError, ModelError
+from ..core.regular_files import read_text
 from ..core.typed_documents import InvalidDocument, as_type
 from . import model_packages
 from .encoders.base import TextEncoder, TextFeatures
+from .vision_server import shorten_to_line
 
 TEMPLATES = ("a photo of a {}.", "a photo of the {} in a room.", "there is a {} in the scene.", "a bad photo of a {}.",
              "a photo of a small {}.", "a photo of a large {}.", "{}")  # fmt: skip
@@ -37,6 +39,8 @@ CONTRAST = (
 _KEPT = 4096  # the latest embeddings, kept in a cache file
 _LONGEST = 200  # characters of a word; longer ones are not cached
 _AT_ONCE = 64
+_LARGEST_TOKENIZER = 64 << 20
+_MOST_TOKENS = 4096
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,8 @@ class ModelWords(TextEncoder):
                     )
             prompts = [template.replace("{}", word) for word in new for template in self._templates]
             embedded = self._text.embed(prompts).reshape(len(new), len(self._templates), -1).mean(axis=1)
-            embedded /= np.linalg.norm(embedded, axis=1, keepdims=True)
+            norms = np.linalg.norm(embedded, axis=1, keepdims=True)
+            embedded /= np.where(norms > 0, norms, 1)
             self._known.update(zip(new, embedded, strict=True))
             _write_cache(self._cache, self._known)
         empty = np.zeros(self._dimension, np.float32)
@@ -136,17 +141,27 @@ class TextNetwork:
             from tokenizers import Tokenizer
         except ImportError as error:
             raise ModelError("Encoding words needs the package tokenizers: pip install 'freeocc3d[models]'.") from error
-        path = package.file("tokenizer")
+        self._path = package.file("tokenizer")
         try:
-            self._tokenizer = Tokenizer.from_file(str(path))
-        except Exception as error:  # tokenizers raises bare Exceptions
-            raise ModelError(f"{path} is not a tokenizer.json: {' '.join(str(error).split())}.") from error
+            self._tokenizer = Tokenizer.from_str(read_text(self._path, _LARGEST_TOKENIZER))
+        except OSError as error:
+            raise ModelError(f"Cannot read {self._path}: {error.strerror}.") from error
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # tokenizers raises bare Exceptions, and panics that are none
+            raise ModelError(f"{self._path} is not a tokenizer.json: {shorten_to_line(str(error), 200)}.") from error
+        self._refuse_endless_texts()
         self._package = package
-        self._session = package.session("text")
+        self._network = package.session("text")
 
     def tokens(self, texts: list[str]) -> NDArray[np.int64]:
-        """(T, L) token numbers; the tokenizer file defines how texts are cut and padded."""
-        rows = [encoding.ids for encoding in self._tokenizer.encode_batch(texts)]
+        """(T, L) token numbers; the tokenizer file defines how texts are cut and padded. Raises ModelError."""
+        try:
+            rows = [encoding.ids for encoding in self._tokenizer.encode_batch(texts)]
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:
+            raise ModelError(f"{self._path} fails on a text: {shorten_to_line(str(error), 200)}.") from error
         if len({len(row) for row in rows}) > 1:
             raise ModelError(
                 f"{self._package.folder}/{self._package.parts['tokenizer']} does not pad texts: export it again."
@@ -157,15 +172,22 @@ class TextNetwork:
         """(T, D) unit embeddings."""
         parts = []
         for start in range(0, len(texts), _AT_ONCE):
-            (features,) = self._session.run(["features"], {"tokens": self.tokens(texts[start : start + _AT_ONCE])})
-            parts.append(features / np.linalg.norm(features, axis=1, keepdims=True))
-        features = np.concatenate(parts).astype(np.float32)
-        if features.shape[1] != self._package.dimension or not np.isfinite(features).all():
-            raise ModelError(
-                f"The text network of {self._package.folder} gives {features.shape[1]} dimensions, or numbers that are "
-                f"not finite; its manifest states {self._package.dimension} dimensions."
-            )
-        return features
+            tokens = self.tokens(texts[start : start + _AT_ONCE])
+            shapes = {"features": (len(tokens), self._package.dimension)}
+            (features,) = self._network.run(["features"], {"tokens": tokens}, shapes)
+            norms = np.linalg.norm(features, axis=1, keepdims=True)
+            if not (norms > 0).all():
+                raise ModelError(f"{self._network.path} gives a text no meaning, zeros alone: export it again.")
+            parts.append(features / norms)
+        return np.concatenate(parts).astype(np.float32)
+
+    def _refuse_endless_texts(self) -> None:
+        """Raises ModelError if texts would be padded to more tokens than any network reads."""
+        padding, truncation = (getattr(self._tokenizer, name) or {} for name in ("padding", "truncation"))
+        lengths = [padding.get("length"), padding.get("pad_to_multiple_of"), truncation.get("max_length")]
+        longest = max((length for length in lengths if length is not None), default=0)
+        if longest > _MOST_TOKENS:
+            raise ModelError(f"{self._path} makes texts of {longest} tokens, which no network reads: export it again.")
 
 
 def _read_cache(path: Path, dimension: int) -> dict[str, NDArray[np.float32]]:

@@ -2,23 +2,24 @@
 
 A query is one call, POST …/chat/completions, with a picture as a data URL. Each failure gives a message of one
 sentence.
-Standard library only. Source: the chat completions API, https://platform.openai.com/docs/api-reference/chat.
+Source: the chat completions API, https://platform.openai.com/docs/api-reference/chat.
 """
 
 from __future__ import annotations
 
 import base64
-import http.client
 import json
 import time
-import urllib.error
 import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import IO, Any
+from typing import Any
 from urllib.parse import urlsplit
 
+import msgspec
+
 from ..core.errors import ConfigError, FreeOccError
+from .timed_requests import Answer, NoAnswer, fetch
 
 _MOST_BYTES = 1 << 20  # largest answer
 _MOST_TOKENS = 1024
@@ -71,60 +72,46 @@ class VisionServer:
         raise AssertionError("unreachable")
 
     def _post(self, body: bytes) -> bytes:
+        """The body of the answer. Raises _Again, ServerError."""
         headers = {"Content-Type": "application/json", "Accept": "application/json", "User-Agent": "freeocc3d"}
         if self.key:
             headers["Authorization"] = f"Bearer {self.key}"
         url = resolve_address(self.endpoint)
         request = urllib.request.Request(url, body, headers, method="POST")
-        no_proxy = [urllib.request.ProxyHandler({})] if urlsplit(url).hostname in _LOCAL else []
-        opener = urllib.request.build_opener(_NoRedirects, *no_proxy)
-        deadline = time.monotonic() + self.timeout
+        received = bytearray()
+
+        def receive(_: Answer, piece: bytes) -> None:
+            received.extend(piece)
+            if len(received) > _MOST_BYTES:
+                raise ServerError(f"{url} sends more than {_MOST_BYTES:,} bytes", final=False)
+
         try:
-            with opener.open(request, timeout=self.timeout) as response:
-                return self._read(response, deadline)
-        except urllib.error.HTTPError as error:
-            with error:
-                said = self._cleaned(_excerpt(error))
-            text = f"{url} answers {error.code}{f': {said}' if said else ''}"
-            if error.code in _AGAIN:
-                raise _Again(text, _seconds(error.headers.get("Retry-After")), final=False) from error
-            raise ServerError(text, final=error.code in _FOREVER) from error
+            answer = fetch(request, receive, self.timeout, proxies=urlsplit(url).hostname not in _LOCAL)
         except TimeoutError as error:
             raise _Again(f"{url} does not answer within {self.timeout:g} s", final=False) from error
-        except (OSError, http.client.HTTPException) as error:  # URLError is an OSError
-            reason = getattr(error, "reason", error)
-            if isinstance(reason, TimeoutError):
-                raise _Again(f"{url} does not answer within {self.timeout:g} s", final=False) from error
-            raise _Again(f"{url} cannot be reached: {self._cleaned(str(reason) or 'the connection broke')}") from error
-
-    def _read(self, response: IO[bytes], deadline: float) -> bytes:
-        """Reads the body, up to the size limit of an answer. ``timeout`` covers the whole body, so that a server that
-        sends single bytes cannot delay a run."""
-        body = bytearray()
-        while chunk := response.read1(65536):  # type: ignore[attr-defined]
-            body += chunk
-            if len(body) > _MOST_BYTES:
-                raise ServerError(
-                    f"{resolve_address(self.endpoint)} sends more than {_MOST_BYTES:,} bytes", final=False
-                )
-            if time.monotonic() > deadline:
-                raise TimeoutError
-        return bytes(body)
+        except NoAnswer as error:
+            raise _Again(f"{url} cannot be reached: {self._cleaned(str(error))}") from error
+        if answer.succeeded:
+            return bytes(received)
+        said = self._cleaned(_message(answer.excerpt))
+        text = f"{url} answers {answer.status}{f': {said}' if said else ''}"
+        if answer.status in _AGAIN:
+            raise _Again(text, _seconds(answer.headers.get("Retry-After")), final=False)
+        raise ServerError(text, final=answer.status in _FOREVER)
 
     def _text_of(self, body: bytes) -> str:
         try:
-            choice = json.loads(body)["choices"][0]
-            message = choice["message"]
-            content = message.get("content")
-        except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
+            message = msgspec.json.decode(body, type=_Reply).choices[0].message
+        except (msgspec.MsgspecError, IndexError, RecursionError) as error:
             said = self._cleaned(body[:80].decode(errors="replace"))
             raise ServerError(
                 f"{resolve_address(self.endpoint)} does not answer like a chat endpoint: '{said}'", False
             ) from error
+        content = message.content
         if isinstance(content, list):  # parts, as some servers send them
             texts = [part.get("text") for part in content if isinstance(part, dict)]
             content = "\n".join(text for text in texts if isinstance(text, str))
-        return "" if message.get("refusal") or not isinstance(content, str) else content
+        return "" if message.refusal or not isinstance(content, str) else content
 
     def _cleaned(self, text: str) -> str:
         """One short line without the key, which some servers quote."""
@@ -166,24 +153,28 @@ class _Again(Exception):
         self.pause_s, self.final = pause_s, final
 
 
-class _NoRedirects(urllib.request.HTTPRedirectHandler):
-    """Refuses redirects, which would send the key to another address."""
-
-    def redirect_request(self, *_: Any) -> None:
-        return None
+class _Message(msgspec.Struct):
+    content: Any = None
+    refusal: Any = None
 
 
-def _excerpt(error: urllib.error.HTTPError) -> str:
+class _Choice(msgspec.Struct):
+    message: _Message
+
+
+class _Reply(msgspec.Struct):
+    """What is used of an answer."""
+
+    choices: list[_Choice]
+
+
+def _message(excerpt: bytes) -> str:
     """A server's message about an error, or the start of its body."""
     try:
-        text = error.read(4096).decode(errors="replace")
-    except (OSError, http.client.HTTPException):
-        return ""
-    try:
-        said = json.loads(text)["error"]
+        said = msgspec.json.decode(excerpt, type=dict[str, Any])["error"]
         return str(said["message"] if isinstance(said, dict) else said)
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return text
+    except (msgspec.MsgspecError, KeyError, RecursionError):
+        return excerpt.decode(errors="replace")
 
 
 def _seconds(text: str | None) -> float:

@@ -66,7 +66,7 @@ def test_free_share_and_inflation(tmp_path) -> None:
         ({"frame": "map"}, "must be gravity or first-camera, got 'map'"),
         ({"min_height": 2.0}, r"below 'nav2\.max_height'"),
         ({"min_free": 1.5}, "from 0 to 1"),
-        ({"inflation": -1.0}, "at least 0"),
+        ({"inflation": -1.0}, "from 0 to 1000"),
         ({"inflation": float("nan")}, "inflation"),
     ],
 )

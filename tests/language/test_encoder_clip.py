@@ -182,7 +182,7 @@ def test_other_precisions_stay_near(folder: Path, tmp_path: Path, precision: str
         ({"attention": "nackclip"}, "'attention' must be plain, maskclip"),
         ({"short_side": 3}, "'short_side' must be from 16 to 4096"),
         ({"window": -1}, "'window' must be from 0 to 4096"),
-        ({"stride": -1}, "'stride' must be at least 0"),
+        ({"stride": -1}, "'stride' must be from 0 to 4096"),
         ({"templates": ("a photo",)}, "Each of 'templates' must contain {}"),
         ({"contrast": ("wall", " ")}, "'contrast' must not contain empty words"),
     ],

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import yaml
 from model_folders import dense_package, graph, succeed, write_manifest
@@ -97,16 +99,23 @@ def test_other_inputs_and_outputs_are_reported(tmp_path: Path, inputs: Any, outp
     [
         ({"format": 2}, "it must contain format: 1"),
         ({"kind": "diffusion"}, "kind 'diffusion' is not one of clip"),
-        ({"dimension": "8"}, "'dimension' is missing or not of type int"),
-        ({"dimension": True}, "'dimension' is missing or not of type int"),
-        ({"dimension": 0}, "must be greater than 0"),
-        ({"dimension": 1 << 40}, "must be greater than 0, and usual"),
-        ({"patch": 300}, "and 'input_size' must not be less than 'patch'"),
-        ({"mean": [0.5]}, "'mean' and 'std' must be three numbers"),
-        ({"std": [0.5, 0.5, 0.0]}, "must be greater than 0"),
+        ({"dimension": "8"}, "'dimension' has text instead of a whole number"),
+        ({"dimension": True}, "'dimension' has true or false instead of a whole number"),
+        ({"dimension": 0}, "'dimension' has a number that is not >= 1"),
+        ({"dimension": 1 << 40}, "'dimension' has a number that is not <= 65536"),
+        ({"patch": 300}, "'input_size' must not be less than 'patch'"),
+        ({"mean": [0.5]}, "'mean' has 1 entries instead of 3"),
+        ({"std": [0.5, 0.5, 0.0]}, "'std' at least 0.001"),
         ({"std": [0.5, 0.5, float("nan")]}, "must be finite"),
-        ({"licence": None}, "'licence' is missing"),
+        ({"licence": None}, "'licence' has nothing instead of text"),
         ({"parts": {"image": "image.onnx"}}, "'parts' lacks text, tokenizer"),
+        ({"logit_scale": float("inf")}, "'logit_scale' has a number that is not"),
+        ({"mean": [1e300, 0, 0]}, "must be levels in 0…1"),
+        ({"prefix_tokens": -1}, "'prefix_tokens' has a number that is not >= 0"),
+        ({"name": ""}, "'name'"),
+        ({"parts": []}, "'parts' has a list instead of a group of keys"),
+        ({"files": {"image.onnx": 5}}, "has a whole number instead of text"),
+        ({"format": True}, "it must contain format: 1"),
         ({"files": {}}, "'parts' and 'files' must name the same files"),
     ],
 )
@@ -139,7 +148,7 @@ def test_manifests_run_nothing(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"Cannot read .*manifest\.yaml"):
         model_packages.read_package(folder)
     (folder / "manifest.yaml").write_text("a: " + "x" * (1 << 20))
-    with pytest.raises(ModelError, match="larger than a megabyte"):
+    with pytest.raises(ModelError, match="more than the 1 MB"):
         model_packages.read_package(folder)
 
 
@@ -192,3 +201,62 @@ def test_the_command_lists_and_verifies(home: Path, capsys: pytest.CaptureFixtur
     assert "good: 3 files match their hashes" in said.out
     assert "text.onnx is damaged" in said.err
     assert "strange is not a model package" in said.err
+
+
+@pytest.mark.parametrize("location", ["../weights.onnx.data", "/etc/passwd", "", "a/b.onnx.data", "other.onnx.data"])
+def test_weights_elsewhere_are_refused(tmp_path: Path, location: str) -> None:
+    folder = dense_package(tmp_path / "tiny")
+    (folder / "other.onnx.data").write_bytes(bytes(4 * 8))
+    keep_outside(folder / "text.onnx", location)
+    write_manifest(folder)
+    with pytest.raises(ModelError, match="keeps weights in"):
+        model_packages.read_package(folder).session("text")
+
+
+def test_weights_beside_a_network_are_checked(tmp_path: Path) -> None:
+    folder = dense_package(tmp_path / "tiny")
+    weights = folder / "text.onnx.data"
+    weights.write_bytes(np.arange(8, dtype=np.float32).tobytes())
+    keep_outside(folder / "text.onnx", weights.name)
+    parts = {"image": "image.onnx", "text": "text.onnx", "tokenizer": "tokenizer.json"}
+    files = {name: model_packages.hash_file(folder / name) for name in (*parts.values(), weights.name)}
+    write_manifest(folder, files=files)
+    package = model_packages.read_package(folder)
+    model_packages.verify_files(package)
+    (found,) = package.session("text").run(["features"], {"tokens": np.zeros((1, 1), np.float32)})
+    assert found.tolist() == [list(range(8))]
+    weights.write_bytes(bytes(32))
+    with pytest.raises(ModelError, match=r"text\.onnx\.data is damaged"):
+        package.session("text")
+    with pytest.raises(ModelError, match=r"text\.onnx\.data is damaged"):
+        model_packages.verify_files(package)
+
+
+def keep_outside(path: Path, location: str) -> None:
+    """Move the numbers of a network into another file, as it states."""
+    model = onnx.load(path)
+    (tensor,) = model.graph.initializer
+    tensor.ClearField("raw_data")
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value=location)
+    path.write_bytes(model.SerializeToString())
+
+
+@pytest.mark.parametrize("name", ["manifest.yaml", "text.onnx", "tokenizer.json"])
+@pytest.mark.parametrize("kind", ["fifo", "folder", "loop", "device", "link"])
+def test_only_regular_files_are_read(tmp_path: Path, name: str, kind: str) -> None:
+    folder = dense_package(tmp_path / "tiny")
+    path = folder / name
+    content = path.read_bytes()
+    path.unlink()
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        (tmp_path / "elsewhere").write_bytes(content)
+        path.symlink_to({"loop": path, "device": "/dev/zero", "link": tmp_path / "elsewhere"}[kind])
+    if kind == "link" and name == "manifest.yaml":
+        return
+    with pytest.raises(ModelError, match=r"lacks its file|Cannot read|is a link|has no manifest"):
+        model_packages.verify_files(model_packages.read_package(folder))

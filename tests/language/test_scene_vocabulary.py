@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -186,3 +187,20 @@ def test_options_out_of_range_are_refused(bad: dict[str, Any], told: str) -> Non
 
 def test_no_answers_make_an_empty_vocabulary() -> None:
     assert aggregate_names({}, "m") == {"model": "m", "keyframes": [], "names": {}}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["\n" * 10**6, " " * 10**6, "- x" + " " * 10**6 + "y", "-\n" * 10**6, "[" * 10**6, "<think>" * 10**5, "(" * 10**6,
+     "1. " * 10**6, "- " + "a " * 10**6, "[1," * 10**5, ("<think></think>" + "\t") * 10**5],
+    ids=str.split("newlines spaces gap bullets brackets thoughts parentheses numbers words lists tabs"),
+)  # fmt: skip
+def test_an_answer_of_a_model_that_repeats_itself_is_read_at_once(text: str) -> None:
+    began = time.process_time()
+    parse_names(text)
+    assert time.process_time() - began < 2
+
+
+def test_the_names_at_the_start_of_a_long_answer_are_read() -> None:
+    assert parse_names("- chair\n- desk\n" + "\n" * 10**6) == ["chair", "desk"]
+    assert parse_names("- chair\n" * 10**5) == ["chair"]

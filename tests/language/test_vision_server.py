@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from hostile_servers import Connection, attacking
 from vision_servers import Answer, chat, saying, send, serving
 
 from freeocc3d.core.errors import ConfigError
@@ -229,3 +230,31 @@ def test_texts_of_answers(body: bytes, text: str) -> None:
 
 def test_one_line_is_fit_to_be_shown() -> None:
     assert shorten_to_line("a\n\tb\x1b[31m  c\u202e" + 100 * "d", 9) == "a b [31m "[:9]
+
+
+@pytest.mark.parametrize(
+    ("start", "forever"),
+    [
+        (b"HTTP/1.1 200 OK\r\n", b"X-Y: z\r\n"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", b" "),
+        (b"HTTP/1.1 503 Busy\r\nContent-Length: 4000\r\n\r\n", b" "),
+        (b"", b"HTTP/1.1 100 Continue\r\n\r\n"),
+        (b"", b"HTTP/1.1 200 OK "),
+    ],
+)
+def test_the_timeout_holds_for_headers_and_bodies_of_errors_too(start: bytes, forever: bytes) -> None:
+    def script(connection: Connection) -> None:
+        connection.send(start)
+        connection.drip(forever)
+
+    with attacking(script) as server, pytest.raises(ServerError, match=r"within 0\.3 s"):
+        asking(server.url, timeout=0.3, retries=1).ask("What?", JPEG)
+    assert server.connections == 2
+
+
+SHAPES = [b'{"choices": [{"message": {"content": NaN}}]}', b'{"choices": {"0": {}}}', b"\x1f\x8b" * 99]
+
+
+@pytest.mark.parametrize("body", SHAPES)
+def test_an_answer_of_another_shape_is_reported(body: bytes) -> None:
+    failing(lambda handler, _: send(handler, body, Content_Encoding="gzip"), "does not answer like a chat", False)

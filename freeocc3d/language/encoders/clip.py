@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import ModelError
 from ...core.types import Frame
 from ...settings.option_types import Advanced, Cosine
 from .. import model_packages
@@ -63,11 +64,12 @@ class ClipEncoder(Encoder):
         from .. import clip_attention
 
         chosen = self.options.attention
-        q, k, v, stream = self._image.run(["queries", "keys", "values", "stream"], {"image": images})
+        h, w = tiling.window
+        q, k, v, stream = self._attention_of(images, h * w)
         mixed = clip_attention.mix_values(chosen, q, k, v, tiling.window)
         output = "features" if clip_attention.KEEPS_REST[chosen] else "reduced"
-        (features,) = self._head.run([output], {"mixed": mixed, "stream": stream})
-        h, w = tiling.window
+        shapes = {output: (*stream.shape[:2], self.dimension)}
+        (features,) = self._head.run([output], {"mixed": mixed, "stream": stream}, shapes)
         return np.asarray(features[:, -h * w :].reshape(len(images), h, w, -1))
 
     def pooled(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -75,10 +77,25 @@ class ClipEncoder(Encoder):
         test compares a package with its checkpoint by them."""
         from .. import clip_attention
 
-        q, k, v, stream = self._image.run(["queries", "keys", "values", "stream"], {"image": images})
         grid = images.shape[2] // self.package.patch, images.shape[3] // self.package.patch
+        q, k, v, stream = self._attention_of(images, grid[0] * grid[1])
         mixed = clip_attention.mix_values("plain", q, k, v, grid)
         return np.asarray(self._head.run(["pooled"], {"mixed": mixed, "stream": stream})[0])
+
+    def _attention_of(self, images: NDArray[np.float32], patches: int) -> list[NDArray[np.float32]]:
+        """Queries, keys and values (B, heads, N, d) of the last block, and its stream (B, N, heads d). Raises
+        ModelError."""
+        names = ["queries", "keys", "values", "stream"]
+        parts = self._image.run(names, {"image": images}, dict.fromkeys(names[:3], (len(images), None, None, None)))
+        tokens = patches + self.package.prefix_tokens
+        batch, heads, _, width = parts[0].shape
+        own = [(batch, heads, tokens, width)] * 3 + [(batch, tokens, heads * width)]
+        if [part.shape for part in parts] != own:
+            raise ModelError(
+                f"{self._image.path} gives attention of {parts[0].shape[2]} tokens for images of {patches} patches and "
+                f"{self.package.prefix_tokens} other tokens, or its parts do not fit each other: export it again."
+            )
+        return parts
 
     def text_state(self) -> dict[str, Any]:
         return self.options.wording.state(self.package)

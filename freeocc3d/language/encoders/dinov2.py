@@ -49,7 +49,8 @@ class Dinov2Encoder(Encoder):
 
     def _window_features(self, images: NDArray[np.float32], tiling: Tiling) -> NDArray[np.float32]:
         """(B, h, w, D) of (B, 3, H, W) windows."""
-        return np.asarray(self._image.run(["features"], {"image": images})[0])
+        shapes = {"features": (len(images), *tiling.window, self.dimension)}
+        return np.asarray(self._image.run(["features"], {"image": images}, shapes)[0])
 
     def text_state(self) -> dict[str, Any]:
         return self.options.wording.state(self.package)

@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from ...core.errors import ModelError
 from ...core.types import Frame
 from .. import model_packages
 from ..text_networks import ModelWords
@@ -51,7 +52,13 @@ class SeemEncoder(Encoder):
         package, rgb = self.package, frame.color
         tiling = Tiling.of(rgb.shape[0], rgb.shape[1], package, self.options.short_side, 0)
         image = tiling.image(rgb, package.mean, package.std)[None]
-        masks, embeddings = self._image.run(["masks", "embeddings"], {"image": image})
+        shapes = {"masks": (1, None, None, None), "embeddings": (1, None, self.dimension)}
+        masks, embeddings = self._image.run(["masks", "embeddings"], {"image": image}, shapes)
+        if len(masks[0]) != len(embeddings[0]) or not masks.size:
+            raise ModelError(
+                f"{self._image.path} gives masks {masks.shape} and embeddings {embeddings.shape}, which do not fit "
+                "each other: export it again."
+            )
         return paint_masks(masks[0], embeddings[0], self.options.mask_probability)
 
     def text_state(self) -> dict[str, Any]:

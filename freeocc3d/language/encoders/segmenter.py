@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...capture.base import Capture
 from ...capture.class_files import read_class_file, read_class_names
 from ...core.errors import ConfigError, FrameError
-from ...core.onnx_session import load_session
+from ...core.onnx_session import load_network
 from ...core.typed_documents import as_type
 from ...core.types import Frame
 from ...settings.option_types import Device, FilePath, Stride
@@ -114,7 +114,8 @@ class SegmentationNetwork:
     def __init__(self, path: Path, n_classes: int, options: Options):
         """Raises ConfigError for a file that cannot be used; the message says why in one sentence."""
         self.path, self.n_classes, self.options = path, n_classes, options
-        self.session = load_session(path, options.device)
+        self.network = load_network(path, options.device)
+        self.session = self.network.session
         self.input, self.last, self.size = self._input()
         self.dtype = _INPUTS[self.input.type]
         self.output = self._output()
@@ -134,12 +135,8 @@ class SegmentationNetwork:
     def _scores(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(h, w, C) the network's output for an image."""
         image = self._image(rgb)
-        try:
-            given = self.session.run([self.output.name], {self.input.name: image})[0]
-        except Exception as error:  # ONNX Runtime raises many types that share no base but Exception
-            reason = " ".join(str(error).split())[:200]
-            raise ConfigError(f"{self.path} fails on an image of shape {_shape(image.shape)}: {reason}") from error
-        return self._by_class(np.asarray(given))
+        (given,) = self.network.run([self.output.name], {self.input.name: image}, finite=False)
+        return self._by_class(given)
 
     def _image(self, rgb: NDArray[np.uint8]) -> NDArray[np.generic]:
         """The frame in the form that the input needs."""
@@ -158,7 +155,11 @@ class SegmentationNetwork:
     def _by_class(self, given: NDArray[Any]) -> NDArray[np.float32]:
         """(h, w, C) logits or posteriors of an output; one-hot if the output contains class numbers."""
         if np.issubdtype(given.dtype, np.integer):
+            if given.ndim not in (3, 4) or not given.size:
+                raise ConfigError(self._misfit([(self.output.name, given.shape)]))
             numbers = given.reshape(given.shape[-2:]) if given.size == np.prod(given.shape[-2:]) else given[0, ..., 0]
+            if numbers.ndim != 2:
+                raise ConfigError(self._misfit([(self.output.name, given.shape)]))
             if numbers.min(initial=0) < 0 or numbers.max(initial=0) >= self.n_classes:
                 raise ConfigError(
                     f"{self.path} gives class {numbers.max()}, but only {self.n_classes} classes have names: complete "
@@ -166,7 +167,7 @@ class SegmentationNetwork:
                 )
             return np.eye(self.n_classes, dtype=np.float32)[numbers]
         axis = _class_axis(given.shape, self.n_classes, self.last)
-        if given.ndim != 4 or axis is None:
+        if given.ndim != 4 or axis is None or given.shape[axis] != self.n_classes or not given.size:
             raise ConfigError(self._misfit([(self.output.name, given.shape)]))
         return np.ascontiguousarray(np.moveaxis(given[0], axis - 1, -1), np.float32)
 

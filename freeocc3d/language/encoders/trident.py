@@ -110,8 +110,10 @@ class TridentEncoder(Encoder):
         for (images, corners), (others, _) in zip(
             tiling.windows(tiling.image(rgb, clip.mean, clip.std)), seen_by_dino, strict=True
         ):
-            (values,) = self._image.run(["values"], {"image": images})
-            (seen,) = self._dino.run(["features"], {"image": others})
+            tokens = tiling.window[0] * tiling.window[1] + clip.prefix_tokens
+            (values,) = self._image.run(["values"], {"image": images}, {"values": (len(images), None, tokens, None)})
+            own = {"features": (len(images), *tiling.window, None)}
+            (seen,) = self._dino.run(["features"], {"image": others}, own)
             mixed = self._mixed(values, seen, tiling)
             splice = splice or Splice(tiling, mixed.shape[-1])
             splice.add(mixed, corners)
@@ -131,7 +133,8 @@ class TridentEncoder(Encoder):
         """(N, D) unit features of (N, width) mixed values."""
         from ..patch_features import normalize_patches
 
-        (features,) = self._head.run(["reduced"], {"mixed": mixed[None], "stream": np.zeros_like(mixed[None])})
+        fed = {"mixed": mixed[None], "stream": np.zeros_like(mixed[None])}
+        (features,) = self._head.run(["reduced"], fed, {"reduced": (1, len(mixed), self.dimension)})
         return normalize_patches(features[0])
 
     def _sam_view(self, rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[int, int]]:
@@ -146,7 +149,9 @@ class TridentEncoder(Encoder):
         tiling = dataclasses.replace(tiling, grid=grid)
         square = np.zeros((1, 3, size, size), np.float32)
         square[0, :, : grid[0] * patch, : grid[1] * patch] = tiling.image(rgb, self.sam.mean, self.sam.std)
-        features, attention = self._sam.run(["features", "attention"], {"image": square})
+        n = size // patch
+        shapes = {"features": (1, None, n, n), "attention": (1, n * n, n * n)}
+        features, attention = self._sam.run(["features", "attention"], {"image": square}, shapes)
         return features, attention, grid
 
     def _refined(self, features: NDArray[np.float32], sam_features: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -157,7 +162,9 @@ class TridentEncoder(Encoder):
         spacing = max(h, w) / self.options.points * self.sam.patch
         xs, ys = (np.arange(spacing / 2, n * self.sam.patch, spacing, dtype=np.float32) for n in (w, h))
         points = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(1, -1, 2)
-        masks, scores = self._masks.run(["masks", "scores"], {"features": sam_features, "points": points})
+        count, n = points.shape[1], sam_features.shape[2]
+        shapes = {"masks": (1, count, 3, 4 * n, 4 * n), "scores": (1, count, 3)}
+        masks, scores = self._masks.run(["masks", "scores"], {"features": sam_features, "points": points}, shapes)
         best = scores[0].argmax(axis=1)
         rows = np.flatnonzero(scores[0, np.arange(len(best)), best] >= self.options.mask_score)
         finer = normalize_patches(resample_patches(features, (_FINER * h, _FINER * w)))

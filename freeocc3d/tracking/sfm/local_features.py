@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import ModelError
-from ...core.threads import count_threads
+from ...core.onnx_session import load_network
 
 SIFT = "sift"
 
@@ -90,28 +90,19 @@ class KeypointNetwork:
     ratio = 1.0
 
     def __init__(self, path: Path):
-        import onnxruntime as ort
-
         if not path.is_file():
             raise ModelError(f"There is no network {path}: set tracking.colmap.features to sift, or to an .onnx file.")
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = count_threads()
-        options.log_severity_level = 3
-        try:
-            self._session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's exceptions share no base class
-            said = " ".join(str(error).split())[:200].rstrip(".")
-            raise ModelError(f"{path} is not an ONNX network that onnxruntime can run: {said}.") from error
+        self._network = load_network(path)
         self._path = path
-        inputs, outputs = self._session.get_inputs(), [output.name for output in self._session.get_outputs()]
-        self._named = [next((n for n in outputs if kind in n.lower()), None) for kind in ("keypoint", "descriptor")]
-        shape = inputs[0].shape if len(inputs) == 1 else []
-        if len(shape) != 4 or shape[1] not in (_GRAY, _COLOR) or None in self._named:
+        inputs, outputs = list(self._network.inputs.items()), list(self._network.outputs)
+        self._named = [next((n for n in outputs if kind in n.lower()), "") for kind in ("keypoint", "descriptor")]
+        shape = inputs[0][1] if len(inputs) == 1 else []
+        if len(shape) != 4 or shape[1] not in (_GRAY, _COLOR) or "" in self._named:
             raise ModelError(
                 f"{path} is not a network for local features: it must take one image (1, 1 or 3, H, W) and give "
-                f"keypoints and descriptors, but takes {[i.name for i in inputs]} and gives {outputs}."
+                f"keypoints and descriptors, but takes {[name for name, _ in inputs]} and gives {outputs}."
             )
-        self._input, self._channels = inputs[0].name, shape[1]
+        self._input, self._channels = inputs[0][0], shape[1]
         self._size = tuple(side if isinstance(side, int) else None for side in shape[2:])
 
     def __call__(self, color: NDArray[np.uint8]) -> LocalFeatures:
@@ -119,7 +110,10 @@ class KeypointNetwork:
         height, width = (own or given for own, given in zip(self._size, image.shape[:2], strict=True))
         shrunk = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).reshape(height, width, -1)
         tensor = np.ascontiguousarray(shrunk.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
-        keypoints, descriptors = self._session.run(self._named, {self._input: tensor})
+        keypoints, descriptors = self._network.run(self._named, {self._input: tensor})
+        flat = min(keypoints.ndim, descriptors.ndim) < 2
+        if flat or keypoints.shape[-1] < 2 or max(descriptors.shape[:-2], default=1) > 1:
+            raise ModelError(f"{self._path} gives keypoints {keypoints.shape} and descriptors {descriptors.shape}.")
         pixels = np.asarray(keypoints, np.float32).reshape(-1, keypoints.shape[-1])[:, :2]
         found = np.asarray(descriptors, np.float32).reshape(descriptors.shape[-2:])
         if len(found) != len(pixels):
