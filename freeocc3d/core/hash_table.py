@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from .compiling import njit
-from .voxel_keys import pack_index
+from .voxel_keys import KEY_LIMIT, pack_index
 
 packed_key = njit(cache=True, nogil=True)(pack_index)
 """``pack_index`` for compiled code."""
+
+
+@njit(cache=True, nogil=True)
+def cell_index(place: float) -> int:
+    """The whole number at or below a place, in cells; the nearest that a key can hold for places farther away."""
+    return np.int64(math.floor(min(max(place, np.float64(-KEY_LIMIT)), np.float64(KEY_LIMIT - 1))))
 
 
 @njit(cache=True, nogil=True)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..core.errors import ConfigError
 from ..core.transforms import invert, multiply_quats, rotations_to_quats
 from ..core.types import Frame, Gaussians, PosedFrame
 from ..settings.stages import GaussianOptions as Options
@@ -27,6 +28,8 @@ _COLUMNS = 320
 
 _SAMPLED = 4  # step between the pixels for a frame's median depth
 _BACKWARD = 1e-6  # smallest 1 + z of a ray, so that a ray exactly backward gives a quaternion
+_FINEST = 12.0
+"""Cells that a pixel covers along an edge, at most."""
 _LEAST_RADIUS_M = 1e-4  # of Gaussians whose neighbors are at the same place
 
 
@@ -49,9 +52,12 @@ class AnchoredCells:
         self.cell_size = cell_size
         self._T_world_keyframe = T_world_keyframe
         self._sums = CellSums(cell_size)
+        self._compared = False
 
     def add(self, posed: PosedFrame) -> None:
         """Adds a keyframe, or a frame between keyframes; the points of such a frame are anchored to its keyframe."""
+        if not self._compared:
+            self._compared = _refuse_tiny(self.cell_size, posed.frame)
         self._sums.add_frame(posed, self.stride(posed.frame), self.options.edge)
 
     def gaussians(self, frames: Iterable[PosedFrame]) -> Gaussians:
@@ -104,6 +110,22 @@ class AnchoredCells:
         usual = float(np.median(measured)) if len(measured) else 1.0
         fine = int(0.5 * self.cell_size * frame.intrinsics.fx / usual)
         return max(1, min(frame.intrinsics.width // _COLUMNS, fine))
+
+
+def _refuse_tiny(cell_size: float, frame: Frame) -> bool:
+    """Whether a frame has depth to compare the cells with. Raises ConfigError if they are so much smaller than what a
+    pixel covers that voxels of this size cannot show anything but single measurements."""
+    measured = frame.depth_m[frame.depth_m > 0]
+    if not len(measured):
+        return False
+    footprint = float(np.median(measured)) / frame.intrinsics.fx
+    if cell_size < footprint / _FINEST:
+        raise ConfigError(
+            f"Gaussians of {cell_size:.2g} m, half a voxel unless gaussians.cell_size is given, are far smaller than "
+            f"the {footprint:.2g} m that a pixel covers at the usual depth: choose occupancy.voxel_size or "
+            f"gaussians.cell_size of at least {footprint / _FINEST * 2:.2g}."
+        )
+    return True
 
 
 def align_to_rays(

@@ -104,9 +104,10 @@ def _look(
         z = R[2, 0] * points[n, 0] + R[2, 1] * points[n, 1] + R[2, 2] * points[n, 2] + t[2]
         if z < _NEAREST_M:
             continue
-        column, line = math.floor(fx * x / z + cx + 0.5), math.floor(fy * y / z + cy + 0.5)
-        if column < 0 or line < 0 or column >= width or line >= height:
+        u, v = fx * x / z + cx + 0.5, fy * y / z + cy + 0.5
+        if not (u >= 0 and v >= 0 and u < width and v < height):
             continue
+        column, line = math.floor(u), math.floor(v)
         depth = np.float64(depth_m[line, column])
         if depth <= 0 or is_at_edge(depth_m, line, column, edge):
             continue

@@ -100,8 +100,8 @@ def project_splats(
         u_reach, v_reach = reach * math.sqrt(uu), reach * math.sqrt(vv)
         if not (u + u_reach >= 0 and v + v_reach >= 0 and u - u_reach <= width - 1 and v - v_reach <= height - 1):
             continue
-        box[g, 0], box[g, 1] = max(math.ceil(u - u_reach), 0), min(math.floor(u + u_reach), width - 1)
-        box[g, 2], box[g, 3] = max(math.ceil(v - v_reach), 0), min(math.floor(v + v_reach), height - 1)
+        box[g, 0], box[g, 1] = math.ceil(max(u - u_reach, 0)), math.floor(min(u + u_reach, width - 1))
+        box[g, 2], box[g, 3] = math.ceil(max(v - v_reach, 0)), math.floor(min(v + v_reach, height - 1))
         if box[g, 2] > box[g, 3]:
             box[g, 0], box[g, 1] = 1, 0
             continue

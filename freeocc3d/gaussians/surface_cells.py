@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,10 +10,10 @@ from numpy.typing import NDArray
 
 from ..core.compiling import njit
 from ..core.depth_noise import compute_sigma_image, look_up_sigma, take_stated_sigma
-from ..core.hash_table import build_table, find_slot, packed_key
+from ..core.hash_table import build_table, cell_index, find_slot, packed_key
 from ..core.transforms import back_project, transform
 from ..core.types import PosedFrame
-from ..core.voxel_keys import pack_voxels
+from ..core.voxel_keys import KEY_LIMIT, pack_voxels
 from .depth_edges import is_at_edge, mask_away_from_edges
 
 _SUMS = 7
@@ -113,7 +112,7 @@ class CellSums:
 def cell_keys(points_world: NDArray[np.float64], cell_size: float) -> NDArray[np.int64]:
     """Converts (N, 3) meters to (N,) integers, one per cell; cells within 2**20 of the origin along each axis have
     distinct integers."""
-    return pack_voxels(np.floor(points_world / cell_size).astype(np.int64))
+    return pack_voxels(np.clip(np.floor(points_world / cell_size), -KEY_LIMIT, KEY_LIMIT - 1).astype(np.int64))
 
 
 def cells_reference(posed: PosedFrame, step: int, edge: float, cell_size: float) -> Cells:
@@ -166,9 +165,7 @@ def _add_frame(  # type: ignore[no-untyped-def]
             wx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * depth + T[0, 3]
             wy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * depth + T[1, 3]
             wz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * depth + T[2, 3]
-            i = np.int64(math.floor(wx / cell_size))
-            j = np.int64(math.floor(wy / cell_size))
-            k = np.int64(math.floor(wz / cell_size))
+            i, j, k = cell_index(wx / cell_size), cell_index(wy / cell_size), cell_index(wz / cell_size)
             row, used = _row_of(packed_key(i, j, k), used, table, rows, keys)
             sigma = look_up_sigma(sigma_m, v, u, depth)
             w = 1.0 / (sigma * sigma)

@@ -148,7 +148,9 @@ def _span(
     half = max(b * b * dv * dv - a * (c * dv * dv + np.float32(2) * least), np.float32(0))
     half = math.sqrt(half) / a + np.float32(_SLACK)
     middle = u - b * dv / a
-    return max(low, math.ceil(middle - half)), min(high, math.floor(middle + half))
+    lowest, highest = np.float32(low), np.float32(high)  # before the cast: it is undefined for what no integer holds
+    first = math.ceil(min(max(middle - half, lowest), highest + np.float32(1)))
+    return max(low, first), min(high, math.floor(max(min(middle + half, highest), lowest - np.float32(1))))
 
 
 @njit(parallel=True, cache=True, error_model="numpy")

@@ -14,7 +14,7 @@ from ..core.transforms import back_project, invert, transform
 from ..core.types import BLOCK, Frame
 from ..core.voxel_keys import unpack_voxels
 from ..settings.stages import CarvingOptions as Options
-from .voxel_blocks import find_blocks_along_rays
+from .voxel_blocks import find_blocks_along_rays, refuse_blocks
 
 _SIGMAS = 3
 """Standard deviations of a depth within which its surface lies: 99.7 % of Gaussian noise."""
@@ -135,6 +135,7 @@ class DepthEvidence:
             return
         used, wanted = len(self.packed), len(self.packed) + len(new)
         if wanted > len(self._free):
+            refuse_blocks(wanted, self.voxel_size)
             more = np.zeros((max(wanted, 3 * len(self._free) // 2) - len(self._free), BLOCK**3), np.uint16)
             self._free, self._hits = np.concatenate((self._free, more)), np.concatenate((self._hits, more))
         place = np.searchsorted(self.packed, new)
@@ -192,9 +193,9 @@ def _count(
                 continue
             u = fx * (R[0, 0] * vx + R[0, 1] * vy + R[0, 2] * vz + t[0]) / z + cx
             v = fy * (R[1, 0] * vx + R[1, 1] * vy + R[1, 2] * vz + t[1]) / z + cy
-            column, row = math.floor(u + 0.5), math.floor(v + 0.5)
-            if column < 0 or row < 0 or column >= width or row >= height:
+            if not (u + 0.5 >= 0 and v + 0.5 >= 0 and u + 0.5 < width and v + 0.5 < height):
                 continue
+            column, row = math.floor(u + 0.5), math.floor(v + 0.5)
             depth = depth_m[row, column]
             if depth == 0:
                 continue

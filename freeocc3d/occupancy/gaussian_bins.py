@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from ..core.compiling import njit
 from ..core.hash_table import build_table, find_row, packed_key
 from ..core.threads import count_threads
-from .voxel_blocks import find_touched_blocks, unite_keys
+from ..core.types import BLOCK
+from ..core.voxel_keys import KEY_LIMIT
+from .voxel_blocks import find_touched_blocks, refuse_blocks, unite_keys
 
 PROBABILISTIC, POISSON, INTEGRATED, RELEASED = range(4)
 MODES = {"probabilistic": PROBABILISTIC, "poisson": POISSON, "integrated": INTEGRATED, "released": RELEASED}
@@ -25,6 +27,10 @@ SMALLEST_SCALE_M = 1e-5
 
 LEAST_OPACITY = 1e-6
 """Least opacity in the logarithm of a weight: a Gaussian that no image shows has almost no weight."""
+
+
+_FARTHEST = BLOCK * KEY_LIMIT - BLOCK
+"""Voxels from the origin of the farthest ones whose blocks have keys."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,16 @@ class Bins:
         start = np.concatenate(([0], np.cumsum(count)))
         pairs = np.arange(start[-1]) + np.repeat(self.start[rows] - start[:-1], count)
         return replace(self, packed=self.packed[rows], start=start, gaussian=self.gaussian[pairs])
+
+
+@njit(cache=True)
+def _voxel_at_or_below(place: float) -> int:
+    return math.floor(min(max(place, -_FARTHEST), _FARTHEST))
+
+
+@njit(cache=True)
+def _voxel_at_or_above(place: float) -> int:
+    return math.ceil(min(max(place, -_FARTHEST), _FARTHEST))
 
 
 @njit(parallel=True, cache=True)
@@ -100,7 +116,7 @@ def prepare_gaussians(
             log_weight[g] -= math.log(s0 * s1 * s2)
         elif mode == RELEASED:
             d0, d1, d2 = d0 * size**4, d1 * size**4, d2 * size**4
-        dilation = math.ceil(cutoff * max(s0, s1, s2))
+        dilation = _voxel_at_or_above(cutoff * max(s0, s1, s2))
         entry = 0
         for i in range(3):
             a = R[i]
@@ -112,16 +128,17 @@ def prepare_gaussians(
             means[g, i] = mean
             reach = cutoff * math.sqrt((a[0] * s0) ** 2 + (a[1] * s1) ** 2 + (a[2] * s2) ** 2)
             if mode == RELEASED:
-                lo[g, i], hi[g, i] = math.floor(mean) - dilation, math.floor(mean) + dilation
+                lo[g, i] = max(_voxel_at_or_below(mean) - dilation, -_FARTHEST)
+                hi[g, i] = min(_voxel_at_or_below(mean) + dilation, _FARTHEST)
             elif mode == INTEGRATED:  # some part of the voxel
-                lo[g, i], hi[g, i] = math.floor(mean - reach), math.floor(mean + reach)
+                lo[g, i], hi[g, i] = _voxel_at_or_below(mean - reach), _voxel_at_or_below(mean + reach)
             else:  # its center
-                lo[g, i], hi[g, i] = math.ceil(mean - reach - 0.5), math.floor(mean + reach - 0.5)
+                lo[g, i], hi[g, i] = _voxel_at_or_above(mean - reach - 0.5), _voxel_at_or_below(mean + reach - 0.5)
     return means, form, log_weight, lo, hi
 
 
 def sort_by_block(
-    lo: NDArray[np.int32], hi: NDArray[np.int32]
+    lo: NDArray[np.int32], hi: NDArray[np.int32], voxel_size: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
     """Sorts the (Gaussian, block) pairs by counting. Returns the blocks' packed keys, the start of each block's
     Gaussians, and the Gaussians. Each thread sorts a part of the Gaussians. The parts keep their order, so the result
@@ -130,6 +147,7 @@ def sort_by_block(
     parts = [slice(first, end) for first, end in pairwise(bounds)]
     with ThreadPoolExecutor(len(parts)) as threads:
         packed = unite_keys(*threads.map(lambda part: find_touched_blocks(lo[part], hi[part]), parts))
+        refuse_blocks(len(packed), voxel_size)
         table, rows = build_table(packed, len(packed))
         count = np.stack(list(threads.map(lambda part: _count(table, rows, lo[part], hi[part], len(packed)), parts)))
         start = np.concatenate(([0], np.cumsum(count.sum(axis=0))))

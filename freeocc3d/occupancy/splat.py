@@ -42,6 +42,8 @@ from .gaussian_bins import INTEGRATED, MODES, POISSON, PROBABILISTIC, RELEASED, 
 
 _MOST_TOUCHED = 1 << 28
 """Pairs of a Gaussian and a block that it touches; a Gaussian of a map touches about ten."""
+_MOST_OF_EACH, _FEW_TOUCHED = 512, 1 << 20
+"""Blocks that Gaussians touch on average, at most, and a number of pairs that takes no time."""
 
 
 def check(options: Options) -> None:
@@ -76,7 +78,7 @@ def bin_gaussians(
     if shape is not None:
         lo, hi = np.maximum(lo, np.int32(0)), np.minimum(hi, np.array(shape, np.int32) - 1)
     _refuse_many(lo, hi, options)
-    packed, start, gaussian = sort_by_block(lo, hi)
+    packed, start, gaussian = sort_by_block(lo, hi, options.voxel_size)
     squared_cutoff = np.float32(np.inf if mode == RELEASED else options.cutoff**2)
     return Bins(
         packed, start, gaussian, means, form, lo, hi, gaussians.opacities, share, log_weight, mode,
@@ -97,10 +99,11 @@ def _refuse_far(gaussians: Gaussians, origin: NDArray[np.float64], options: Opti
 
 def _refuse_many(lo: NDArray[np.int32], hi: NDArray[np.int32], options: Options) -> None:
     touched = np.maximum((hi >> 3).astype(np.float64) - (lo >> 3) + 1, 0).prod(axis=1).sum()
-    if touched > _MOST_TOUCHED:
+    if touched > min(_MOST_TOUCHED, max(_MOST_OF_EACH * len(lo), _FEW_TOUCHED)):
         raise FreeOccError(
-            f"Gaussians touch {touched:.3g} blocks of voxels of {options.voxel_size:g} m, more than memory holds: "
-            "choose larger voxels."
+            f"{len(lo)} Gaussians touch {touched:.3g} blocks of voxels of {options.voxel_size:g} m, more than memory "
+            "and time suffice for: choose a larger occupancy.voxel_size, or smaller values of occupancy.cutoff, "
+            "gaussians.coverage, gaussians.gamma and gaussians.uncertainty."
         )
 
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.compiling import njit
-from ..core.hash_table import packed_key, put_key
+from ..core.errors import ConfigError
+from ..core.hash_table import cell_index, packed_key, put_key
+from ..core.memory import available_memory
 from ..core.types import BLOCK
+
+_VOXEL_BYTES = 24
+"""Of a voxel while a map is built: counts, alpha, state, and the copies of them that are made on the way."""
+_MANY_BLOCKS = 1 << 14
+"""Fewer blocks, 200 MB, are not compared with the memory."""
 
 
 def unite_keys(*packed: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -26,7 +31,31 @@ def find_blocks_along_rays(
     """Returns the ascending packed keys of all blocks on the segments from a camera's center to (P, 3) points."""
     edge = BLOCK * voxel_size
     ends = (np.asarray(points_world, np.float64) - origin) / edge
-    return np.sort(_walked((np.asarray(center_world, np.float64) - origin) / edge, ends))
+    start = (np.asarray(center_world, np.float64) - origin) / edge
+    _refuse_long(start, ends, voxel_size)
+    return np.sort(_walked(start, ends))
+
+
+def refuse_blocks(blocks: float, voxel_size: float) -> None:
+    """Raises ConfigError if that many blocks of voxels do not fit into the memory that is free."""
+    needed, free = blocks * BLOCK**3 * _VOXEL_BYTES, available_memory()
+    if needed > free:
+        raise ConfigError(
+            f"{blocks * BLOCK**3:.3g} voxels of {voxel_size:g} m need about {needed / 1e9:.1f} GB of memory, but "
+            f"{free / 1e9:.1f} GB are free: choose a larger occupancy.voxel_size, or a smaller capture.max_depth."
+        )
+
+
+def _refuse_long(start: NDArray[np.float64], ends: NDArray[np.float64], voxel_size: float) -> None:
+    """Raises ConfigError if the blocks on the segments cannot fit into the memory. They are no more than the steps on
+    all segments, and no more than those of a pyramid."""
+    if not len(ends):
+        return
+    steps = float(np.abs(ends - start).sum()) + len(ends)
+    low, high = np.minimum(ends.min(axis=0), start), np.maximum(ends.max(axis=0), start)
+    blocks = min(steps, float(np.prod(high - low + 1)) / 3 + 3 * len(ends))
+    if not blocks < _MANY_BLOCKS:
+        refuse_blocks(blocks if np.isfinite(blocks) else float("inf"), voxel_size)
 
 
 @njit(cache=True, nogil=True)
@@ -62,10 +91,10 @@ def _walked(start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np
     for p in range(len(ends)):
         faces = 0
         for i in range(3):
-            cell[i] = math.floor(start[i])
+            cell[i] = cell_index(start[i])
             length = ends[p, i] - start[i]
             step[i] = 1 if length > 0 else -1
-            faces += abs(np.int64(math.floor(ends[p, i])) - cell[i])
+            faces += abs(cell_index(ends[p, i]) - cell[i])
             between[i] = 1.0 / abs(length) if length != 0 else np.inf
             ahead = cell[i] + 1 - start[i] if length > 0 else start[i] - cell[i]
             next_face[i] = ahead * between[i] if length != 0 else np.inf

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...core.compiling import njit
 from ...core.depth_noise import compute_sensor_sigma
-from ...core.errors import CaptureError
+from ...core.errors import CaptureError, ConfigError
 from ...core.transforms import back_project, invert
 from ...core.types import FREE, UNKNOWN, Frame, Intrinsics
 from ...settings.option_types import Seed
@@ -29,6 +29,7 @@ REQUIRES: tuple[str, ...] = ("open3d",)
 PATH = "builtin:room"
 
 _RATE_HZ = 30.0
+_MOST_PIXELS = 3840 * 2160
 _FOCAL_PER_WIDTH = 0.82  # a field of view of 63 degrees
 _NEAREST_M = 0.3  # a depth camera measures nothing nearer
 _JAGGED = 0.2  # share of edge pixels that take a neighbor's depth, each way
@@ -59,6 +60,14 @@ class Options(TypedOptions, frozen=True):
     """Whether depth and color have sensor noise; false = exact."""
     seed: Seed = 0
     """Seed of the noise."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.width * self.height > _MOST_PIXELS:
+            raise ConfigError(
+                f"'width' and 'height' make {self.width * self.height:,} pixels, more than the {_MOST_PIXELS:,} that "
+                "are rendered: choose smaller ones."
+            )
 
 
 @dataclass(frozen=True)

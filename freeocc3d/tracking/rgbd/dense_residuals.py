@@ -150,7 +150,7 @@ def linearize(
             inverse_z = 1.0 / z
             u = fx * x * inverse_z + cx
             v = fy * y * inverse_z + cy
-            if u < 0.5 or v < 0.5 or u > wt - 1.5 or v > ht - 1.5:
+            if not (u >= 0.5 and v >= 0.5 and u <= wt - 1.5 and v <= ht - 1.5):
                 continue
             stats[1] += 1
             jt, it = int(u + 0.5), int(v + 0.5)
@@ -167,11 +167,10 @@ def linearize(
             sigma_s = look_up_sigma(source.sigma_m, i, j, ps2)
             variance = sigma_t * sigma_t + sigma_s * sigma_s
             k = abs(r) / math.sqrt(variance)
-            bin_ = int(k * _PER_SIGMA)
             if n0 * m0 + n1 * m1 + n2 * m2 < NORMALS_AGREE:
                 continue
-            if bin_ < _BINS:
-                histogram_g[bin_] += 1
+            if k * _PER_SIGMA < _BINS:
+                histogram_g[int(k * _PER_SIGMA)] += 1
             count_g += 1
             weight = 1.0 / ((1.0 + k * k * soft_g) ** 2 * variance * sure_g)
             if k < ON_SURFACE * scales[0]:
@@ -194,9 +193,8 @@ def linearize(
             _count_intensities(stats, value_s, value_t)
             rp = value_t - (gain * value_s + offset)
             kp = abs(rp) * (1.0 / GRAY_SIGMA)
-            bin_ = int(kp * _PER_SIGMA)
-            if bin_ < _BINS:
-                histogram_p[bin_] += 1
+            if kp * _PER_SIGMA < _BINS:
+                histogram_p[int(kp * _PER_SIGMA)] += 1
             count_p += 1
             weight_p = sure_p / (1.0 + kp * kp * soft_p) ** 2
             d0, d1 = gu * fx * inverse_z, gv * fy * inverse_z
