@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def try_changes(
     project: Project, chosen: Sequence[tuple[str, Change]], equivalent: Path, jobs: int = 1, work: Path | None = None
 ) -> Iterator[Tried]:
-    """Yields each change of a module with what became of it. Raises ValueError if a test fails without any change.
+    """Yields each change of a module with what became of it. Raises ValueError for a wrong list.
 
     equivalent: list of changes that change nothing.  jobs: processes at a time.  work: folder of compiled kernels and
     times that is kept for the next run.
@@ -83,11 +83,11 @@ def try_changes(
         while waiting or running:
             while waiting and len(running) < jobs:
                 number, (module, change) = waiting.pop()
-                tests = project.own_tests(module)
-                if (module, change.before, change.after) in known or not tests:
-                    yield _tried(module, change, "equivalent" if tests else "untested")
+                is_known = (module, change.before, change.after) in known
+                tests = [] if is_known else copies.passing(project.own_tests(module))
+                if not tests:
+                    yield _tried(module, change, "equivalent" if is_known else "untested")
                     continue
-                copies.measure(tests)
                 copy = copies.folder / f"changed-{number}"
                 began = time.monotonic()
                 running[copy] = copies.start(module, change.source, tests, copy), module, change, began

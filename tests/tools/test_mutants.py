@@ -43,7 +43,7 @@ def project(tmp_path: Path) -> Path:
         "pack/room/user.py": "from .part import clamp  # numba\n",
         "pack/other/__init__.py": "from ..room.part import clamp\n",
         "tests/room/test_part.py": TEST,
-        "tests/room/test_rest.py": "from pack.other import clamp\n",
+        "tests/room/test_rest.py": "from pack.other import clamp\n\ndef test_rest():\n    assert clamp\n",
         "tests/other/test_far.py": "from pack.room import part\n",
         "tools/equivalent.txt": EQUIVALENT,
         "setup.cfg": "[tool:pytest]\n",
@@ -155,9 +155,10 @@ def test_a_change_that_never_ends_is_noticed(tmp_path: Path) -> None:
     assert 0.9 < outcome.cpu_s < 8
 
 
-def test_a_test_that_fails_by_itself_is_told(project: Path) -> None:
+def test_a_test_that_fails_by_itself_is_told_and_left_out(project: Path) -> None:
     (project / "tests/room/test_part.py").write_text("def test():\n    assert 0\n")
-    command = [sys.executable, str(TOOL), "--root", str(project), "--package", "pack", "--modules", "room/part"]
+    command = [sys.executable, str(TOOL), "--root", str(project), "--package", "pack", "--only", "room/part#0.1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode != 0
-    assert "tests/room/test_part.py fails without any change" in done.stderr
+    assert "tests/room/test_part.py fails without any change and is left out" in done.stderr
+    assert "survived" in done.stdout.splitlines()[1], "the other test of the room sees nothing"
+    assert done.returncode == 1

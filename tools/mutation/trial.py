@@ -50,6 +50,7 @@ class Copies:
         if any(name.split("/")[0] == project.package for name in changed):
             times = {}
         self._times = {name: seconds for name, seconds in times.items() if name not in changed}
+        self._failing: set[str] = set()
 
     def _update(self) -> set[str]:
         """Returns the names of the files that were copied or removed."""
@@ -75,21 +76,28 @@ class Copies:
             for compiled in path.parent.glob(f"__pycache__/{path.name}.*.nb?"):
                 compiled.unlink()
 
-    def measure(self, tests: Sequence[Path]) -> float:
-        """Seconds of the processor that test files take, each run once as they are. Raises ValueError if one fails."""
-        names = [path.relative_to(self.project.root).as_posix() for path in tests]
-        for name in names:
-            if name not in self._times:
+    def passing(self, tests: Sequence[Path]) -> list[Path]:
+        """The test files that pass as they are; each is run once, which compiles kernels. Others are told on stderr."""
+        for path in tests:
+            name = self._name(path)
+            if name not in self._times and name not in self._failing:
                 outcome = wait(start(self.warm, [name], 1800))
-                if not outcome.passed:
-                    raise ValueError(f"{name} fails without any change: {_output_of(self.warm).read_text()}")
-                self._times[name] = outcome.cpu_s
-                self._known.write_text(json.dumps(self._times), encoding="utf-8")
-        return sum(self._times[name] for name in names)
+                if outcome.passed:
+                    self._times[name] = outcome.cpu_s
+                    self._known.write_text(json.dumps(self._times), encoding="utf-8")
+                else:
+                    self._failing.add(name)
+                    said = _output_of(self.warm).read_text(encoding="utf-8")
+                    print(f"{name} fails without any change and is left out:\n{said}", file=sys.stderr, flush=True)
+        return [path for path in tests if self._name(path) in self._times]
+
+    def _name(self, test: Path) -> str:
+        return test.relative_to(self.project.root).as_posix()
 
     def start(self, module: str, source: str, tests: Sequence[Path], folder: Path) -> tuple[int, float]:
-        """Starts the tests of a changed module in a new copy."""
-        limit_s = 10 + 4 * self.measure(tests)
+        """Starts the ``passing`` tests of a changed module in a new copy, the fastest first."""
+        names = sorted(map(self._name, tests), key=lambda name: self._times[name])
+        limit_s = 10 + 4 * sum(self._times[name] for name in names)
         shutil.copytree(self.warm, folder, symlinks=True, copy_function=os.link)
         path = folder / self.project.package / f"{module}.py"
         path.unlink()  # a link, of which the warm copy keeps the other end
@@ -97,8 +105,7 @@ class Copies:
         if stale := {one for one in self.project.kernels_with(module) if self.project.has_kernels(one)}:
             limit_s += _COMPILING_S
             self._forget(folder, stale)
-        names = [test.relative_to(self.project.root).as_posix() for test in tests]
-        return start(folder, sorted(names, key=lambda name: self._times[name]), limit_s)
+        return start(folder, names, limit_s)
 
     def drop(self, folder: Path) -> None:
         """Removes a copy."""
