@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import CaptureError
 from ..core.types import Intrinsics
-from .camera_files import reduce_camera
+from .camera_files import check_focal, reduce_camera
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 BROWN_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -68,7 +68,7 @@ class Rectified:
     """Undistorts the images of a lens. The output has the lens's aspect ratio and holds only pixels that the lens sees;
     with barrel distortion, the corners are cut off.
 
-    intrinsics: camera of the output.
+    intrinsics: camera of the output. Raises CaptureError for a distortion that no lens has.
     """
 
     intrinsics: Intrinsics
@@ -80,10 +80,12 @@ class Rectified:
         self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
         if lens.fisheye or any(lens.distortion):
             K = _pinhole(camera.matrix, lens, self.size)
+            values = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+            check_focal(values, self.size, f"The lens with the distortion {', '.join(map(str, lens.distortion))}")
             distortion = np.array(lens.distortion, np.float64)
             undistort = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
             self._maps = undistort(camera.matrix, distortion, np.eye(3), K, self.size, cv2.CV_32FC1)
-            self.intrinsics = Intrinsics(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+            self.intrinsics = Intrinsics(*self.size, *values)
 
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistort color (H, W, 3) to (h, w, 3), with area averages where it shrinks."""
@@ -105,8 +107,11 @@ class Rectified:
 def _pinhole(K: NDArray[np.float64], lens: Lens, size: tuple[int, int]) -> NDArray[np.float64]:
     """(3, 3) matrix of the pinhole camera of the same size that sees nothing beyond the lens's image."""
     distortion = np.array(lens.distortion, np.float64)
-    if lens.fisheye:
-        return np.asarray(
-            cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, distortion, size, np.eye(3), balance=0.0)
-        )
-    return np.asarray(cv2.getOptimalNewCameraMatrix(K, distortion, size, 0)[0])
+    try:
+        if lens.fisheye:
+            found = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, distortion, size, np.eye(3), balance=0.0)
+        else:
+            found = cv2.getOptimalNewCameraMatrix(K, distortion, size, 0)[0]
+    except cv2.error:  # no point of the image's edge has a place
+        found = np.full((3, 3), np.nan)
+    return np.asarray(found)

@@ -69,7 +69,10 @@ class PosedImages(Capture):
                     f"{view.image} has {size[0]} x {size[1]} pixels, but its camera has {lens.camera.width} x "
                     f"{lens.camera.height}."
                 ) from error
-        rectified = self._rectified(lens)
+        try:
+            rectified = self._rectified(lens)
+        except CaptureError as error:
+            raise FrameError(f"{view.image} cannot be undistorted: {error}") from error
         depth_m = np.zeros(rectified.size[::-1], np.float32)
         if self.has_depth and view.depth is not None:
             units = self.options.depth_scale or UNITS_PER_METER

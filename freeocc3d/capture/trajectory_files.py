@@ -111,6 +111,10 @@ def _checked(found: PoseFile) -> PoseFile:
     finite = np.isfinite(found.T_world_cam).all(axis=(1, 2))
     if not finite.any():
         raise CaptureError(f"{found.path} is not a trajectory: it holds no pose.")
+    if np.isfinite(found.T_world_cam[~finite, :3]).any():
+        raise CaptureError(
+            f"{found.path} holds a pose of which some numbers are NaN or infinite: correct or remove it."
+        )
     if (np.abs(found.T_world_cam[finite, :3, 3]) > FARTHEST).any():
         raise CaptureError(f"{found.path} holds a position that is not possible: correct it.")
     if not all(is_rigid(pose) for pose in found.T_world_cam[finite]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import stat
 from collections.abc import Iterator
@@ -47,18 +48,20 @@ def check_regular(path: Path, limit: int | None = None) -> os.stat_result:
 @contextlib.contextmanager
 def open_regular(path: Path, limit: int | None = None) -> Iterator[BinaryIO]:
     """Open a regular file to read bytes. Raises what ``check_regular`` raises, also if the file is replaced
-    meanwhile."""
+    meanwhile. A file that states no size is empty: reading those of /proc may block."""
     check_regular(path, limit)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as stream:
-        _refuse(path, os.fstat(stream.fileno()), limit)
-        yield stream
+        found = os.fstat(stream.fileno())
+        _refuse(path, found, limit)
+        yield stream if found.st_size else io.BytesIO()
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
     """The content of a regular file of at most ``limit`` bytes. Raises OSError, as ``check_regular`` does."""
     with open_regular(path, limit) as stream:
-        size = os.fstat(stream.fileno()).st_size
+        size = stream.seek(0, 2)
+        stream.seek(0)
         data = stream.read(size + 1)  # not limit + 1: the stream takes memory for all that it is asked for
         if len(data) > size:
             data += stream.read(limit + 1 - len(data))

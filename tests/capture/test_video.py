@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import os
+import signal
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -9,8 +11,9 @@ import pytest
 from small_captures import truncate
 from videos import SIZE, number_of, write_video
 
-from freeocc3d.capture import Options, open_capture, read_ahead, select_frames
+from freeocc3d.capture import Options, open_capture, read_ahead, video_process
 from freeocc3d.capture.camera_files import DIAGONAL_35MM, USUAL_FOCAL
+from freeocc3d.capture.video_decoding import VideoDecoder
 from freeocc3d.core.errors import CaptureError, ConfigError, FrameError
 
 VARIABLE_MS = np.cumsum([0] + [20 + 13 * (n % 4) + 100 * (n == 30) for n in range(59)]).tolist()
@@ -98,12 +101,11 @@ def test_threads_may_read_at_once(tmp_path: Path) -> None:
 
 
 def test_ascending_reading_decodes_each_frame_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    capture = open_capture(write_video(tmp_path / "scan.mp4"), Options(stride=5))
-    decoder = capture._decoder  # type: ignore[attr-defined]
+    decoder = VideoDecoder(write_video(tmp_path / "scan.mp4"))
     seeks = []
     seek = decoder._seek
     monkeypatch.setattr(decoder, "_seek", lambda start: (seeks.append(start), seek(start)))
-    read = [number_of(frame.color) for _, frame in read_ahead(capture, select_frames(capture))]
+    read = [number_of(decoder.image(index, (96, 64))) for index in range(0, 60, 5)]
     assert read == list(range(0, 60, 5))
     assert len(seeks) <= 5, "one for each group of pictures at the most"
 
@@ -111,7 +113,7 @@ def test_ascending_reading_decodes_each_frame_once(tmp_path: Path, monkeypatch: 
 def test_what_is_no_video_is_reported_in_a_sentence(tmp_path: Path) -> None:
     notes = tmp_path / "notes.mp4"
     notes.write_text("no video at all\n" * 50)
-    with pytest.raises(CaptureError, match=r"notes\.mp4 is not a readable video"):
+    with pytest.raises(CaptureError, match=r"notes\.mp4 is a text file, not a readable video"):
         open_capture(notes)
     (tmp_path / "empty.mp4").touch()
     with pytest.raises(CaptureError, match=r"empty\.mp4 is not a readable video"):
@@ -159,7 +161,7 @@ def test_a_file_is_only_read_as_a_video_and_a_folder_never(tmp_path: Path) -> No
         open_capture(tmp_path)
     with pytest.raises(ConfigError, match="'max_size' must be from 16 to"):
         open_capture(path, Options(max_size=2))
-    with pytest.raises(ConfigError, match="'scale' must be greater than 0"):
+    with pytest.raises(ConfigError, match="'scale' must be"):
         open_capture(path, Options(scale=0.0))
 
 
@@ -180,3 +182,80 @@ def test_damage_costs_the_frames_that_hang_on_it_alone(tmp_path: Path) -> None:
     assert len(shown) + len(broken) == 60
     assert len(shown) >= 40
     assert sum(number != index for index, number in shown.items()) <= 12, "concealed, within one group of pictures"
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "scan.mp4", "list.m3u8", "list.ffconcat"])
+def test_text_is_no_video(tmp_path: Path, name: str) -> None:
+    """FFmpeg draws text, and opens the files that a list names."""
+    write_video(tmp_path / "other.mkv", count=5)
+    for text in (
+        "0.1 1 2 3 0 0 0 1\n" * 200,
+        "#EXTM3U\n#EXTINF:1,\nother.mkv\n",
+        "ffconcat version 1.0\nfile other.mkv\n",
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(CaptureError, match=rf"{name} is a text file, not a readable video"):
+            open_capture(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["#EXTM3U\n#EXTINF:1,\nother.mkv\n\0", "ffconcat version 1.0\nfile other.mkv\n#\0\n", "\0text " * 900],
+)
+def test_formats_that_open_other_files_or_draw_text_are_refused(tmp_path: Path, text: str) -> None:
+    write_video(tmp_path / "other.mkv", count=5)
+    (tmp_path / "scan.mp4").write_text(text)
+    with pytest.raises(CaptureError, match=r"scan\.mp4 is not a readable video"):
+        open_capture(tmp_path / "scan.mp4")
+
+
+@pytest.mark.parametrize("target", ["pipe", "/dev/zero", "loop"])
+def test_what_is_no_regular_file_is_refused(tmp_path: Path, target: str) -> None:
+    path = tmp_path / "scan.mp4"
+    if target == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(path if target == "loop" else target)
+    with pytest.raises(CaptureError, match=r"scan\.mp4"):
+        open_capture(path)
+    with pytest.raises(CaptureError, match=r"Cannot read .*scan\.mp4"):
+        VideoDecoder(path)
+
+
+def test_a_decoder_that_dies_costs_its_frame_alone(tmp_path: Path) -> None:
+    capture = open_capture(write_video(tmp_path / "scan.mp4", count=20))
+    assert number_of(capture[3].color) == 3
+    decoder = capture._decoder  # type: ignore[attr-defined]
+    for again in range(5):
+        if decoder._process is not None:
+            decoder._process.kill()
+        with pytest.raises(FrameError, match=r"Frame 4 of .*scan\.mp4 cannot be decoded: the decoder has ended"):
+            capture[4]
+        if again < 3:
+            assert number_of(capture[5].color) == 5
+    with pytest.raises(FrameError, match="too often"):
+        capture[6]
+
+
+def test_a_decoder_that_makes_no_progress_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = open_capture(write_video(tmp_path / "scan.mp4", count=20))
+    process = capture._decoder._process  # type: ignore[attr-defined]
+    process.send_signal(signal.SIGSTOP)
+    monkeypatch.setattr(video_process, "SILENT_S", 0.2)
+    with pytest.raises(FrameError, match="makes no progress"):
+        capture[1]
+    assert process.poll() is not None
+
+
+def test_memory_of_the_decoder_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taking = "v.VideoDecoder = lambda *_: bytearray(8 << 30)"
+    code = f"from freeocc3d.capture import video_decoding as v; {taking}; v.main()"
+    monkeypatch.setattr(video_process, "_CODE", code)
+    with pytest.raises(CaptureError, match="needs too much memory"):
+        open_capture(write_video(tmp_path / "scan.mp4", count=3))
+
+
+def test_a_decoder_that_aborts_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video_process, "_CODE", "import os; os.abort()")
+    with pytest.raises(CaptureError, match=r"scan\.mp4 is not a readable video: the decoder has ended \(signal 6\)"):
+        open_capture(write_video(tmp_path / "scan.mp4", count=3))

@@ -74,3 +74,11 @@ def test_a_home_that_is_unknown_leaves_the_path(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("HOME", "/home/me")
     assert user_path("~/scan") == Path("/home/me/scan")
     assert user_path("~nobody_of_this_name/scan") == Path("~nobody_of_this_name/scan")
+
+
+def test_files_that_state_no_size_are_empty(tmp_path: Path) -> None:
+    """/proc/kmsg would block, and /proc/self/mem never end."""
+    for name in ("/proc/self/maps", "/proc/kmsg"):
+        (tmp_path / "link").unlink(missing_ok=True)
+        (tmp_path / "link").symlink_to(name)
+        assert read_bytes(tmp_path / "link", 1 << 20) == b""

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import CaptureError, FrameError
-from ...core.image_files import Size
+from ...core.image_files import MOST_PIXELS, Size
+from ...core.regular_files import IMAGE_BYTES, open_regular
 from ...core.types import Frame, Intrinsics
 from ...core.warnings import Notice
 from ..base import Capture, Options
@@ -23,9 +25,13 @@ from ..camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given
 from ..image_decoding import read_color
 from ..numbered_files import list_folder
 
+if TYPE_CHECKING:
+    from PIL import Image
+
 REQUIRES: tuple[str, ...] = ("PIL",)
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
 UNREADABLE = {".heic", ".heif", ".dng"}
 """Image formats of phones that no decoder here reads."""
 
@@ -141,20 +147,33 @@ def make_natural_key(path: Path) -> list[tuple[int, str]]:
 
 
 def read_header(path: Path) -> Header | None:
-    """Size and EXIF data of an image, without decoding it; None if the file is not an image."""
+    """Size and EXIF data of an image, without decoding it; None if the file is not an image that can be decoded."""
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
-            width, height = image.size
-            exif = image.getexif()
-            inner = exif.get_ifd(_EXIF)
+        with open_regular(path, IMAGE_BYTES) as stream, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large images and damaged EXIF data
+            with Image.open(stream, formats=_FORMATS) as image:
+                width, height = image.size
+                exif, inner = _exif(image)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+    if width * height > MOST_PIXELS:
         return None
     orientation = exif.get(_ORIENTATION, 1)
     orientation = orientation if orientation in range(1, 9) else 1
     size = (height, width) if orientation >= 5 else (width, height)
     return Header(size, orientation, _stated_focal(inner, width, height), _stated_time(inner))
+
+
+def _exif(image: Image.Image) -> tuple[Mapping[int, Any], Mapping[int, Any]]:
+    """The EXIF data of an image and of its inner directory; empty if they are damaged, for which Pillow's parsers have
+    errors of every type."""
+    try:
+        exif = image.getexif()
+        return dict(exif), dict(exif.get_ifd(_EXIF))
+    except Exception:
+        return {}, {}
 
 
 def apply_orientation(image: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
@@ -172,7 +191,7 @@ def _stated_focal(exif: Any, width: int, height: int) -> float | None:
             return camera.fx / float(np.hypot(width, height))
         pixels_per_mm = float(exif[_PLANE_RESOLUTION]) / _UNIT_MM[int(exif.get(_PLANE_UNIT, 2))]
         focal = float(exif[_FOCAL]) * pixels_per_mm * width / float(exif.get(_WIDTH, width))
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+    except (KeyError, TypeError, ValueError, ArithmeticError):
         return None
     # Wrong values are common: many programs change the image but keep the tag.
     return focal / float(np.hypot(width, height)) if 0.3 < focal / max(width, height) < 20 else None
