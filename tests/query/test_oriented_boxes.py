@@ -7,7 +7,7 @@ import pytest
 from worded_voxels import SIZE, WORDS, box, feature, occupancy
 
 from freeocc3d.core.transforms import invert, transform
-from freeocc3d.query.oriented_boxes import oriented_boxes
+from freeocc3d.query.oriented_boxes import _box_around, oriented_boxes
 from freeocc3d.query.word_query import query
 
 
@@ -72,3 +72,15 @@ def test_no_rectangle_at_any_angle_is_smaller(degrees: int) -> None:
     assert found.extent[0] * found.extent[1] <= areas.min() + 1e-9
     assert np.abs((found.yaw - a + np.pi / 2) % np.pi - np.pi / 2) < np.deg2rad(8)
     assert found.extent[0] == pytest.approx(1.6, abs=0.25)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, -20.0])
+def test_of_boxes_that_are_as_small_the_one_turned_least_is_taken(degrees: float) -> None:
+    """An octagon, around which a square fits along every side."""
+    angles = np.deg2rad(22.5 + 45 * np.arange(8) + degrees)
+    outline = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    corners = np.concatenate([np.column_stack((outline + (3, 1), np.full(8, z))) for z in (0.5, 2.0)])
+    found = _box_around(corners, np.eye(4))
+    assert np.rad2deg(found.yaw) == pytest.approx(degrees, abs=1e-6)
+    np.testing.assert_allclose(found.extent, (2 * np.cos(np.pi / 8), 2 * np.cos(np.pi / 8), 1.5))
+    np.testing.assert_allclose(found.T_map_box[:3, 3], (3, 1, 1.25), atol=1e-9)

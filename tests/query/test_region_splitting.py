@@ -11,7 +11,7 @@ from scenes import occupancy_of
 from worded_voxels import WORDS, box, feature, occupancy
 
 from freeocc3d.core.errors import ConfigError
-from freeocc3d.query.region_splitting import cut_necks, split_footprint
+from freeocc3d.query.region_splitting import _footprint, cut_necks, split_footprint
 from freeocc3d.query.word_query import Options, query
 
 SHAPE = 60, 60
@@ -191,3 +191,21 @@ def test_what_spreads_too_far_stays_whole_and_no_score_is_too_low() -> None:
     for one, up in ((made, (0.0, 0.0, 1.0)), (far, (0.0, 0.0, 1.0))):
         part = cut_necks(one, rows, np.zeros(50, np.int32), np.full(50, -0.5, np.float32), np.array(up), 0.5)
         assert len(np.unique(part)) == 1
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0)])
+def test_each_voxel_has_its_own_cell_with_the_best_score_above_and_below_it(up: tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(0)
+    voxels = np.argwhere(rng.random((9, 7, 8)) < 0.4)
+    made = occupancy_of(voxels)
+    stored, axis = made.occupied_voxels(), int(np.argmax(np.abs(up)))
+    scores = rng.uniform(0.1, 1, len(stored)).astype(np.float32)
+    cells, footprint = _footprint(made, np.arange(len(stored)), scores, np.array(up))
+    assert footprint is not None
+    columns = [tuple(column) for column in np.delete(stored, axis, axis=1).tolist()]
+    best = {column: max(s for own, s in zip(columns, scores, strict=True) if own == column) for column in columns}
+    np.testing.assert_array_equal(footprint[tuple(cells.T)], [best[column] for column in columns])
+    assert np.count_nonzero(footprint) == len(best)
+    assert len({(*cell, *column) for cell, column in zip(cells.tolist(), columns, strict=True)}) == len(best)
+    assert not footprint[[0, -1]].any(), "around them are empty cells"
+    assert not footprint[:, [0, -1]].any()
