@@ -15,7 +15,7 @@ packed_key = njit(cache=True, nogil=True)(pack_index)
 
 
 @njit(cache=True, nogil=True)
-def cell_index(place: float) -> int:
+def cell_index(place: float) -> np.int64:
     """The whole number at or below a place, in cells; the nearest that a key can hold for places farther away."""
     return np.int64(math.floor(min(max(place, np.float64(-KEY_LIMIT)), np.float64(KEY_LIMIT - 1))))
 
