@@ -139,6 +139,8 @@ def _kill(rng: random.Random, originals: Path, folder: Path) -> Attack:
                 raise Silent("neither the old map nor the new one is there")
         finished = (folder / "map").exists() and not (folder / "map.partial").exists()
         if finished and not replaces:
+            for name in ("lock", "stages.json"):  # the next run removes them
+                (folder / "map" / name).unlink(missing_ok=True)
             _require_same(folder / "map", originals)
         else:
             _resume(folder / "map", originals, overwrite=replaces)
