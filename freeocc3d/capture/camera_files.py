@@ -41,6 +41,9 @@ DIAGONAL_35MM = 43.27
 """Diagonal of the 36 x 24 mm frame, millimeters."""
 
 
+FARTHEST = 1e9
+"""Largest coordinate of a point or camera, in any unit; larger ones are damage."""
+
 T = TypeVar("T")
 
 Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
@@ -161,7 +164,7 @@ def read_intrinsics(path: Path) -> Calibration:
 def read_rigid(path: Path) -> NDArray[np.float64]:
     """Read a (4, 4) rigid transform. Raises CaptureError with the file's name."""
     matrix = read_matrix(path)
-    if matrix is None or not is_rigid(matrix):
+    if matrix is None or not is_pose(matrix):
         raise CaptureError(f"{path} must hold a rigid transform of 4 x 4 numbers: correct or remove it.")
     return matrix
 
@@ -170,7 +173,12 @@ def read_pose(path: Path) -> NDArray[np.float64] | None:
     """Read (4, 4) T_world_cam; None if the file is missing or holds no rigid transform. ScanNet writes -inf where
     tracking was lost."""
     matrix = read_matrix(path) if os.path.lexists(path) else None
-    return matrix if matrix is not None and is_rigid(matrix) else None
+    return matrix if matrix is not None and is_pose(matrix) else None
+
+
+def is_pose(T: NDArray[np.float64]) -> bool:
+    """Whether a (4, 4) matrix is a rigid transform whose position is possible."""
+    return is_rigid(T) and bool(np.abs(T[:3, 3]).max() <= FARTHEST)
 
 
 def read_matrix(path: Path) -> NDArray[np.float64] | None:

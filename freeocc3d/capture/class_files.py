@@ -10,6 +10,7 @@ The file is YAML or JSON, or a bare list of names: YAML, JSON, or one name per l
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -118,7 +119,7 @@ def capture_class_names(folder: Path) -> tuple[str, ...]:
     """The names in ``classes.json`` of a capture's folder, the first one for nothing; empty if the file is missing.
     Raises CaptureError."""
     path = folder / CLASSES_JSON
-    names = read_class_file(path).names if path.is_file() else ()
+    names = read_class_file(path).names if os.path.lexists(path) else ()
     if len(names) > _MOST_IN_BYTES:
         raise CaptureError(f"{path} must hold at most {_MOST_IN_BYTES} classes, because class images are 8-bit.")
     return names

@@ -22,7 +22,7 @@ from ..core.errors import CaptureError
 from ..core.regular_files import read_bytes, read_text
 from ..core.transforms import quats_to_rotations
 from ..core.types import Intrinsics
-from .camera_files import check_focal
+from .camera_files import FARTHEST, check_focal
 from .lenses import Lens, lens_of
 
 T = TypeVar("T")
@@ -37,9 +37,6 @@ PARAMETERS = {
     "DIVISION": f"{_FF} k", "SIMPLE_FISHEYE": _F, "FISHEYE": _FF, "EUCM": f"{_FF} alpha beta", "EQUIRECTANGULAR": "w h",
 }  # fmt: skip
 """Camera models with the names of their parameters, in the order of their numbers in .bin files."""
-
-FARTHEST = 1e9
-"""Largest coordinate of a point or camera; larger ones are damage."""
 
 _MODEL_BYTES = 1 << 30
 _LONGEST_NAME = 4096

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from ..core.errors import CaptureError, FreeOccError
 from ..core.ply_files import PlyHeader, read_ply_header, read_ply_vertices
 from ..core.regular_files import check_regular, open_regular, read_bytes
+from .camera_files import FARTHEST
 
 _MOST_BYTES = 1 << 30
 _MOST_TEXT_BYTES = 256 << 20
 _LONGEST_HEADER = 1 << 12
-_FARTHEST = 1e9
 
 
 def read_points(path: Path) -> NDArray[np.float64]:
@@ -36,7 +36,7 @@ def read_points(path: Path) -> NDArray[np.float64]:
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise CaptureError(f"{path} holds no points, or is not a readable point cloud (PLY, PCD or XYZ).")
-    if np.abs(points).max() > _FARTHEST:
+    if np.abs(points).max() > FARTHEST:
         raise CaptureError(f"{path} holds a point that is farther away than is possible: correct it.")
     return points
 

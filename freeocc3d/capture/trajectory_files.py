@@ -22,8 +22,8 @@ from ..core.errors import CaptureError
 from ..core.regular_files import user_path
 from ..core.transforms import invert, is_rigid
 from .base import Capture
-from .camera_files import read_matrix
-from .colmap_models import FARTHEST, colmap_folder, read_colmap_model
+from .camera_files import FARTHEST, read_matrix
+from .colmap_models import colmap_folder, read_colmap_model
 from .nerfstudio_files import read_transforms
 from .number_files import NumberRows, read_number_rows
 from .numbered_files import list_folder

@@ -72,6 +72,8 @@ def read_encoded(path: Path, size: Size | None = None, most_pixels: int = MOST_P
     tail = data[-TAIL_BYTES:]
     if (data.startswith(JPEG_START) and JPEG_END not in tail) or (data.startswith(PNG_START) and PNG_END not in tail):
         raise ImageFileError(f"{path} is cut off: its end is missing ({len(data)} bytes).")
+    if data.startswith(PNG_START) and not _chunks_fit(data):
+        raise _unreadable(path, data)
     if data.startswith(JPEG_START) and width * height > len(data) and data.count(b"\xff\xda") > _SCANS:
         raise ImageFileError(f"{path} is a JPEG image of more than {_SCANS} scans: save it anew.")
     return data
@@ -123,6 +125,16 @@ def _stated_size(data: bytes) -> Size | None:
         width, height = struct.unpack_from(form, data, 18)
         return width, abs(height)  # negative: from the top down
     return None
+
+
+def _chunks_fit(data: bytes) -> bool:
+    """Whether the chunks of a PNG follow one another to its end; OpenCV takes memory for whatever length one states."""
+    at = 8
+    while data[at + 4 : at + 8] != b"IEND":
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+        if at + 12 > len(data):
+            return False
+    return True
 
 
 def _jpeg_size(data: bytes) -> Size | None:

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import os
+import struct
 import subprocess
 import sys
 import types
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +14,7 @@ import pytest
 from small_captures import data_folder, depth_image, write_image, write_replica, write_scannet, write_seven_scenes
 
 from freeocc3d.capture import Options, check_depth_scale, open_capture, select_frames
-from freeocc3d.core.errors import CaptureError, ConfigError
+from freeocc3d.core.errors import CaptureError, ConfigError, FrameError
 from freeocc3d.settings import config, registry
 
 
@@ -142,3 +145,38 @@ def test_real_captures_are_in_the_units_that_they_state(name: str) -> None:
 def test_opening_a_capture_imports_nothing_heavy() -> None:
     code = "import sys, freeocc3d.capture; print({'open3d', 'torch', 'scipy', 'numba'} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
+
+
+@pytest.mark.parametrize("target", ["pipe", "/dev/zero", "loop", "bomb", "huge"])
+@pytest.mark.parametrize("name", ["color/1.png", "depth/1.png"])
+def test_a_hostile_image_is_a_broken_frame(tmp_path: Path, name: str, target: str) -> None:
+    """A pipe would block, a device fill the memory, an image of gigapixels do both or end the run."""
+    path = write_scannet(tmp_path, 3) / name
+    path.unlink()
+    if target == "pipe":
+        os.mkfifo(path)
+    elif target in ("bomb", "huge"):
+        side = 30_000 if target == "bomb" else 1 << 30
+        head = b"IHDR" + struct.pack(">IIBBBBB", side, side, 16, 0, 0, 0, 0)
+        data = struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + data + struct.pack(">I", 0) + b"IEND\xaeB`\x82")
+    else:
+        path.symlink_to(path if target == "loop" else target)
+    capture = open_capture(tmp_path)
+    with pytest.raises(FrameError, match=rf"{name}"):
+        capture[1]
+    assert capture[0].color.shape == (24, 32, 3)
+    assert check_depth_scale(capture) is None
+
+
+@pytest.mark.parametrize("name", ["intrinsic/intrinsic_color.txt", "pose/1.txt", "classes.json"])
+@pytest.mark.parametrize("target", ["pipe", "/dev/zero", "loop"])
+def test_a_hostile_document_is_told_and_not_left_out(tmp_path: Path, name: str, target: str) -> None:
+    path = write_scannet(tmp_path, 3) / name
+    path.unlink(missing_ok=True)
+    if target == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(path if target == "loop" else target)
+    with pytest.raises(CaptureError, match=rf"{name}"):
+        open_capture(tmp_path).pose(1)

@@ -65,6 +65,10 @@ def test_poses_are_optional_and_must_be_rigid(tmp_path: Path) -> None:
     write_matrix(tmp_path / "frame-000001.pose.txt", 2.0 * np.eye(4))
     (tmp_path / "frame-000002.pose.txt").write_text("tracking was lost")
     assert [capture.pose(i) is None for i in range(4)] == [True, True, True, False]
+    far = np.eye(4)
+    far[0, 3] = 1e18
+    write_matrix(tmp_path / "frame-000003.pose.txt", far)
+    assert capture.pose(3) is None
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])

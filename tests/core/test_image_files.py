@@ -162,3 +162,16 @@ def test_a_jpeg_header_is_found_as_decoders_find_it(tmp_path: Path) -> None:
     for between in (b"\xff\xff\xff", b"\0\0\0", b"\xff\x01", b"\xff\xfe\0\x04ab"):
         (path := tmp_path / "image.jpg").write_bytes(data[:2] + between + data[2:])
         assert image_files.read_image_size(path) == (40, 24)
+
+
+def test_a_chunk_of_a_png_that_is_longer_than_the_file_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenCV takes memory for it: up to 4 GB."""
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("the decoder saw it"))
+    data = encoded("png")
+    for at in (8, data.index(b"IDAT") - 4):
+        for length in (1 << 20, 0x7FFFFFFF, 0xFFFFFFFF):
+            (path := tmp_path / "image.png").write_bytes(data[:at] + struct.pack(">I", length) + data[at + 4 :])
+            with pytest.raises(ImageFileError, match="not a readable image"):
+                read_image(path, STORED)

@@ -215,3 +215,15 @@ def test_a_map_with_other_colors_is_refused(state: dict) -> None:
 def test_options_out_of_range_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
         Options(**bad)
+
+
+def test_centroids_are_colors() -> None:
+    """Lightness, chroma and hue in their ranges, and the vivid ones of a name within a sixth of the circle."""
+    for name, centroids in CENTROIDS.items():
+        for lightness, chroma, hue in centroids:
+            assert 0 <= lightness <= 100, name
+            assert 0 <= chroma <= 135, name
+            assert 0 <= hue < 360, name
+        vivid = np.array([hue for _, chroma, hue in centroids if chroma > 12])
+        apart = np.abs(np.subtract.outer(vivid, vivid))
+        assert np.minimum(apart, 360 - apart).max(initial=0) <= 60, name

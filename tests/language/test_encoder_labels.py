@@ -13,6 +13,7 @@ from small_captures import SIZE, class_image, write_image, write_replica, write_
 from freeocc3d.capture import base, open_capture
 from freeocc3d.capture.base import Capture
 from freeocc3d.core.errors import CaptureError, ConfigError
+from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.language.encoders import labels
 from freeocc3d.language.encoders.labels import LabelsEncoder, Options, load, load_text
 
@@ -174,3 +175,20 @@ def test_a_word_for_several_classes_is_attained_by_each() -> None:
 def test_the_note_names_classes() -> None:
     assert "sofa, lamp" in load_text({"classes": NAMES}).knows
     assert labels.LabelWords(["nothing", *map(str, range(50))]).knows.endswith("…)")
+
+
+@pytest.mark.parametrize(("width", "fits"), [(1019, True), (981, True), (1021, False), (979, False)])
+def test_class_images_have_the_frames_shape_up_to_two_percent(width: int, fits: bool) -> None:
+    frame = Frame(
+        0,
+        0.0,
+        np.zeros((50, 100, 3), np.uint8),
+        np.zeros((50, 100), np.float32),
+        Intrinsics(100, 50, 90.0, 90.0, 49.5, 24.5),
+    )
+    encoder = labels.LabelsEncoder(("nothing", "cup"), lambda index: np.ones((500, width), np.uint8), 10)
+    if fits:
+        assert encoder.encode(frame).shape[:2] == (5, 10)
+    else:
+        with pytest.raises(CaptureError, match="Their views differ"):
+            encoder.encode(frame)

@@ -61,3 +61,11 @@ def test_sharpness_falls_with_blur_and_not_with_brightness() -> None:
     assert measure_detail(cv2.blur(image, (9, 1))) < 0.7 * sharp
     assert measure_detail(image // 2) == pytest.approx(sharp, rel=0.1)
     assert measure_detail(np.zeros((240, 320, 3), np.uint8)) == 0
+
+
+def test_detail_of_a_large_image_is_that_of_the_image_at_320_columns() -> None:
+    rng = np.random.default_rng(0)
+    small = cv2.GaussianBlur(rng.integers(0, 256, (60, 320, 3), np.uint8), (0, 0), 1.5)
+    large = np.repeat(np.repeat(small, 3, axis=0), 3, axis=1)
+    assert measure_detail(large) == pytest.approx(measure_detail(small), rel=1e-6)
+    assert measure_detail(np.repeat(large[:1], 2, axis=0)) >= 0  # no thinner than a row

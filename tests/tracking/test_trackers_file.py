@@ -53,9 +53,9 @@ def test_a_cloud_fills_only_what_has_no_depth() -> None:
     assert tracker.prepare_frame(lost) is lost
 
 
-def pair_scale(monkeypatch, count=30, wrong=0, step=0.5, scale=2.0, frames=2, missing=()) -> float | None:
+def pair_scale(monkeypatch, count=30, wrong=0, step=0.5, scale=2.0, frames=2, missing=(), by=0.9) -> float | None:
     """The scale from matches of two frames, ``step`` units apart, at depths of about 4 m; ``wrong`` of the matches lie
-    elsewhere. Of more frames, only those that are not missing can be read."""
+    elsewhere, by a part of the motion. Of more frames, only those that are not missing can be read."""
     rng = np.random.default_rng(0)
     T = np.tile(np.eye(4), (max(frames, 2), 1, 1))
     T[:, :3, :3] = ((0.8, 0.0, 0.6), (0.0, 1.0, 0.0), (-0.6, 0.0, 0.8))
@@ -63,7 +63,7 @@ def pair_scale(monkeypatch, count=30, wrong=0, step=0.5, scale=2.0, frames=2, mi
     p_s = rng.uniform((-1, -1, 3), (1, 1, 5), (count, 3))
     T_ts = np.linalg.inv(T[0]) @ T[1]
     p_t = p_s @ T_ts[:3, :3].T + scale * T_ts[:3, 3]
-    p_t[count - wrong :] += (0.0, 0.9 * scale * step, 0.0)
+    p_t[count - wrong :] += (0.0, by * scale * step, 0.0)
     unknown = np.concatenate((p_s, np.zeros((5, 3))))  # features without depth
     decoded = []
 
@@ -88,6 +88,8 @@ def pair_scale(monkeypatch, count=30, wrong=0, step=0.5, scale=2.0, frames=2, mi
         ({"count": 19}, False),
         ({"wrong": 14}, True),
         ({"wrong": 15}, False),
+        ({"wrong": 15, "by": 0.49}, True),  # within half of the motion
+        ({"wrong": 15, "by": 0.51}, False),
         ({"step": 0.0}, False),
         ({"scale": -2.0}, False),
         ({"step": 0.11}, True),  # 0.22 m at 4 m

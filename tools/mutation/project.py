@@ -93,7 +93,8 @@ class Project:
 
     def has_kernels(self, module: str) -> bool:
         """Whether Numba compiles functions of a module."""
-        return "numba" in self.modules[module].read_text(encoding="utf-8")
+        text = self.modules[module].read_text(encoding="utf-8")
+        return "numba" in text or "njit" in text
 
 
 def _test_names(module: str) -> set[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -11,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import CaptureError
-from ...core.transforms import is_rigid
 from ..base import Options
 from ..camera_files import (
     Calibration,
     Number,
     PositiveNumber,
     guess_camera,
+    is_pose,
     read_given_calibration,
     read_json,
     rescale_camera,
@@ -87,7 +88,7 @@ class Reader(ImagePairs):
         # Line n is the n-th file or, if files were removed, the file with number n.
         row = index if len(self._trajectory) == len(self) else self._pairs.numbers[index]
         T_world_cam = self._trajectory[row]
-        return T_world_cam if is_rigid(T_world_cam) else None
+        return T_world_cam if is_pose(T_world_cam) else None
 
     def labels(self, index: int) -> NDArray[np.uint8] | None:
         return self._class_image(self._class_files.get(self._pairs.numbers[index]))
@@ -100,7 +101,7 @@ class Reader(ImagePairs):
     def _trajectory(self) -> NDArray[np.float64] | None:
         """(L, 4, 4) poses, one per line of traj.txt; None without this file."""
         path = self.path / "traj.txt"
-        if not path.is_file():
+        if not os.path.lexists(path):
             return None
         try:
             table = read_number_rows(path).table()
@@ -117,7 +118,7 @@ class Reader(ImagePairs):
 def _parameters(path: Path, options: Options) -> tuple[Calibration | None, float]:
     """Color camera and depth units per meter. The camera may be None if depth is not read. Raises CaptureError."""
     override = read_given_calibration(options)
-    file = next((f for f in (path / "cam_params.json", path.parent / "cam_params.json") if f.is_file()), None)
+    file = next((f for f in (path / "cam_params.json", path.parent / "cam_params.json") if os.path.lexists(f)), None)
     if file is None:
         if override is None and options.depth:
             raise CaptureError(

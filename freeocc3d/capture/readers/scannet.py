@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -121,4 +122,4 @@ def _T_color_depth(path: Path) -> NDArray[np.float64] | None:
 
 
 def _first(path: Path, names: Iterable[str]) -> Path | None:
-    return next((path / name for name in names if (path / name).is_file()), None)
+    return next((path / name for name in names if os.path.lexists(path / name)), None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,9 @@ class Reader(ImagePairs):
     def __init__(self, path: Path, options: Options):
         pairs = pair_files(list_numbered(path, COLOR), list_numbered(path, DEPTH), path, options)
         stated = path / "camera-intrinsics.txt"
-        calibration = read_given_calibration(options) or (read_intrinsics(stated) if stated.is_file() else KINECT)
+        calibration = read_given_calibration(options) or (
+            read_intrinsics(stated) if os.path.lexists(stated) else KINECT
+        )
         camera = calibration.camera(pairs.color_size)
         grid = PixelGrid(camera, rescale_camera(camera, pairs.depth_size))
         super().__init__(path, options, pairs, grid, units_per_meter=1000.0)
