@@ -17,7 +17,8 @@ from ..core.types import Frame
 from .base import NOMINAL_DEPTH, Capture, Options
 from .camera_files import read_given_calibration, rescale_camera
 from .image_decoding import convert_to_meters, read_color, read_depth
-from .lenses import Lens, Rectified
+from .lenses import Lens
+from .undistortion import Rectified
 
 UNITS_PER_METER = 1000.0
 """Units per meter of stored depth, unless ``capture.depth_scale`` is set."""

@@ -22,7 +22,7 @@ _MARGIN = 8
 """Blocks next to the farthest ones that may be asked for."""
 _SAME_SIZE = 1e-6
 _CORNER = pack_index(*[-KEY_LIMIT // BLOCK] * 3)
-"""The key of the lowest block; without it, the key of a block has fewer than 59 bits."""
+"""The key of the lowest block; without it, the key of a block has at most 60 bits."""
 _ONE_HALF = 0x3C00  # the bits of 1 in half precision; negative numbers, infinity and NaN have larger ones
 _MOST_BYTES = 8 << 30
 _FEATURE_ARRAYS = {
@@ -117,7 +117,7 @@ def _problem(arrays: dict[str, NDArray[Any]], manifest: Manifest) -> str:
     least = KEY_LIMIT // BLOCK - _MARGIN >> (deepest - levels.astype(np.int64))
     if ((keys < -least[:, None]) | (keys >= least[:, None])).any():
         return "its array 'keys' holds blocks too far from the origin"
-    if len(np.unique(pack_voxels(keys) - _CORNER | levels.astype(np.int64) << 59)) < len(keys):
+    if len(np.unique(pack_voxels(keys) - _CORNER | levels.astype(np.int64) << 60)) < len(keys):
         return "its array 'keys' holds a block twice"
     counts = manifest.counts.voxels
     occupied, free = int(np.count_nonzero(state == OCCUPIED)), state.size - int(np.count_nonzero(state))
