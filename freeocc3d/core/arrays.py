@@ -22,7 +22,7 @@ from .regular_files import UnusableFile, open_regular
 
 Shape = tuple[int | None, ...]
 
-_LARGEST = 8 << 30
+_LARGEST, _AT_ONCE = 8 << 30, 1 << 20
 _MAGIC, _LONGEST_HEADER = b"\x93NUMPY", 4096
 _HEADER = re.compile(
     r"\{'descr': *'(?P<type>[<>|=]?(?:\?|[biufUS]\d{1,9}))', *'fortran_order': *(?P<columns>True|False), *"
@@ -55,8 +55,8 @@ def read_arrays(
     """Read arrays of numbers, of truth values or of texts from an .npz file, in the machine's byte order.
 
     expected: name -> (``dtype.kind``, number of dimensions or shape, in which None is any length); the file must hold
-    each of them.  also: names of arrays that are read if they are there. If both are empty, all arrays are read.
-    most_bytes: of all arrays together. Other arrays are not unpacked. Raises MapError.
+    each of them, but for those in ``also``.  also: names of arrays that are read if they are there. If both are empty,
+    all arrays are read.  most_bytes: of all arrays together. Other arrays are not unpacked. Raises MapError.
     """
     try:
         with open_regular(path, most_bytes) as stream, zipfile.ZipFile(stream) as archive:
@@ -82,7 +82,7 @@ def _read(
         if name in infos:
             arrays[name] = _read_array(archive, infos[name], expected.get(name), most_bytes)
             most_bytes -= arrays[name].nbytes
-        elif name in expected:
+        elif name in expected and name not in also:
             raise _Unusable(f"it has no usable array '{name}'")
     return arrays
 
@@ -110,13 +110,24 @@ def _read_array(
             raise _Unusable(f"its array {info.filename} is not as large as its header says")
         if size > most_bytes:
             raise _Unusable(f"its array {info.filename} takes {size:,} bytes, more than is possible here")
-        data = bytearray(size)
-        if cast(BufferedIOBase, stream).readinto(data) != size or stream.read(
-            1
-        ):  # the end is read, so that the checksum is compared
+        data = _filled(cast(BufferedIOBase, stream), size)
+        if data is None or stream.read(1):  # at the end, zipfile compares the checksum
             raise _Unusable(f"its array {info.filename} ends too early")
     array = np.frombuffer(data, dtype).reshape(shape, order="F" if in_columns else "C")
     return array if dtype.isnative else array.astype(dtype.newbyteorder("="))
+
+
+def _filled(stream: BufferedIOBase, size: int) -> bytearray | None:
+    """The next bytes of a stream, or None if there are fewer. zipfile copies what it is asked for, so ask for a little
+    at a time."""
+    data = bytearray(size)
+    view = memoryview(data)
+    while view:
+        count = stream.readinto(view[:_AT_ONCE])
+        if not count:
+            return None
+        view = view[count:]
+    return data
 
 
 def _header(stream: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -39,15 +40,16 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 class _Cache:
-    """Numba's interface of caches. Reads from the folder that can be written, and what that lacks from the
-    installation, which may hold the kernels of a container's image. A damaged or missing file, or a full disk, is never
-    an error."""
+    """Numba's interface of caches. Reads from the folder that can be written. What that lacks it reads from the
+    installation, which may hold the kernels of a container's image, unless the user chose a folder. A damaged or
+    missing file, or a full disk, is never an error."""
 
     def __init__(self, function: Callable[..., Any]):
         source = Path(function.__code__.co_filename).parent
         stamp = _stamps[function] = _hash_dependencies(function)
         self._own = find_writable_folder(source)
-        folders = dict.fromkeys((self._own, source / "__pycache__"))
+        chosen = self._own is not None and "NUMBA_CACHE_DIR" in os.environ
+        folders = dict.fromkeys((self._own, None if chosen else source / "__pycache__"))
         self._caches = [_open_folder(function, folder, stamp) for folder in folders if folder is not None]
 
     @property

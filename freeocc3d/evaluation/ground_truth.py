@@ -20,7 +20,7 @@ _NAMES = (
     "labels", "classes", "frames_mask", "origin", "voxel_size", "occupancy", "T_world_map", "means", "scales",
     "quats_wxyz", "opacities", "semantics",
 )  # fmt: skip
-_MOST_BYTES, _FARTHEST = 3 << 29, 1e9
+_MOST_BYTES, _FARTHEST = (1 << 30) + (1 << 22), 1e9
 
 
 def load_ground_truth(path: str | Path, classes: tuple[str, ...] | None = None) -> GroundTruth:

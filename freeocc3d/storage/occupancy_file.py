@@ -12,7 +12,7 @@ from ..core.arrays import Shape, read_arrays, write_arrays
 from ..core.errors import MapError
 from ..core.types import BLOCK, OCCUPIED, UNKNOWN, Occupancy
 from ..core.voxel_keys import KEY_LIMIT, pack_index, pack_voxels
-from ..language.feature_codec import Codec, CodedFeatures
+from ..language.feature_codec import MOST_BYTES, Codec, CodedFeatures
 from .manifest import Manifest
 from .map_files import FEATURES, MANIFEST, OCCUPANCY
 
@@ -24,9 +24,9 @@ _SAME_SIZE = 1e-6
 _CORNER = pack_index(*[-KEY_LIMIT // BLOCK] * 3)
 """The key of the lowest block; without it, the key of a block has at most 60 bits."""
 _ONE_HALF = 0x3C00  # the bits of 1 in half precision; negative numbers, infinity and NaN have larger ones
-_MOST_BYTES = 8 << 30
-_FEATURE_ARRAYS = {
-    "gaussian_codes": ("u", 2), "codec_basis": ("f", 2), "codec_bits": ("u", 1), "codec_offset": ("f", 1),
+_MOST_BYTES, _CODEC_BYTES = 8 << 30, 64 << 20
+_CODEC_ARRAYS = {
+    "codec_basis": ("f", 2), "codec_bits": ("u", 1), "codec_offset": ("f", 1),
     "codec_scale": ("f", 1),
 }  # fmt: skip
 
@@ -54,11 +54,9 @@ def write_features(folder: Path, codec: Codec, gaussian_features: NDArray[np.flo
 
 def read_features(path: Path, manifest: Manifest) -> tuple[Codec, NDArray[np.uint8]]:
     """Read the codec and the (N, M) coded features of the Gaussians from features.npz. Raises MapError."""
-    expected: dict[str, tuple[str, int | Shape]] = {
-        **_FEATURE_ARRAYS,
-        "gaussian_codes": ("u", (manifest.counts.gaussians, None)),
-    }
-    arrays = read_arrays(path, expected, most_bytes=_MOST_BYTES)
+    arrays = read_arrays(path, _CODEC_ARRAYS, most_bytes=_CODEC_BYTES)
+    count = manifest.counts.gaussians
+    arrays |= read_arrays(path, {"gaussian_codes": ("u", (count, None))}, most_bytes=count * MOST_BYTES)
     tables = {name.removeprefix("codec_"): table for name, table in arrays.items() if name.startswith("codec_")}
     try:
         codec = Codec.from_tables(tables)
@@ -102,7 +100,7 @@ def _expected(path: Path, manifest: Manifest, codec: Codec) -> dict[str, tuple[s
     return {
         "keys": ("i", (blocks, 3)), "probability": ("f", voxels), "free": ("u", voxels), "hits": ("u", voxels),
         "state": ("u", voxels), "colors": ("u", (counts.occupied, 3)),
-        "feature_codes": ("u", (counts.occupied, codec.code_bytes)),
+        "feature_codes": ("u", (counts.occupied, codec.code_bytes)), "levels": ("u", (blocks,)),
     }  # fmt: skip
 
 

@@ -141,7 +141,8 @@ def test_debug_shows_the_traceback(tmp_path) -> None:
     assert "Traceback" in done.stderr
 
 
-def test_ctrl_c_ends_cleanly_and_resumes(tmp_path) -> None:
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 1), (signal.SIGTERM, 143)])
+def test_a_stopped_run_ends_cleanly_and_resumes(tmp_path, number, status) -> None:
     out = tmp_path / "map"
     command = [
         sys.executable,
@@ -156,9 +157,9 @@ def test_ctrl_c_ends_cleanly_and_resumes(tmp_path) -> None:
     while not (Path(f"{out}.partial") / "stages.json").exists():  # the first checkpoint
         assert process.poll() is None
         os.sched_yield()
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 1
+    assert process.returncode == status
     assert "--resume" in errors
     assert "Traceback" not in errors
     assert not out.exists()

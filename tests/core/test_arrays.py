@@ -71,6 +71,14 @@ def test_only_named_arrays_are_unpacked(tmp_path: Path) -> None:
             read_arrays(tmp_path / "a.npz", expected, most_bytes=1 << 20)
 
 
+def test_what_is_expected_may_be_missing_if_it_is_optional_but_not_of_another_kind(tmp_path: Path) -> None:
+    write_arrays(tmp_path / "a.npz", ARRAYS)
+    expected = {"keys": ("i", 2), "absent": ("u", 1)}
+    assert read_arrays(tmp_path / "a.npz", expected, also=("absent",)).keys() == {"keys"}
+    with pytest.raises(MapError, match="no usable array 'half'"):
+        read_arrays(tmp_path / "a.npz", {"half": ("f", 2)}, also=("half",))
+
+
 @pytest.mark.parametrize(("wanted", "usable"), [((20, 3), True), ((None, 3), True), ((19, 3), False), ((20,), False)])
 def test_shapes_are_compared_before_anything_is_unpacked(tmp_path: Path, wanted: tuple, usable: bool) -> None:
     write_arrays(tmp_path / "a.npz", ARRAYS)

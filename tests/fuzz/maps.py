@@ -24,6 +24,9 @@ import yaml
 import freeocc3d
 from freeocc3d.core.checksums import hash_bytes, hash_file
 from freeocc3d.editing.adaptive_voxels import refine_where_needed
+from freeocc3d.evaluation.ground_truth import save_ground_truth
+from freeocc3d.evaluation.true_occupancy import GroundTruth
+from freeocc3d.export import export_map
 from freeocc3d.settings import registry
 
 from . import mutators
@@ -48,31 +51,81 @@ def prepare(folder: Path) -> None:
     shutil.copytree(folder / "color" / "map", folder / "unscaled" / "map")
     _edit_manifest(folder / "unscaled" / "map", scale={"metric": False, "by": "none", "factor": 1.0})
     freeocc3d.load_map(folder / "unscaled" / "map")
+    _prepare_scoring(folder / "color" / "map", _parent(folder / "scoring" / "x").parent)
+
+
+def _prepare_scoring(path: Path, folder: Path) -> None:
+    """A truth, true poses, and the results of other systems."""
+    loaded = freeocc3d.load_map(path)
+    labels = np.zeros((40, 40, 30), np.uint8)
+    labels[:, :3], labels[:3], labels[30:] = 1, 2, 255
+    truth = GroundTruth(labels, np.array([-2.0, -2.0, -1.5]), 0.1, ("free", "wall", "sofa"), None)
+    save_ground_truth(truth, folder / "truth.npz")
+    export_map(loaded, "gaussians", folder / "splat.ply", {})
+    export_map(loaded, "npz", folder / "grid.npz", {})
+    shutil.copy(path / "trajectory.txt", folder / "poses.txt")
+    g = loaded.gaussians[:200]
+    arrays = {name: getattr(g, name) for name in ("means", "scales", "quats_wxyz", "opacities")}
+    (folder / "frames").mkdir()
+    time = (path / "trajectory.txt").read_text().splitlines()[1].split()[0]
+    np.savez(folder / "frames" / f"frame_{time}.npz", **arrays, labels=np.ones(200, np.int64))
+
+
+def _attack_scoring(rng: random.Random, originals: Path, folder: Path) -> Attack:
+    """A damaged truth, trajectory, or result of another system."""
+    shutil.copytree(originals / "scoring", folder, dirs_exist_ok=True)
+    shutil.copytree(originals / "color" / "map", folder / "map")
+    frame = next((folder / "frames").glob("*.npz")).relative_to(folder)
+    name, run = rng.choice((
+        ("splat.ply", "--gaussians splat.ply --align none"), ("grid.npz", "--grid grid.npz --align none"),
+        (str(frame), "--frames frames --poses poses.txt"), ("truth.npz", "map --poses poses.txt"),
+        ("truth.npz", "--grid grid.npz --align none"), ("poses.txt", "map --poses poses.txt"),
+        ("poses.txt", "--gaussians splat.ply --trajectory poses.txt --poses poses.txt"),
+    ))  # fmt: skip
+    changes: dict[str, tuple[Change, ...]] = {
+        ".txt": (mutators.change_lines,),
+        ".ply": (_change_ply_header, _change_ply_values, _change_ply_values),
+        ".npz": (_change_array, _change_array, _change_archive),
+    }
+    change = rng.choice((*changes[Path(name).suffix], mutators.change_bytes, mutators.change_kind))
+    try:
+        done = change(rng, folder / name)
+    except Exception as error:
+        done = type(error).__name__
+    line = f"evaluate {run} --ground-truth truth.npz --json"
+    return Attack(f"{line}; {name}: {done}", functools.partial(_printed, *line.split(" ")))
 
 
 def attack(rng: random.Random, originals: Path, folder: Path) -> Attack:
-    """One damaged map, and one use of it."""
+    """One damaged map, and one use of it; or what maps are scored with."""
+    if rng.random() < 0.12:
+        return _attack_scoring(rng, originals, folder)
     kind = rng.choice(("color", "color", "labels", "refined", "unscaled"))
     shutil.copytree(originals / kind / "map", folder / "map")
     signed = rng.random() < 0.55
     done = []
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         name, change = _choose(rng, folder / "map")
+        if not (folder / "map" / name).is_file() and change is not mutators.change_kind:
+            continue  # an earlier change replaced it
         try:
             done.append(f"{name}: {change(rng, folder / 'map' / name)}")
         except Exception as error:  # an earlier change left nothing of the kind
             done.append(f"{name}: ({type(error).__name__})")
     if signed:
         _sign(folder / "map", rng)
+    manifest = folder / "map" / "map.yaml"
+    changed = signed or not manifest.is_file() or manifest.is_symlink() or _SEAL not in manifest.read_bytes()
     use, run = _USES[rng.choices(range(len(_USES)), [weight for weight, *_ in _USES])[0]][1:]
     description = f"{use} of {kind}{' signed' if signed else ''}; {'; '.join(done)}"
-    return Attack(description, functools.partial(_run, run, originals / kind, folder, signed))
+    return Attack(description, functools.partial(_run, run, originals / kind, folder, changed))
 
 
-def _run(run: Callable[[], str], original: Path, folder: Path, signed: bool) -> None:
-    """Use the damaged map; if it states the checksums of the sound one, the answer must be that of the sound one."""
+def _run(run: Callable[[], str], original: Path, folder: Path, changed: bool) -> None:
+    """Use the damaged map. Unless it was changed on purpose, that is, states other checksums or none of the manifest,
+    the answer must be that of the sound map."""
     answer = run()
-    if not signed and answer:
+    if not changed and answer:
         for made in ("out", "out.npz"):
             (folder / made).unlink(missing_ok=True)
         if answer != _sound_answer(run, original):
@@ -150,6 +203,8 @@ def _choose(rng: random.Random, path: Path) -> tuple[str, Change]:
     )[0]  # fmt: skip
     if name == "image":
         return _image(rng, path), rng.choice((mutators.change_bytes, _change_image, _change_image_header))
+    if rng.random() < 0.15:
+        return rng.choice((("map.yaml", _stretch_manifest), ("keyframes/keyframes.json", _stretch_cameras)))
     changes: dict[str, tuple[Change, ...]] = {
         ".yaml": (mutators.change_yaml, mutators.change_yaml, mutators.change_lines),
         ".json": (mutators.change_json, mutators.change_json, mutators.change_lines),
@@ -158,6 +213,39 @@ def _choose(rng: random.Random, path: Path) -> tuple[str, Change]:
         ".npz": (_change_array, _change_array, _change_array, _change_archive),
     }
     return name, rng.choice((*changes[Path(name).suffix], mutators.change_bytes))
+
+
+def _stretch_manifest(rng: random.Random, path: Path) -> str:
+    """Numbers that a map may have, but hardly ever has."""
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    size = rng.choice((1e-6, 1e-4, 0.3, 50.0, 1e4, 1e6))
+    smallest = {"finest_voxel_m": size / 2} if "finest_voxel_m" in content else {}
+    far = [rng.choice((0.0, -1e9, 1e5, 1e9)) for _ in range(3)]
+    turned = np.eye(4)[rng.choice(([0, 1, 2, 3], [1, 2, 0, 3], [2, 0, 1, 3]))]
+    turned[:3, 3] = far
+    change: dict[str, Any] = rng.choice((
+        {"voxel_size_m": size, **smallest}, {"origin": far},
+        {"T_gravity_map": turned.tolist()}, {"T_gravity_map": None},
+        {"up": rng.choice(([1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.0, -0.8]))}, {"T_world_map": turned.tolist()},
+        {"scale": {"metric": rng.random() < 0.5, "by": "poses", "factor": rng.choice((1e-9, 1e9))}},
+        {"encoder": {"name": rng.choice(("labels", "segmenter", "clip", "color.x")), "state": {"classes": ["", "a"]}}},
+        {"encoder": {"name": "labels", "dimension": 0, "state": {"classes": [f"c{n}" for n in range(12)]}}},
+        {"vocabulary": {"model": "m", "keyframes": [0], "names": {"red": {"count": 1}, "\u202e": {"count": 9}}}},
+        {"capture": {"path": rng.choice(("/", "/dev/zero", "x" * 5000, "", "builtin:none")), "format": "x"}},
+    ))  # fmt: skip
+    path.write_text(yaml.safe_dump({**content, **change}, sort_keys=False), encoding="utf-8")
+    return f"{change!r:.120}"
+
+
+def _stretch_cameras(rng: random.Random, path: Path) -> str:
+    """Cameras that may be, but hardly ever are."""
+    entries = json.loads(path.read_text(encoding="utf-8"))
+    key = rng.choice(("fx", "fy", "cx", "cy", "timestamp"))
+    value = rng.choice((1e-3, 1.0, 1e5, 1e9))
+    for entry in entries if rng.random() < 0.5 else entries[:1]:
+        entry[key] = value
+    path.write_text(json.dumps(entries), encoding="utf-8")
+    return f"{key} = {value}"
 
 
 def _image(rng: random.Random, path: Path) -> str:
@@ -360,7 +448,7 @@ def _uses() -> list[tuple[float, str, Callable[[], str]]]:
         (1, "scale map -o out --length 0:20,20 0:60,40 1.5 --overwrite"),
         (1, "scale map -o out --camera-height 1.4 --overwrite"),
         (0.3, "scale map -o out --poses builtin:room --overwrite"), (0.4, "refine map --voxel 0.05 -o out --overwrite"),
-        (0.1, "view map --picture out --overwrite"), (0.1, "evaluate map --ground-truth map/occupancy.npz --json"),
+        (0.1, "view map --picture out --overwrite"),
     ]  # fmt: skip
     compared = ("info", "query map red wall", "query map chair", "query map --class")
     uses: list[tuple[float, str, Callable[[], str]]] = []

@@ -1,5 +1,9 @@
 """Splats are sorted and listed as in NumPy, and composited as in plain torch."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -18,6 +22,25 @@ from freeocc3d.gaussians.splat_projection import (
     Z,
 )
 from freeocc3d.gaussians.tile_compositing import TILE, composite, composite_backward, list_by_tile, sort_nearest_first
+
+COMPOSITED = """
+import hashlib
+import numpy as np
+from freeocc3d.gaussians.tile_compositing import composite, composite_backward, list_by_tile
+rng = np.random.default_rng(0)
+splats = rng.uniform(0.02, 0.3, (200, 11)).astype(np.float32)
+splats[:, :2], splats[:, 3], splats[:, 6] = rng.uniform(0, 60, (200, 2)), 0.01, -4
+first = np.clip(splats[:, :2] - 12, 0, 63).astype(np.int32)
+last = np.clip(splats[:, :2] + 12, 0, 63).astype(np.int32)
+box = np.stack((first[:, 0], last[:, 0], first[:, 1], last[:, 1]), axis=1)
+start, listed, _, _ = list_by_tile(box, 4, 4)
+out = composite(splats, box, start, listed, 64, 64)
+gradient = np.cos(np.arange(out.size, dtype=np.float32)).reshape(out.shape)
+found = composite_backward(splats, box, start, listed, out, gradient)
+assert out.any() and found.any()
+print(hashlib.sha256(out.tobytes() + found.tobytes()).hexdigest(), sum(composite.stats.cache_hits.values()))
+"""
+"""What a process composites, and whether it took its kernel from the cache."""
 
 
 def test_splats_are_sorted_by_depth_and_ties_stay() -> None:
@@ -102,3 +125,13 @@ def test_pixels_and_gradients_are_those_of_a_plain_composition(seed: int) -> Non
     by_column = exact.grad.numpy()[:, [PIXEL_U, PIXEL_V, CONIC_A, CONIC_B, CONIC_C, OPACITY, RED, RED + 1, RED + 2, Z]]
     for column, (a, b) in enumerate(zip(found.T, by_column.T, strict=True)):
         assert np.linalg.norm(a - b) < 2e-3 * np.linalg.norm(b), column
+
+
+def test_a_first_run_composites_as_later_ones_and_as_one_thread(tmp_path) -> None:
+    found = []
+    for more in ({}, {}, {"OMP_NUM_THREADS": "1"}):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), **more}
+        done = subprocess.run([sys.executable, "-c", COMPOSITED], env=environment, capture_output=True, check=True)
+        found.append(done.stdout.split())
+    assert [hits for _, hits in found] == [b"0", b"1", b"1"]
+    assert len({content for content, _ in found}) == 1

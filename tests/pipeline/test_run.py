@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -34,6 +37,15 @@ def test_the_room_becomes_a_map_with_every_layer(room) -> None:
         "map.yaml", "config.yaml", "report.json", "trajectory.txt", "gaussians.ply", "occupancy.npz", "features.npz",
         "keyframes", "trajectory.png", "gaussians.png",
     }  # fmt: skip
+
+
+def test_one_thread_makes_the_same_map(tmp_path, room) -> None:
+    code = f"import freeocc3d; freeocc3d.reconstruct('builtin:room', {str(tmp_path / 'one')!r}, {ROOM!r})"
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, "OMP_NUM_THREADS": "1"}, check=True)
+    one, many = listing(tmp_path / "one"), listing(room.path)
+    assert one.keys() == many.keys()
+    timed = {"report.json", "map.yaml"}  # the latter has the checksum of the former
+    assert [name for name in one.keys() - timed if one[name] != many[name]] == []
 
 
 def test_the_rooms_poses_are_right(room) -> None:
