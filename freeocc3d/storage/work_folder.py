@@ -130,6 +130,7 @@ class WorkFolder:
         if not self.resumed:
             self._clear()
             return
+        self._drop_special_files()
         try:
             saved = _read_marks(self.folder / _MARKS)
         except (OSError, ValueError):
@@ -174,6 +175,12 @@ class WorkFolder:
 
     def _warn_of_damage(self, progress: Progress, path: Path, then: str) -> None:
         self.warn(progress, Notice("checkpoint-damaged", f"{path} is missing or damaged, so {then}."))
+
+    def _drop_special_files(self) -> None:
+        """Remove links, pipes and devices: writing to them would block, or change what lies elsewhere."""
+        for path in list(self.folder.rglob("*")):
+            if path.is_symlink() or not (path.is_file() or path.is_dir()):
+                path.unlink()
 
     def _clear(self) -> None:
         """Empty the folder. Raises MapError."""

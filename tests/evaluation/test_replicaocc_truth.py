@@ -218,7 +218,7 @@ def test_a_capture_without_class_images_gives_geometry(tmp_path: Path) -> None:
     assert {1, 2} <= set(np.unique(classed.labels))
 
 
-def test_what_cannot_be_built_is_reported_in_a_sentence(tmp_path: Path) -> None:
+def test_what_cannot_be_built_is_reported_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bare = write_seven_scenes(tmp_path / "bare", 3, poses=False)
     with pytest.raises(FreeOccError, match="has no poses"):
         replicaocc_truth.build_truth(bare)
@@ -229,8 +229,10 @@ def test_what_cannot_be_built_is_reported_in_a_sentence(tmp_path: Path) -> None:
         replicaocc_truth.build_truth(scan, ["fill=near"])
     with pytest.raises(ConfigError, match="name=value"):
         replicaocc_truth.build_truth(scan, ["fill"])
-    with pytest.raises(FreeOccError, match="too many for memory"):
-        replicaocc_truth.build_truth(scan, ["voxel_size=0.0005"])
+    with monkeypatch.context() as patched:
+        patched.setattr(replicaocc_truth, "_LARGEST_GRID", 10)
+        with pytest.raises(FreeOccError, match="too many for memory"):
+            replicaocc_truth.build_truth(scan)
     truncate(scan / "frame-000001.depth.png")
     assert replicaocc_truth.build_truth(scan, ["pixel_stride=1"]).labels.size  # the other frames are used
 

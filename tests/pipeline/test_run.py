@@ -155,7 +155,7 @@ def test_overwrite_replaces_a_map(tmp_path, room) -> None:
     [
         ({"traking": {}}, "tracking"),
         ({"tracking": {"odometry": {"itertions": [1, 1, 1]}}}, "iterations"),
-        ({"occupancy": {"voxel_size": "big"}}, "must be a number greater than 0"),
+        ({"occupancy": {"voxel_size": "big"}}, "must be a number from 0.001 to 100"),
         ({"tracking": {"backend": "rgdb"}}, "rgbd"),
         ({"language": {"encoder": "colr"}}, "did you mean .color"),
         ({"occupancy": {"voxel_size": -0.1}}, "voxel_size"),

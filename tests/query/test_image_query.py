@@ -124,7 +124,8 @@ def test_what_the_map_does_not_hold_is_not_found() -> None:
 def test_the_image_side_is_that_of_the_map_where_there_is_one(tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     path.write_text("language: {encoder: colour, colour: {stride: 2}}\n", encoding="utf-8")
-    assert image_query.picture_encoder(SavedMap(tmp_path, tiny_manifest())).options.stride == 2
-    labels = tiny_manifest(encoder=EncoderRecord(name="labels", state={}))
+    files = {path.name: path.stat().st_size}
+    assert image_query.picture_encoder(SavedMap(tmp_path, tiny_manifest(files=files))).options.stride == 2
+    labels = tiny_manifest(files=files, encoder=EncoderRecord(name="labels", state={}))
     with pytest.raises(FreeOccError, match="'labels' reads more of the capture than its pictures"):
         image_query.picture_encoder(SavedMap(tmp_path, labels))

@@ -180,6 +180,20 @@ def _finish_until(allowed: int, output: Path, monkeypatch) -> bool:
     return True
 
 
+def test_what_is_no_file_in_a_work_folder_is_replaced(tmp_path, stopped, whole) -> None:
+    work = shutil.copytree(stopped, tmp_path / "map.partial")
+    (tmp_path / "precious").write_text("mine")
+    for name in ("gaussians.ply", "keyframes/000000.color.jpg"):
+        (work / name).unlink()
+        os.mkfifo(work / name)
+    for name in ("report.json", "keyframes/000000.depth.png", "offline"):
+        (work / name).unlink(missing_ok=True)
+        (work / name).symlink_to(tmp_path / "precious")
+    os.mkfifo(work / "gaussians.png")
+    assert content(resume(tmp_path).path) == content(whole)
+    assert (tmp_path / "precious").read_text() == "mine"
+
+
 def test_a_complete_map_that_was_damaged_before_it_got_its_name_is_made_again(tmp_path, complete, whole) -> None:
     work = shutil.copytree(complete, tmp_path / "map.partial")
     flip(work / "occupancy.npz")
