@@ -90,7 +90,8 @@ def change_value(rng: random.Random, content: Any) -> tuple[Any, str]:
         node[key] = json.loads(json.dumps(value, default=str))
         return content, f"{key!r:.60} = that of {place!r:.60}"
     if action == 3 and isinstance(node[key], int | float) and not isinstance(node[key], bool):
-        node[key] = node[key] * rng.choice((-1, 2, 0.5, 1000, 1e-9)) + rng.choice((0, 1, -1))
+        factor, more = rng.choice((-1, 2, 0.5, 1000, 1e-9)), rng.choice((0, 1, -1))
+        node[key] = (node[key] if abs(node[key]) < 1e300 else 1e300) * factor + more
         return content, f"{key!r:.60} = {node[key]!r:.60}"
     if action == 4 and isinstance(node[key], list):
         values = node[key]
