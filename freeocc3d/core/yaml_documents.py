@@ -1,6 +1,7 @@
 """Reads YAML that comes from outside: plain values, and no more of them than a document of ours can have.
 
-Source: yaml.org/spec/1.1, as PyYAML resolves plain scalars; but a key is always text, and a date stays text.
+Source: yaml.org/spec/1.1, as PyYAML resolves plain scalars; but a key is always text, and a date that
+exists stays text.
 """
 
 from __future__ import annotations
@@ -132,7 +133,7 @@ class _Builder:
             tag = next((tag for tag, pattern in candidates or () if pattern.match(word)), None)
             if tag is None:
                 return float(word) if self._is_float(word) else word
-        if tag in ("!", f"{_TAG}str", f"{_TAG}timestamp", f"{_TAG}value", f"{_TAG}merge"):
+        if tag in ("!", f"{_TAG}str", f"{_TAG}value", f"{_TAG}merge"):
             return word
         if tag == f"{_TAG}int":
             return _whole_number(event, word)
@@ -141,7 +142,7 @@ class _Builder:
             raise _invalid(event, f"the tag {tag[:80]} is not read")
         try:
             return made(yaml.ScalarNode(tag, word))
-        except (ValueError, KeyError, IndexError, OverflowError) as error:
+        except (ValueError, KeyError, IndexError, OverflowError, AttributeError) as error:
             raise _invalid(event, f"'{word[:80]}' is not a {tag.removeprefix(_TAG)}") from error
 
 
@@ -155,10 +156,17 @@ def _merge(event: Any, own: dict[Any, Any]) -> None:
             own.setdefault(name, value)
 
 
+def _date(node: yaml.ScalarNode) -> str:
+    """The text of a date that exists."""
+    _CONSTRUCTOR.construct_yaml_timestamp(node)
+    return str(node.value)
+
+
 _MAKERS: dict[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}float": _CONSTRUCTOR.construct_yaml_float,
     f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
     f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
+    f"{_TAG}timestamp": _date,
 }
 
 

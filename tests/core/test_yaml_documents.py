@@ -61,7 +61,10 @@ def test_what_pyyaml_writes_is_read() -> None:
 
 def test_keys_and_dates_are_text() -> None:
     assert parse_yaml("1: a\nyes: b\n2024-01-01: 2024-01-01") == {"1": "a", "yes": "b", "2024-01-01": "2024-01-01"}
-    assert parse_yaml("d: 2024-13-45\ne: =") == {"d": "2024-13-45", "e": "="}
+    assert parse_yaml("d: '2024-13-45'\ne: =") == {"d": "2024-13-45", "e": "="}
+    for impossible in ("d: 2024-13-45", "d: !!timestamp x"):
+        with pytest.raises(InvalidYaml, match=r"line 1: '.*' is not a timestamp"):
+            parse_yaml(impossible)
 
 
 @pytest.mark.parametrize(
