@@ -42,7 +42,7 @@ def lift_features(
     for done, row in enumerate(chosen, start=1):
         frame = frames[row]
         try:
-            features = _encoded(encoder, frame)
+            features = encode_finite(encoder, frame)
         except FrameError as error:
             progress.warn(str(error))
         else:
@@ -51,7 +51,7 @@ def lift_features(
     return fusion.features()
 
 
-def _encoded(encoder: Encoder, frame: Frame) -> NDArray[np.float16]:
+def encode_finite(encoder: Encoder, frame: Frame) -> NDArray[np.float16]:
     """The frame's features. Raises FrameError if they are not finite, as a network in half precision may overflow."""
     features = encoder.encode(frame)
     if not np.isfinite(features).all():

@@ -21,6 +21,7 @@ from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.depth.depth_network import load_depth_network
 from freeocc3d.language import model_packages
 from freeocc3d.language.encoders import clip, dinov2, seem, segmenter
+from freeocc3d.language.lifting import encode_finite
 from freeocc3d.language.text_networks import ModelWords, TextNetwork
 from freeocc3d.tracking.sfm.local_features import KeypointNetwork
 
@@ -88,12 +89,12 @@ def _use(kind: str, folder: Path) -> None:
         found = KeypointNetwork(folder / "points.onnx")(_FRAME.color).descriptors
     elif kind == "segmenter":
         options = segmenter.Options(model=str(folder / "segmenter.onnx"), classes=str(folder / "classes.txt"))
-        found = segmenter.load(options).encode(_FRAME)
+        found = encode_finite(segmenter.load(options), _FRAME)
     else:
         module = _ENCODERS[kind]
         model_packages.verify_files(model_packages.read_package(folder))
         encoder = module.load(module.Options(model=str(folder), short_side=24))
-        found = encoder.encode(_FRAME)
+        found = encode_finite(encoder, _FRAME)
         words = TextNetwork(encoder.package).embed(["a red chair", "lamp"])
         state = json.loads(json.dumps(encoder.text_state()))
         ModelWords(state).contrast_words()
