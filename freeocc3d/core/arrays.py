@@ -59,7 +59,7 @@ def read_arrays(
     all arrays are read.  most_bytes: of all arrays together. Other arrays are not unpacked. Raises MapError.
     """
     try:
-        with open_regular(path, most_bytes) as stream, zipfile.ZipFile(stream) as archive:
+        with open_regular(path, _LARGEST) as stream, zipfile.ZipFile(stream) as archive:
             return _read(archive, expected, also, most_bytes)
     except FileNotFoundError as error:
         raise MapError(f"{path} is missing: copy the whole map folder again, or make the map again.") from error

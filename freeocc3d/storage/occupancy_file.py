@@ -24,7 +24,7 @@ _SAME_SIZE = 1e-6
 _CORNER = pack_index(*[-KEY_LIMIT // BLOCK] * 3)
 """The key of the lowest block; without it, the key of a block has at most 60 bits."""
 _ONE_HALF = 0x3C00  # the bits of 1 in half precision; negative numbers, infinity and NaN have larger ones
-_MOST_BYTES, _CODEC_BYTES = 8 << 30, 64 << 20
+_MOST_BYTES, _CODEC_BYTES, _FILE_BYTES, _VOXEL_BYTES = 8 << 30, 64 << 20, 1 << 20, 128
 _CODEC_ARRAYS = {
     "codec_basis": ("f", 2), "codec_bits": ("u", 1), "codec_offset": ("f", 1),
     "codec_scale": ("f", 1),
@@ -56,7 +56,7 @@ def read_features(path: Path, manifest: Manifest) -> tuple[Codec, NDArray[np.uin
     """Read the codec and the (N, M) coded features of the Gaussians from features.npz. Raises MapError."""
     arrays = read_arrays(path, _CODEC_ARRAYS, most_bytes=_CODEC_BYTES)
     count = manifest.counts.gaussians
-    arrays |= read_arrays(path, {"gaussian_codes": ("u", (count, None))}, most_bytes=count * MOST_BYTES)
+    arrays |= read_arrays(path, {"gaussian_codes": ("u", (count, None))}, most_bytes=_CODEC_BYTES + count * MOST_BYTES)
     tables = {name.removeprefix("codec_"): table for name, table in arrays.items() if name.startswith("codec_")}
     try:
         codec = Codec.from_tables(tables)
@@ -95,7 +95,9 @@ def _expected(path: Path, manifest: Manifest, codec: Codec) -> dict[str, tuple[s
     if counts.unknown:
         blocks = every // BLOCK**3
     else:  # as in maps of earlier versions; hardly a block is unknown throughout
-        blocks = len(read_arrays(path, {"keys": ("i", (None, 3))}, most_bytes=max(every, 1) * 3 * 8)["keys"])
+        blocks = len(
+            read_arrays(path, {"keys": ("i", (None, 3))}, most_bytes=_FILE_BYTES + _VOXEL_BYTES * every)["keys"]
+        )
     voxels = (blocks, BLOCK**3)
     return {
         "keys": ("i", (blocks, 3)), "probability": ("f", voxels), "free": ("u", voxels), "hits": ("u", voxels),

@@ -154,10 +154,10 @@ def test_a_key_that_every_map_has_is_missed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("voxel_size_m: 2024-13-45", "'voxel_size_m' has text instead of a number"),
+        ("voxel_size_m: 2024-13-45", "is not a timestamp"),
         ("voxel_size_m: !!int abc", "'abc' is not a whole number"),
         ("voxel_size_m: !!float x", "'x' is not a float"),
-        ("voxel_size_m: !!timestamp x", "'voxel_size_m' has text instead of a number"),
+        ("voxel_size_m: !!timestamp x", "is not a timestamp"),
         ("voxel_size_m: !!bool x", "'x' is not a bool"),
         ("voxel_size_m: " + "9" * 5000, "64 bits"),
         ("voxel_size_m: " + "[" * 3000, "line"),
