@@ -52,20 +52,23 @@ def write_features(folder: Path, codec: Codec, gaussian_features: NDArray[np.flo
     write_arrays(folder / FEATURES, {"gaussian_codes": codec.encode(gaussian_features), **tables}, compressed=True)
 
 
-def read_features(path: Path, manifest: Manifest) -> tuple[Codec, NDArray[np.uint8]]:
-    """Read the codec and the (N, M) coded features of the Gaussians from features.npz. Raises MapError."""
+def read_codec(path: Path) -> Codec:
+    """Read the tables of the codec from features.npz. A query needs no more of the file. Raises MapError."""
     arrays = read_arrays(path, _CODEC_ARRAYS, most_bytes=_CODEC_BYTES)
-    count = manifest.counts.gaussians
-    arrays |= read_arrays(path, {"gaussian_codes": ("u", (count, None))}, most_bytes=_CODEC_BYTES + count * MOST_BYTES)
-    tables = {name.removeprefix("codec_"): table for name, table in arrays.items() if name.startswith("codec_")}
     try:
-        codec = Codec.from_tables(tables)
+        return Codec.from_tables({name.removeprefix("codec_"): table for name, table in arrays.items()})
     except ValueError as error:
         raise MapError(f"{path} is damaged: {error}.") from error
-    codes = arrays["gaussian_codes"]
+
+
+def read_gaussian_codes(path: Path, manifest: Manifest, codec: Codec) -> NDArray[np.uint8]:
+    """Read the (N, M) coded features of the Gaussians from features.npz. Raises MapError."""
+    count = manifest.counts.gaussians
+    expected = {"gaussian_codes": ("u", (count, None))}
+    codes = read_arrays(path, expected, most_bytes=count * MOST_BYTES)["gaussian_codes"]
     if codes.shape[1] != codec.code_bytes or codes.dtype != np.uint8:
         raise MapError(f"{path} is damaged: its feature codes do not match its codec.")
-    return codec, codes
+    return codes
 
 
 def read_occupancy(path: Path, manifest: Manifest, codec: Codec) -> Occupancy:

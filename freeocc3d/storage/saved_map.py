@@ -19,8 +19,7 @@ from ..settings import registry
 from .checked_files import CheckedFiles
 from .manifest import Manifest, read_manifest
 from .map_files import CONFIG, FEATURES, GAUSSIANS, KEYFRAMES, MANIFEST, OCCUPANCY, REPORT, TRAJECTORY
-from .occupancy_file import read_features, read_occupancy
-from .report_file import read_report
+from .occupancy_file import read_codec, read_gaussian_codes, read_occupancy
 
 if TYPE_CHECKING:
     from typing import Self
@@ -111,7 +110,7 @@ class SavedMap:
     @functools.cached_property
     def gaussian_features(self) -> NDArray[np.float16]:
         """(N, D) unit features of the Gaussians."""
-        return self._codec.decode(self._features[1])
+        return self._codec.decode(read_gaussian_codes(self.files.path(FEATURES), self.manifest, self._codec))
 
     @functools.cached_property
     def trajectory(self) -> Trajectory:
@@ -139,6 +138,8 @@ class SavedMap:
     @functools.cached_property
     def report(self) -> dict[str, Any]:
         """Timings, used and lost frames, memory and warnings of the run that made the map."""
+        from .report_file import read_report
+
         return read_report(self.files.path(REPORT))
 
     @functools.cached_property
@@ -197,12 +198,8 @@ class SavedMap:
         return sorted(count, key=lambda name: -count[name])
 
     @functools.cached_property
-    def _features(self) -> tuple[Codec, NDArray[np.uint8]]:
-        return read_features(self.files.path(FEATURES), self.manifest)
-
-    @property
     def _codec(self) -> Codec:
-        return self._features[0]
+        return read_codec(self.files.path(FEATURES))
 
 
 def _of_frames(
