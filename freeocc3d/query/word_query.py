@@ -13,10 +13,9 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError, MapError
@@ -50,7 +49,7 @@ class Options(TypedOptions, frozen=True):
     """Least score of a matching voxel, -1…1; null = the encoder's own value for cosines, 0.5 for probabilities."""
     grow: PositiveShare = 0.8
     """A region grows over connected voxels that reach this share of the threshold; 1 = no growth."""
-    top_k: Annotated[int, Meta(ge=1, le=100_000)] = 20
+    top_k: PositiveInt = 20
     """Greatest number of regions for a word."""
     min_voxels: PositiveInt = 2
     """Least number of voxels of a region. Smaller regions are left out, unless all are smaller."""

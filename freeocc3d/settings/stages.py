@@ -92,7 +92,7 @@ class StereoOptions(TypedOptions, frozen=True):
 class GaussianOptions(TypedOptions, frozen=True):
     """Layer 2: how the depth of keyframes becomes Gaussians."""
 
-    cell_size: VoxelEdge | None = None
+    cell_size: Meters | None = None
     """Edge in meters of the cells that hold one Gaussian each; null = half the voxel size. If the scale is unknown,
     voxels may turn out to be large, so null then also limits the edge to a hundredth of the usual depth."""
     pixel_stride: Stride | None = None

@@ -25,7 +25,7 @@ def asked(room: Occupancy, word: str, where: Where, top_k: int = 20, up: np.ndar
 
 
 def answer(room: Occupancy, word: str, where: Where, top_k: int = 20, up: np.ndarray = UP):
-    every = Options(top_k=10_000)
+    every = Options(top_k=10**8)  # more regions than any map has voxels
     references = query(room, WORDS, where.words, every) if where.words else []
     return only_where(room, up, query(room, WORDS, [word], every), references, where, top_k)[0]
 
