@@ -80,9 +80,11 @@ class Place:
 class Ranking:
     """What matches."""
 
-    top: Annotated[int | None, typer.Option("--top", metavar="K", help="At most K regions for each word.")] = None
+    top: Annotated[int | None, typer.Option("--top", min=1, metavar="K", help="At most K regions for each word.")] = (
+        None
+    )
     threshold: Annotated[
-        float | None, typer.Option("--threshold", metavar="T", help="Lowest score of a match, -1 to 1.")
+        float | None, typer.Option("--threshold", min=-1, max=1, metavar="T", help="Lowest score of a match, -1 to 1.")
     ] = None
     scores: Annotated[
         str | None,

@@ -21,6 +21,7 @@ PICKS = ("largest", "highest", "lowest", "best")
 _ON_GAP = -0.5, 1.5  # voxels: a tilted lattice rounds surfaces up or down
 _LOWEST = 1.0  # voxels above a region's lowest point that belong to its underside
 _OVERLAP = 1.0 - 1e-6
+_FARTHEST_M = 1e6
 
 _Condition = tuple[Callable[[Region], bool], str]
 
@@ -47,14 +48,17 @@ class Where:
 
     def __post_init__(self) -> None:
         if self.within is not None and not (
-            len(self.within) == 6 and np.isfinite(self.within).all() and np.less(self.within[:3], self.within[3:]).all()
+            len(self.within) == 6
+            and np.less_equal(np.abs(self.within), _FARTHEST_M).all()
+            and np.less(self.within[:3], self.within[3:]).all()
         ):
             raise ConfigError(
                 "'within' takes a lower and an upper corner, x0 y0 z0 x1 y1 z1 in meters, with x0 < x1, y0 < y1 and "
-                f"z0 < z1; got {' '.join(f'{value:g}' for value in self.within)}."
+                f"z0 < z1, at most {_FARTHEST_M:g} m from the origin; got "
+                f"{' '.join(f'{value:g}' for value in self.within)}."
             )
-        if not 0 <= self.near_m < np.inf:
-            raise ConfigError(f"'near' takes a distance of 0 meters or more, got {self.near_m:g}.")
+        if not 0 <= self.near_m <= _FARTHEST_M:
+            raise ConfigError(f"'near' takes a distance of 0 to {_FARTHEST_M:g} meters, got {self.near_m:g}.")
         if self.pick not in (None, *PICKS):
             raise ConfigError(f"'pick' must be one of {', '.join(PICKS)}, got '{self.pick}'.")
 

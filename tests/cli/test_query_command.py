@@ -97,15 +97,20 @@ def test_query_by_class_by_picture_and_as_a_page(room, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--threshold", "nan"], "'threshold'"),
         (["--within", 0, 0, 0, 1, 1, "inf"], "'within'"),
+        (["--within", 0, 0, 0, 1, 1, 1e7], "at most 1e+06 m from the origin"),
         (["--near", "blue:nan"], "'near'"),
+        (["--near", "blue:1e7"], "0 to 1e+06 meters"),
         (["--refine", "nan"], "nan"),
-        (["--top", 0], "'top_k'"),
     ],
 )
 def test_a_query_with_impossible_numbers_is_refused(room, arguments, said) -> None:
     assert said in refused("query", room, "red", *arguments)
+
+
+@pytest.mark.parametrize(("option", "value"), [("--threshold", "nan"), ("--threshold", 2), ("--top", 0)])
+def test_a_number_outside_its_range_is_wrong_usage_and_its_option_is_named(room, option, value) -> None:
+    assert f"Invalid value for '{option}'" in run("query", room, "red", option, value, code=2).stderr
 
 
 @pytest.mark.parametrize("option", ["--ply", "--picture", "--html"])

@@ -66,7 +66,9 @@ class _Told:
 def _document(seed: int, results: list[harness.Result], failures: list[harness.Result]) -> dict[str, object]:
     names = dict.fromkeys(result.part for result in results)
     counts = {name: Counter(result.outcome for result in results if result.part == name) for name in names}
-    return {"seed": seed, "counts": counts, "failures": [result._asdict() for result in failures]}
+    stopped = [(result.outcome, result.description) for result in results if result.part == "checkpoints"]
+    failed = [result._asdict() for result in failures]
+    return {"seed": seed, "counts": counts, "failures": failed, "checkpoints": stopped}
 
 
 if __name__ == "__main__":

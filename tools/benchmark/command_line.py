@@ -63,6 +63,9 @@ def parse_arguments() -> argparse.Namespace:
         "-o", "--output", type=Path, metavar="FOLDER", help="write results.json, table.md and plots here"
     )
     parser.add_argument("--compare", type=Path, metavar="OLD", help="an earlier results.json: print what changed")
+    parser.add_argument(
+        "--before", type=Path, metavar="TREE", help="a checkout of an earlier tree, for the variant earlier_tree"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
     parser.add_argument("--inside", nargs=2, help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -99,7 +102,7 @@ def main() -> None:
         return
     old = json.loads(given.compare.read_text(encoding="utf-8")) if given.compare else None
     with tempfile.TemporaryDirectory(prefix="freeocc3d-benchmark-") as temporary:
-        results = run(given.captures, given.variants, given.frames, Path(temporary))
+        results = run(given.captures, given.variants, given.frames, Path(temporary), given.before)
         if given.output is not None:
             given.output.mkdir(parents=True, exist_ok=True)
             (given.output / "results.json").write_text(json.dumps(results, indent=1), encoding="utf-8")

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from .figures import Figures
@@ -22,15 +23,15 @@ class PartFailed(Exception):
     """A part could not be measured; the message is one sentence."""
 
 
-def run_timed(command: list[str]) -> tuple[float, int, str]:
+def run_timed(command: list[str], environment: Mapping[str, str] | None = None) -> tuple[float, int, str]:
     """Wall seconds, peak resident bytes (of the largest of its processes) and stdout of a command.
 
-    A process begins with the peak of the process that starts it, which must therefore be small. Raises PartFailed with
-    the command's last line on stderr.
+    A process begins with the peak of the process that starts it, which must therefore be small. environment: None =
+    this process's. Raises PartFailed with the command's last line on stderr.
     """
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
         mark = time.perf_counter()
-        process = subprocess.Popen(command, stdout=out, stderr=err)
+        process = subprocess.Popen(command, stdout=out, stderr=err, env=environment)
         _, status, usage = os.wait4(process.pid, 0)
         seconds = time.perf_counter() - mark
         process.returncode = os.waitstatus_to_exitcode(status)

@@ -14,13 +14,14 @@ from .peer_rows import PEERS
 class Measurement:
     """A measurement in its own process, besides the rows of ablations and peers.
 
-    measure: ``module:function`` that returns figures.  given: its arguments: none, ``capture``, ``captures`` (two) or
-    ``map_path``.  map_of: the ablation whose map it uses.  lines: ``module:function`` from one process's figures to
-    lines of what was measured and its goal.  table: instead of it, from all rows to lines of Markdown.
+    measure: ``module:function`` that returns figures.  given: its arguments: none, ``capture``, ``captures`` (two),
+    ``map_path``, or ``capture`` and ``before``, a checkout of an earlier tree.  map_of: the ablation whose map it uses.
+    lines: ``module:function`` from one process's figures to lines of what was measured and its goal.  table: instead of
+    it, from all rows to lines of Markdown.
     """
 
     title: str
-    given: Literal["nothing", "capture", "captures", "map"]
+    given: Literal["nothing", "capture", "captures", "map", "earlier"]
     measure: str
     lines: str = ""
     table: str = ""
@@ -126,6 +127,24 @@ MEASUREMENTS = {
         "fusion_of_mistakes:measure_fusion",
         table="fusion_of_mistakes:tabulate_fusion",
         map_of=TRUE_CLASSES,
+    ),
+    "damaged_input": Measurement(
+        "10,000 damaged inputs, runs that are killed, torn checkpoints: how they end (a quarter of an hour)",
+        "nothing",
+        "damaged_input:measure_damaged_input",
+        lines="damaged_input:damaged_input_lines",
+    ),
+    "equal_maps": Measurement(
+        "maps by one thread and by many, with an empty and a full cache of kernels: which files differ",
+        "capture",
+        "equal_maps:measure_equal_maps",
+        lines="equal_maps:equal_maps_lines",
+    ),
+    "earlier_tree": Measurement(
+        "seconds of reconstruct and of a cold query over those of the tree of --before",
+        "earlier",
+        "earlier_tree:measure_earlier_tree",
+        lines="earlier_tree:earlier_tree_lines",
     ),
 }
 

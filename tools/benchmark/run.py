@@ -25,8 +25,10 @@ _TRACKED = ("stress", "glued", "lengths")
 """Measurements that time kernels which the first run would have to compile."""
 
 
-def run(captures: Sequence[Path], names: Sequence[str], frames: int | None, folder: Path) -> Figures:
-    """All rows, and the figures of all named measurements."""
+def run(
+    captures: Sequence[Path], names: Sequence[str], frames: int | None, folder: Path, before: Path | None = None
+) -> Figures:
+    """All rows, and the figures of all named measurements. before: a checkout of an earlier tree to compare with."""
     jobs = [Job(capture.resolve(), frames, folder / str(number)) for number, capture in enumerate(captures)]
     if any(name not in MEASUREMENTS or name in _TRACKED for name in names):
         first = str(jobs[0].capture)
@@ -36,7 +38,7 @@ def run(captures: Sequence[Path], names: Sequence[str], frames: int | None, fold
         job.folder.mkdir(parents=True)
         rows += _measure_rows(job, names)
     measured = {
-        name: [row for given in _arguments_of(part, jobs) for row in _measure_part(name, part, given)]
+        name: [row for given in _arguments_of(part, jobs, before) for row in _measure_part(name, part, given)]
         for name, part in MEASUREMENTS.items()
         if name in names
     }
@@ -80,7 +82,7 @@ def _over_dense_slam(row: Figures, slam_seconds: float) -> Figures:
     return figures
 
 
-def _arguments_of(part: Measurement, jobs: Sequence[Job]) -> Iterator[dict[str, Any]]:
+def _arguments_of(part: Measurement, jobs: Sequence[Job], before: Path | None) -> Iterator[dict[str, Any]]:
     """The arguments of a measurement in each of its processes, and "name", which its rows have as "capture"."""
     if part.given == "nothing":
         yield {"name": ""}
@@ -88,8 +90,9 @@ def _arguments_of(part: Measurement, jobs: Sequence[Job]) -> Iterator[dict[str, 
         for first, second in itertools.pairwise(job.capture for job in jobs):
             name = f"{capture_name(first)} + {capture_name(second)}"
             yield {"name": name, "captures": [str(first), str(second)]}
-    elif part.given == "capture":
-        yield from ({"name": job.name, "capture": str(job.capture)} for job in jobs)
+    elif part.given in ("capture", "earlier"):
+        more = {"before": before and str(before)} if part.given == "earlier" else {}
+        yield from ({"name": job.name, "capture": str(job.capture), **more} for job in jobs)
     else:
         yield from ({"name": job.name, "map_path": str(job.map(part.map_of))} for job in jobs)
 
