@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +67,9 @@ class Network:
         return list(given)
 
 
-def load_network(path: Path, device: str = "cpu", external: Sequence[str] | None = None) -> Network:
-    """The network in an ONNX file. device: "cpu" or "cuda:0".  external: names of the files beside it that may hold its
-    weights; None = any beside it.
+def load_network(path: Path, device: str = "cpu", external: Callable[[str], bool] = lambda name: True) -> Network:
+    """The network in an ONNX file. device: "cpu" or "cuda:0".  external: whether a file beside it may hold its weights,
+    by its name.
 
     Raises ModelError if the file is missing, not ONNX, or keeps weights elsewhere; ConfigError if onnxruntime lacks the
     device.
@@ -100,15 +100,13 @@ def load_network(path: Path, device: str = "cpu", external: Sequence[str] | None
     return Network(path, session)
 
 
-def _check_external(path: Path, allowed: Sequence[str] | None) -> None:
+def _check_external(path: Path, allowed: Callable[[str], bool]) -> None:
     """Raises ModelError if a network keeps weights in a file that is not allowed; OSError."""
     for name in find_external_files(path):
         plain = Path(name).name == name and name not in ("", ".", "..") and name.isprintable()
-        if not plain or (allowed is not None and name not in allowed):
+        if not plain or not allowed(name):
             why = "which its manifest does not list" if plain else "which is no file beside it"
             raise ModelError(f"{path} keeps weights in '{name[:80]}', {why}: export it again.")
-        if (path.parent / name).is_symlink() and allowed is not None:
-            raise ModelError(f"{path} keeps weights in '{name}', which is a link: copy the file.")
         check_regular(path.parent / name)
 
 

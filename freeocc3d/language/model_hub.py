@@ -213,8 +213,9 @@ def _continue(repository: str, revision: str, remote: _Remote, stream: IO[bytes]
         request.add_header("Range", f"bytes={start}-")
 
     def receive(answer: Answer, piece: bytes) -> None:
-        if stream.tell() == start and start and answer.status != _PARTIAL:
-            stream.seek(stream.truncate(0))  # the server sends the whole file
+        nonlocal start
+        if start and answer.status != _PARTIAL:  # the server sends the whole file
+            start = stream.seek(stream.truncate(0))
         if stream.tell() + len(piece) > remote.size:
             raise NoAnswer(f"it sends more than the {remote.size:,} bytes of {remote.name} that it lists")
         stream.write(piece)

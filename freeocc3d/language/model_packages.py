@@ -32,8 +32,8 @@ MANIFESTS = ("manifest.yaml", "manifest.json")
 FORMAT = 1
 _WEIGHTS = ".onnx.data"
 SUFFIXES = (".onnx", ".safetensors", ".json", ".yaml", _WEIGHTS)
-"""Suffixes of the files that a package may contain. Weights beside a network, of more than two gigabytes, are no part
-of their own."""
+"""Suffixes of the files that a package may contain. Weights that a network keeps beside it are no part of
+their own."""
 Precision = Literal["fp32", "fp16", "int8"]
 """Precision of a package's weights."""
 
@@ -90,8 +90,7 @@ class Package:
     parts: part ("image", "text", "tokenizer"…) -> file name.  files: file name -> sha256.  dimension: D of features.
     mean, std: (3,) of RGB in 0…1.  patch: edge of a patch in pixels.  input_size: edge of the training images in
     pixels.  prefix_tokens: number of tokens before those of the patches.  logit_scale: factor of the cosines in
-    training,
-    one over the softmax temperature.
+    training, one over the softmax temperature.
     """
 
     folder: Path
@@ -128,8 +127,6 @@ class Package:
     def checked(self, name: str) -> Path:
         """A file of the package, after a check of its content. Raises ModelError."""
         path, stated = self.folder / name, self.files[name]
-        if path.is_symlink():
-            raise ModelError(f"{path} is a link, but a package holds its files itself: copy the file.")
         found = hash_file(path)
         if found != stated:
             raise ModelError(
@@ -138,11 +135,15 @@ class Package:
             )
         return path
 
+    def _checked_weights(self, name: str) -> bool:
+        """Whether a network may keep weights in a file of that name, whose content is then checked. Raises
+        ModelError."""
+        return name.endswith(_WEIGHTS) and name in self.files and self.checked(name).is_file()
+
     def session(self, part: str, device: str = "cpu") -> Network:
         """The part's network, after a check of its files, inputs, outputs and dimension. Raises ModelError."""
         path = self.file(part)
-        weights = [self.checked(name).name for name in self.files if name.endswith(_WEIGHTS)]
-        network = load_network(path, device, weights)
+        network = load_network(path, device, self._checked_weights)
         expected, outputs = KINDS[self.kind][part], network.outputs
         if sorted(network.inputs) != sorted(expected.inputs) or set(expected.outputs) - set(outputs):
             raise ModelError(
@@ -282,7 +283,9 @@ def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:
         if not all(map(math.isfinite, numbers)):
             raise InvalidDocument("its numbers must be finite")
         if min(said.std) < _LEAST_STD or max(map(abs, numbers[:-1])) > _MOST_LEVEL:
-            raise InvalidDocument(f"'mean' and 'std' must be levels in 0…1, and 'std' at least {_LEAST_STD:g}")
+            raise InvalidDocument(
+                f"'mean' and 'std' must be at most {_MOST_LEVEL:g}, and 'std' at least {_LEAST_STD:g}"
+            )
         if said.input_size < said.patch:
             raise InvalidDocument("'input_size' must not be less than 'patch'")
     except InvalidDocument as error:

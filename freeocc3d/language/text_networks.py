@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -76,9 +77,9 @@ class _State(msgspec.Struct):
     """What a map keeps of an encoder whose words a text network embeds."""
 
     threshold: Annotated[float, msgspec.Meta(ge=-1, le=1)]
-    temperature: Annotated[float, msgspec.Meta(gt=0, le=100)]
+    temperature: Annotated[float, msgspec.Meta(gt=0, le=1000)]
     dimension: Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
-    templates: Annotated[list[str], msgspec.Meta(min_length=1, max_length=1000)]
+    templates: Annotated[list[str], msgspec.Meta(min_length=1, max_length=10_000)]
     contrast: Annotated[list[str], msgspec.Meta(max_length=10_000)]
     model: str
     folder: str
@@ -142,31 +143,33 @@ class TextNetwork:
         except ImportError as error:
             raise ModelError("Encoding words needs the package tokenizers: pip install 'freeocc3d[models]'.") from error
         self._path = package.file("tokenizer")
-        try:
+        with self._failing("is not a tokenizer.json"):
             self._tokenizer = Tokenizer.from_str(read_text(self._path, _LARGEST_TOKENIZER))
-        except OSError as error:
-            raise ModelError(f"Cannot read {self._path}: {error.strerror}.") from error
-        except (KeyboardInterrupt, SystemExit):
-            raise
-        except BaseException as error:  # tokenizers raises bare Exceptions, and panics that are none
-            raise ModelError(f"{self._path} is not a tokenizer.json: {shorten_to_line(str(error), 200)}.") from error
         self._refuse_endless_texts()
         self._package = package
         self._network = package.session("text")
 
     def tokens(self, texts: list[str]) -> NDArray[np.int64]:
         """(T, L) token numbers; the tokenizer file defines how texts are cut and padded. Raises ModelError."""
-        try:
+        with self._failing("fails on a text"):
             rows = [encoding.ids for encoding in self._tokenizer.encode_batch(texts)]
-        except (KeyboardInterrupt, SystemExit):
-            raise
-        except BaseException as error:
-            raise ModelError(f"{self._path} fails on a text: {shorten_to_line(str(error), 200)}.") from error
         if len({len(row) for row in rows}) > 1:
             raise ModelError(
                 f"{self._package.folder}/{self._package.parts['tokenizer']} does not pad texts: export it again."
             )
         return np.array(rows, np.int64)
+
+    @contextlib.contextmanager
+    def _failing(self, what: str) -> Iterator[None]:
+        """Raises ModelError for what tokenizers raises: bare Exceptions, and panics that are none."""
+        try:
+            yield
+        except OSError as error:
+            raise ModelError(f"Cannot read {self._path}: {error.strerror}.") from error
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:
+            raise ModelError(f"{self._path} {what}: {shorten_to_line(str(error), 200)}.") from error
 
     def embed(self, texts: list[str]) -> NDArray[np.float32]:
         """(T, D) unit embeddings."""

@@ -58,7 +58,7 @@ def fetch(
     Raises TimeoutError, NoAnswer, and what ``receive`` raises.
     """
     exchange = _Exchange(request, receive, timeout_s)
-    handlers = [_Http(exchange), _Https(exchange), _Redirects() if redirects else _NoRedirects()]
+    handlers = [_Handler(exchange), _Redirects() if redirects else _NoRedirects()]
     opener = urllib.request.build_opener(*handlers, *([] if proxies else [urllib.request.ProxyHandler({})]))
     thread = threading.Thread(target=exchange.run, args=(opener,), name="freeocc3d request", daemon=True)
     thread.start()
@@ -98,7 +98,7 @@ class _Exchange:
                     raise TimeoutError from None
                 continue
             if isinstance(ended, Exception):
-                raise _told(ended) from ended
+                raise ended
             return ended
 
     def connect(self, *arguments: Any, **options: Any) -> socket.socket:
@@ -130,12 +130,21 @@ class _Exchange:
         except urllib.error.HTTPError as error:
             with error:
                 return Answer(error.code, dict(error.headers), _excerpt(error))
+        except Exception as error:
+            raise _told(error) from error
         with response:
             answer = Answer(response.status, dict(response.headers))
-            while piece := response.read1(_AT_ONCE):
+            while piece := _next_piece(response):
                 self._receive(answer, piece)
                 self._received += len(piece)
             return answer
+
+
+def _next_piece(response: http.client.HTTPResponse) -> bytes:
+    try:
+        return response.read1(_AT_ONCE)
+    except Exception as error:
+        raise _told(error) from error
 
 
 def _excerpt(error: urllib.error.HTTPError) -> bytes:
@@ -146,7 +155,7 @@ def _excerpt(error: urllib.error.HTTPError) -> bytes:
 
 
 def _told(error: Exception) -> Exception:
-    """The error as ``fetch`` raises it."""
+    """The network's error as ``fetch`` raises it."""
     reason = error.reason if isinstance(error, urllib.error.URLError) else error
     if isinstance(error, TimeoutError) or isinstance(reason, TimeoutError):
         return TimeoutError()
@@ -157,19 +166,15 @@ def _told(error: Exception) -> Exception:
     return error
 
 
-class _Http(urllib.request.HTTPHandler):
+class _Handler(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
+    """Takes the place of both default handlers; its connections can be ended."""
+
     def __init__(self, exchange: _Exchange):
         super().__init__()
         self._exchange = exchange
 
     def http_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
         return self.do_open(_connecting(http.client.HTTPConnection, self._exchange), req)
-
-
-class _Https(urllib.request.HTTPSHandler):
-    def __init__(self, exchange: _Exchange):
-        super().__init__()
-        self._exchange = exchange
 
     def https_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
         return self.do_open(_connecting(http.client.HTTPSConnection, self._exchange), req)

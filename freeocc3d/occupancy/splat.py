@@ -64,11 +64,12 @@ def bin_gaussians(
     """Sorts Gaussians into blocks of the lattice whose voxel (0, 0, 0) has its lower corner at ``origin``.
 
     shape: limits the evaluation to the voxels (0, 0, 0) … shape - 1; all by default.
-    least_scale: s_min, meters. Raises FreeOccError if they reach farther than voxels have keys, or touch too many
-    blocks.
+    least_scale: s_min, meters. Raises FreeOccError if they touch too many blocks, or, without ``shape``, reach farther
+    than voxels have keys.
     """
     check(options)
-    _refuse_far(gaussians, origin, options, least_scale)
+    if shape is None:
+        _refuse_far(gaussians, origin, options, least_scale)
     mode = MODES[options.projection]
     scales, share = widen_scales(gaussians.scales, least_scale, options)
     means, form, log_weight, lo, hi = prepare_gaussians(

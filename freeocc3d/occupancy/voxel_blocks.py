@@ -13,8 +13,6 @@ from ..core.types import BLOCK
 
 _VOXEL_BYTES = 24
 """Of a voxel while a map is built: counts, alpha, state, and the copies of them that are made on the way."""
-_MANY_BLOCKS = 1 << 14
-"""Fewer blocks, 200 MB, are not compared with the memory."""
 
 
 def unite_keys(*packed: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -28,12 +26,16 @@ def find_blocks_along_rays(
     origin: NDArray[np.float64],
     voxel_size: float,
 ) -> NDArray[np.int64]:
-    """Returns the ascending packed keys of all blocks on the segments from a camera's center to (P, 3) points."""
+    """Returns the ascending packed keys of all blocks on the segments from a camera's center to (P, 3) points. Raises
+    ConfigError, without an end of the walk, if these are more than fit into the memory that is free."""
     edge = BLOCK * voxel_size
     ends = (np.asarray(points_world, np.float64) - origin) / edge
     start = (np.asarray(center_world, np.float64) - origin) / edge
-    _refuse_long(start, ends, voxel_size)
-    return np.sort(_walked(start, ends))
+    most = available_memory() // (BLOCK**3 * _VOXEL_BYTES)
+    keys = _walked(start, ends, most)
+    if len(keys) > most:
+        refuse_blocks(len(keys), voxel_size)
+    return np.sort(keys)
 
 
 def refuse_blocks(blocks: float, voxel_size: float) -> None:
@@ -44,18 +46,6 @@ def refuse_blocks(blocks: float, voxel_size: float) -> None:
             f"{blocks * BLOCK**3:.3g} voxels of {voxel_size:g} m need about {needed / 1e9:.1f} GB of memory, but "
             f"{free / 1e9:.1f} GB are free: choose a larger occupancy.voxel_size, or a smaller capture.max_depth."
         )
-
-
-def _refuse_long(start: NDArray[np.float64], ends: NDArray[np.float64], voxel_size: float) -> None:
-    """Raises ConfigError if the blocks on the segments cannot fit into the memory. They are no more than the steps on
-    all segments, and no more than those of a pyramid."""
-    if not len(ends):
-        return
-    steps = float(np.abs(ends - start).sum()) + len(ends)
-    low, high = np.minimum(ends.min(axis=0), start), np.maximum(ends.max(axis=0), start)
-    blocks = min(steps, float(np.prod(high - low + 1)) / 3 + 3 * len(ends))
-    if not blocks < _MANY_BLOCKS:
-        refuse_blocks(blocks if np.isfinite(blocks) else float("inf"), voxel_size)
 
 
 @njit(cache=True, nogil=True)
@@ -79,8 +69,9 @@ def find_touched_blocks(lo: NDArray[np.int32], hi: NDArray[np.int32]) -> NDArray
 
 
 @njit(cache=True, nogil=True)
-def _walked(start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Returns the distinct packed keys of the unit cells on the segments from one point to (P, 3) others.
+def _walked(start: NDArray[np.float64], ends: NDArray[np.float64], most: int) -> NDArray[np.int64]:
+    """Returns the distinct packed keys of the unit cells on the segments from one point to (P, 3) others. Ends after
+    the first key beyond ``most``.
 
     Source: J. Amanatides, A. Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, Eurographics 1987.
     """
@@ -108,4 +99,6 @@ def _walked(start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np
             cell[i] += step[i]
             next_face[i] += between[i]
             table, count = put_key(table, count, packed_key(cell[0], cell[1], cell[2]))
+            if count > most:
+                return table[table != -1]
     return table[table != -1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import errno
 import time
 import urllib.request
 
@@ -84,21 +84,23 @@ def test_a_slow_download_goes_on_while_it_goes_on() -> None:
     ],
 )  # fmt: skip
 def test_what_is_no_http_is_no_answer(answer: bytes) -> None:
-    with attacking(lambda connection: connection.send(answer)) as server, contextlib.suppress(NoAnswer):
+    with attacking(lambda connection: connection.send(answer)) as server, pytest.raises(NoAnswer):
         fetched(server.url, 2.0)
 
 
-def test_what_the_receiver_raises_ends_the_exchange() -> None:
+@pytest.mark.parametrize("error", [KeyError("enough"), OSError(errno.ENOSPC, "enough"), ValueError("enough")])
+def test_what_the_receiver_raises_ends_the_exchange(error: Exception) -> None:
     def script(connection: Connection) -> None:
         connection.send(OK + b"\r\n")
         while not connection.over.is_set():
             connection.send(bytes(1 << 16))
 
     def receive(_: Answer, __: bytes) -> None:
-        raise KeyError("enough")
+        raise error
 
-    with attacking(script) as server, pytest.raises(KeyError, match="enough"):
+    with attacking(script) as server, pytest.raises(type(error), match="enough") as raised:
         fetch(urllib.request.Request(server.url), receive, 5.0)
+    assert raised.value is error
 
 
 def moved(to: bytes) -> Script:
@@ -120,7 +122,12 @@ def test_redirects_are_followed_on_request_without_the_key() -> None:
     assert b"secret" not in asked[0]
 
 
-@pytest.mark.parametrize("to", [b"/again", b"file:///etc/passwd", b"ftp://127.0.0.1/x", b"http://[::1", b"//", b"x:"])
-def test_redirects_that_lead_nowhere(to: bytes) -> None:
-    with attacking(moved(to)) as server, contextlib.suppress(NoAnswer):
+@pytest.mark.parametrize("to", [b"/again", b"file:///etc/passwd", b"ftp://127.0.0.1/x", b"//", b"x:"])
+def test_redirects_that_lead_nowhere_are_not_followed(to: bytes) -> None:
+    with attacking(moved(to)) as server:
         assert fetched(server.url, redirects=True)[0].status == 302
+
+
+def test_a_redirect_to_no_address_is_no_answer() -> None:
+    with attacking(moved(b"http://[::1")) as server, pytest.raises(NoAnswer):
+        fetched(server.url, redirects=True)

@@ -27,7 +27,8 @@ REQUIRES: tuple[str, ...] = ()
 
 _VOID = 255
 """A value that means nothing in many class images, even if there are fewer than 255 classes."""
-_MOST_CLASSES = 2048
+_MOST_CLASSES = 8192
+"""The features of all classes, a table of classes x classes float16, then take 134 MB."""
 _ASPECT_TOLERANCE = 0.02
 
 
