@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,7 @@ class Capture(ABC):
     def __getitem__(self, index: int) -> Frame:
         """Decode frame ``index``. Thread-safe. Raises FrameError if one of its files is missing or broken."""
 
-    def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
+    def raw_depth(self, index: int) -> tuple[NDArray[Any], float] | None:
         """(H, W) depth as stored (0 = no measurement) and its units per meter; None if depth is not stored as integers.
         Only ``check_depth_scale`` reads it. Raises FrameError."""
         return None

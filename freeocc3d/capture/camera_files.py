@@ -62,10 +62,11 @@ class _Open3DCamera(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Calibration:
-    """Stated intrinsics. values: fx, fy, cx, cy, pixels.  size: the image size that they refer to; None = the size of
+    """Stated intrinsics. values: fx, fy, cx, cy, pixels; without cx and cy, the center of the
+    image.  size: the image size that they refer to; None = the size of
     the images found.  source: where they come from, for messages."""
 
-    values: tuple[float, float, float, float]
+    values: tuple[float, float, float | None, float | None]
     size: Size | None
     source: str
 
@@ -75,9 +76,10 @@ class Calibration:
         Raises CaptureError: a value is not finite, a focal length that no camera has, the principal point outside the
         image, or the size shows another view.
         """
-        fx, fy, cx, cy = self.values
         width, height = self.size or size
-        check_focal(self.values, (width, height), self.source)
+        fx, fy, cx, cy = self.values
+        cx, cy = (width - 1) / 2 if cx is None else cx, (height - 1) / 2 if cy is None else cy
+        check_focal((fx, fy, cx, cy), (width, height), self.source)
         if min(width, height) <= 0 or not same_view((width, height), size):
             raise CaptureError(
                 f"{self.source} is for images of {width} x {height} pixels, but the images have {size[0]} x {size[1]}: "
@@ -144,8 +146,10 @@ def reduce_camera(camera: Intrinsics, max_size: int | None) -> Intrinsics:
 
 
 def read_given_calibration(options: Options) -> Calibration | None:
-    """The color camera that ``capture.intrinsics`` states, or None."""
-    return Calibration(options.intrinsics, None, "capture.intrinsics") if options.intrinsics else None
+    """The color camera that ``capture.intrinsics`` or ``capture.focal`` states, or None."""
+    if options.intrinsics:
+        return Calibration(options.intrinsics, None, "capture.intrinsics")
+    return Calibration((options.focal, options.focal, None, None), None, "capture.focal") if options.focal else None
 
 
 def read_intrinsics(path: Path) -> Calibration:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ class Reregistered(Capture):
         grid = self._grid(frame.intrinsics)
         return replace(frame, color=grid.color(frame.color), depth_m=grid.depth(frame.depth_m))
 
-    def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
+    def raw_depth(self, index: int) -> tuple[NDArray[Any], float] | None:
         return self._capture.raw_depth(index)
 
     def name(self, index: int) -> str:

@@ -16,7 +16,8 @@ from ..core.transforms import invert, project, transform
 from ..core.types import Frame
 from .base import NOMINAL_DEPTH, Capture, Options
 from .camera_files import read_given_calibration, rescale_camera
-from .image_decoding import convert_to_meters, read_color, read_depth
+from .depth_decoding import RawDepth, convert_to_meters, read_raw_depth
+from .image_decoding import read_color
 from .lenses import Lens
 from .undistortion import Rectified
 
@@ -77,14 +78,14 @@ class PosedImages(Capture):
         depth_m = np.zeros(rectified.size[::-1], np.float32)
         if self.has_depth and view.depth is not None:
             units = self.options.depth_scale or UNITS_PER_METER
-            depth_m = rectified.depth(convert_to_meters(read_depth(view.depth), units, self.options.max_depth))
+            depth_m = rectified.depth(convert_to_meters(read_raw_depth(view.depth), units, self.options.max_depth))
         return Frame(index, float(self.timestamps[index]), rectified.color(color), depth_m, rectified.intrinsics)
 
-    def raw_depth(self, index: int) -> tuple[NDArray[np.uint16], float] | None:
+    def raw_depth(self, index: int) -> tuple[RawDepth, float] | None:
         path = self._posed[index].depth
         if path is None or not self.has_depth:
             return None
-        return read_depth(path), self.options.depth_scale or UNITS_PER_METER
+        return read_raw_depth(path), self.options.depth_scale or UNITS_PER_METER
 
     def name(self, index: int) -> str:
         return self._posed[index].image.name

@@ -52,6 +52,10 @@ class Rectified:
             depth_m = cv2.resize(depth_m, self.size, interpolation=cv2.INTER_NEAREST_EXACT)
         return self._moved(depth_m, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
 
+    def nearest(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Undistort values (H, W) of the lens's size, by the nearest pixel."""
+        return self._moved(image, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
+
     def _moved(self, image: NDArray[Any], by: int, border: int) -> NDArray[Any]:
         return image if self._maps is None else cv2.remap(image, *self._maps, by, borderMode=border)
 

@@ -87,6 +87,21 @@ def _read(
     return arrays
 
 
+def read_array(path: Path, most_bytes: int = _LARGEST) -> NDArray[Any]:
+    """Read the array of an .npy file, in the machine's byte order. Raises MapError, as ``read_arrays`` does."""
+    try:
+        with open_regular(path, most_bytes + _LONGEST_HEADER) as stream:
+            size = stream.seek(0, 2)
+            stream.seek(0)
+            return _unpack(stream, path.name, size, None, most_bytes)
+    except OSError as error:
+        raise MapError(f"{path} cannot be read: {error.strerror}.") from error
+    except _Unusable as error:
+        raise MapError(f"{path} is damaged: {error}.") from error
+    except _ERRORS as error:
+        raise MapError(f"{path} is damaged: {' '.join(str(error).split()) or 'it ends too early'}.") from error
+
+
 def is_whole(path: Path) -> bool:
     """Whether no byte of the arrays in an .npz file was lost or changed since it was written."""
     try:
@@ -102,17 +117,23 @@ def _read_array(
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise _Unusable(f"its array {info.filename} is packed in a way that NumPy does not write")
     with archive.open(info) as stream:
-        dtype, in_columns, shape, offset = _header(stream, info.filename)
-        if expected is not None and not _fits(dtype, shape, *expected):
-            raise _Unusable(f"it has no usable array '{info.filename.removesuffix('.npy')}'")
-        size = math.prod(shape) * dtype.itemsize
-        if offset + size != info.file_size:
-            raise _Unusable(f"its array {info.filename} is not as large as its header says")
-        if size > most_bytes:
-            raise _Unusable(f"its array {info.filename} takes {size:,} bytes, more than is possible here")
-        data = _filled(cast(BufferedIOBase, stream), size)
-        if data is None or stream.read(1):  # at the end, zipfile compares the checksum
-            raise _Unusable(f"its array {info.filename} ends too early")
+        return _unpack(stream, info.filename, info.file_size, expected, most_bytes)
+
+
+def _unpack(
+    stream: IO[bytes], name: str, file_size: int, expected: tuple[str, int | Shape] | None, most_bytes: int
+) -> NDArray[Any]:
+    dtype, in_columns, shape, offset = _header(stream, name)
+    if expected is not None and not _fits(dtype, shape, *expected):
+        raise _Unusable(f"it has no usable array '{name.removesuffix('.npy')}'")
+    size = math.prod(shape) * dtype.itemsize
+    if offset + size != file_size:
+        raise _Unusable(f"its array {name} is not as large as its header says")
+    if size > most_bytes:
+        raise _Unusable(f"its array {name} takes {size:,} bytes, more than is possible here")
+    data = _filled(cast(BufferedIOBase, stream), size)
+    if data is None or stream.read(1):  # at the end, zipfile compares the checksum
+        raise _Unusable(f"its array {name} ends too early")
     array = np.frombuffer(data, dtype).reshape(shape, order="F" if in_columns else "C")
     return array if dtype.isnative else array.astype(dtype.newbyteorder("="))
 

@@ -58,6 +58,9 @@ class CaptureOptions(TypedOptions, frozen=True):
     """Meters per unit of poses without a known scale, as in a scan without depth; null = unknown."""
     intrinsics: tuple[Focal, Focal, Center, Center] | None = None
     """fx, fy, cx, cy of the color image in pixels; they replace those in the files. null = as the files state."""
+    focal: Focal | None = None
+    """Focal length of the color image in pixels, for images of one size with the principal point at their center; it
+    replaces what the files state. null = as ``intrinsics`` or the files state."""
     color_focal: Annotated[float, Meta(ge=0.5, le=2)] | None = None
     """Focal length of the color camera divided by the one in the files, for files that suit the depth but not the color
     (7-Scenes' Kinect: 0.90); null = measure it in the scan, 1 = as in the files."""

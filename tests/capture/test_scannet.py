@@ -62,9 +62,13 @@ def test_no_intrinsics_at_all(tmp_path: Path) -> None:
     write_scannet(tmp_path, 1)
     for path in (tmp_path / "intrinsic").iterdir():
         path.unlink()
-    with pytest.raises(CaptureError, match=r"has no intrinsic/intrinsic_color\.txt: add it, or give"):
-        Reader(tmp_path, Options())
-    assert Reader(tmp_path, Options(intrinsics=(32.0, 32.0, 15.5, 11.5)))[0].intrinsics.fx == 32.0
+    unknown = Reader(tmp_path, Options())
+    assert not unknown.intrinsics_known
+    assert not unknown.focal_stated
+    given = Reader(tmp_path, Options(intrinsics=(32.0, 32.0, 15.5, 11.5)))
+    assert given.intrinsics_known
+    assert given[0].intrinsics.fx == 32.0
+    assert Reader(tmp_path, Options(focal=40.0))[0].intrinsics == Intrinsics(32, 24, 40.0, 40.0, 15.5, 11.5)
 
 
 @pytest.mark.parametrize("kind", ["color", "depth"])

@@ -24,10 +24,11 @@ from ..camera_files import (
     rescale_camera,
 )
 from ..class_files import capture_class_names
-from ..depth_registration import PixelGrid
 from ..image_pairs import ImagePairs, pair_files
+from ..lenses import Lens
 from ..number_files import read_number_rows
 from ..numbered_files import has_file, list_numbered
+from ..rgbd_frames import Rig
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -72,8 +73,8 @@ class Reader(ImagePairs):
         pairs = pair_files(list_numbered(results, COLOR), list_numbered(results, DEPTH), results, options)
         calibration, units_per_meter = _parameters(path, options)
         camera = calibration.camera(pairs.color_size) if calibration else guess_camera(pairs.color_size)
-        grid = PixelGrid(camera, rescale_camera(camera, pairs.depth_size))
-        super().__init__(path, options, pairs, grid, units_per_meter)
+        rig = Rig(Lens(camera), Lens(rescale_camera(camera, pairs.depth_size)))
+        super().__init__(path, options, pairs, rig, units_per_meter)
         self.intrinsics_known = self.focal_stated = calibration is not None
         self.classes = capture_class_names(path)
 
@@ -91,7 +92,7 @@ class Reader(ImagePairs):
         return T_world_cam if is_pose(T_world_cam) else None
 
     def labels(self, index: int) -> NDArray[np.uint8] | None:
-        return self._class_image(self._class_files.get(self._pairs.numbers[index]))
+        return self._class_image(index, self._class_files.get(self._pairs.numbers[index]))
 
     @functools.cached_property
     def _class_files(self) -> dict[int, Path]:

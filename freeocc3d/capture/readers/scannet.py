@@ -10,22 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import CaptureError
 from ...core.transforms import invert
-from ...core.types import Intrinsics
 from ..base import Options
-from ..camera_files import (
-    guess_camera,
-    read_given_calibration,
-    read_intrinsics,
-    read_pose,
-    read_rigid,
-    rescale_camera,
-)
+from ..camera_files import read_intrinsics, read_pose, read_rigid
 from ..class_files import capture_class_names
-from ..depth_registration import PixelGrid
 from ..image_pairs import ImagePairs, Pairs, pair_files
+from ..lenses import Lens
 from ..numbered_files import has_file, list_numbered
+from ..rgbd_frames import StatedCameras, build_rig
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -59,9 +51,14 @@ class Reader(ImagePairs):
 
     def __init__(self, path: Path, options: Options):
         pairs = pair_files(list_numbered(path / "color", COLOR), list_numbered(path / "depth", IMAGE), path, options)
-        grid, self.intrinsics_known = _grid(path, options, pairs)
+        rig, self.intrinsics_known = build_rig(
+            _stated_cameras(path, pairs, options.depth),
+            options,
+            pairs.color_size,
+            pairs.depth_size if options.depth else None,
+        )
         self.focal_stated = self.intrinsics_known
-        super().__init__(path, options, pairs, grid, units_per_meter=1000.0)
+        super().__init__(path, options, pairs, rig, units_per_meter=1000.0)
         self.classes = capture_class_names(path)
 
     @classmethod
@@ -73,7 +70,7 @@ class Reader(ImagePairs):
         return None if path is None else read_pose(path)
 
     def labels(self, index: int) -> NDArray[np.uint8] | None:
-        return self._class_image(self._class_files.get(self._pairs.numbers[index]))
+        return self._class_image(index, self._class_files.get(self._pairs.numbers[index]))
 
     @functools.cached_property
     def _pose_files(self) -> dict[int, Path]:
@@ -84,30 +81,15 @@ class Reader(ImagePairs):
         return list_numbered(self.path / "label-filt", IMAGE)
 
 
-def _grid(path: Path, options: Options, pairs: Pairs) -> tuple[PixelGrid, bool]:
-    """The frames' pixel grid, and whether the color camera is known. Raises CaptureError."""
-    if options.depth:
-        color, depth = _cameras(path, options, pairs)
-        return PixelGrid(color, depth, _T_color_depth(path)), True
-    file = _first(path, (*COLOR_CAMERA, *ONE_CAMERA))
-    stated = read_given_calibration(options) or (read_intrinsics(file) if file else None)
-    camera = stated.camera(pairs.color_size) if stated else guess_camera(pairs.color_size)
-    return PixelGrid(camera, camera), stated is not None
-
-
-def _cameras(path: Path, options: Options, pairs: Pairs) -> tuple[Intrinsics, Intrinsics]:
-    """The color and the depth camera. Raises CaptureError if neither is stated."""
-    color_file, depth_file = _first(path, (*COLOR_CAMERA, *ONE_CAMERA)), _first(path, DEPTH_CAMERA)
-    color = read_given_calibration(options) or (read_intrinsics(color_file) if color_file else None)
-    depth = read_intrinsics(depth_file) if depth_file else None
-    if color is None and depth is None:
-        raise CaptureError(f"{path} has no {COLOR_CAMERA[0]}: add it, or give capture.intrinsics.")
-    color_camera = color.camera(pairs.color_size) if color else None
-    depth_camera = depth.camera(pairs.depth_size) if depth else None
-    if color_camera is None:
-        assert depth_camera is not None
-        return rescale_camera(depth_camera, pairs.color_size), depth_camera
-    return color_camera, depth_camera or rescale_camera(color_camera, pairs.depth_size)
+def _stated_cameras(path: Path, pairs: Pairs, with_depth: bool) -> StatedCameras:
+    """What the files state about the two cameras. Raises CaptureError for an unusable file."""
+    color = _first(path, (*COLOR_CAMERA, *ONE_CAMERA))
+    depth = _first(path, DEPTH_CAMERA) if with_depth else None
+    return StatedCameras(
+        Lens(read_intrinsics(color).camera(pairs.color_size)) if color else None,
+        Lens(read_intrinsics(depth).camera(pairs.depth_size)) if depth else None,
+        _T_color_depth(path),
+    )
 
 
 def _T_color_depth(path: Path) -> NDArray[np.float64] | None:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from ..base import Options
 from ..camera_files import Calibration, read_given_calibration, read_intrinsics, read_pose, rescale_camera
-from ..depth_registration import PixelGrid
 from ..image_pairs import ImagePairs, pair_files
+from ..lenses import Lens
 from ..numbered_files import has_file, list_numbered
+from ..rgbd_frames import Rig
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -38,8 +39,8 @@ class Reader(ImagePairs):
             read_intrinsics(stated) if os.path.lexists(stated) else KINECT
         )
         camera = calibration.camera(pairs.color_size)
-        grid = PixelGrid(camera, rescale_camera(camera, pairs.depth_size))
-        super().__init__(path, options, pairs, grid, units_per_meter=1000.0)
+        rig = Rig(Lens(camera), Lens(rescale_camera(camera, pairs.depth_size)))
+        super().__init__(path, options, pairs, rig, units_per_meter=1000.0)
         self.intrinsics_known = options.depth or options.intrinsics is not None
 
     @classmethod
