@@ -1,7 +1,8 @@
 """INPUT: captures. ``open_capture`` finds the reader of a folder; ``read_ahead`` decodes frames on a second thread."""
 
 from .base import Capture, Options
-from .opening import check_depth_scale, open_capture, select_frames
+from .depth_units import settle_depth_unit
+from .opening import open_capture, select_frames
 from .read_ahead import read_ahead
 from .trajectory_files import PoseFile, associate, read_trajectory
 
@@ -10,9 +11,9 @@ __all__ = [
     "Options",
     "PoseFile",
     "associate",
-    "check_depth_scale",
     "open_capture",
     "read_ahead",
     "read_trajectory",
     "select_frames",
+    "settle_depth_unit",
 ]

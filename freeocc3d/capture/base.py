@@ -34,6 +34,11 @@ class Capture(ABC):
     general: ClassVar[bool] = False
     """Whether folders of other formats may match this layout too; the other formats are then tried first."""
 
+    reads_files: ClassVar[bool] = False
+    """Whether a file may be a capture of this format; most formats are folders."""
+    states_poses: ClassVar[bool] = False
+    """Whether captures of this format are reconstructions, whose poses are meant to be used if there is no depth."""
+
     path: Path
     timestamps: NDArray[np.float64]
     """(N,) seconds, ascending; 0, 1, 2, … if the format has no times."""
@@ -57,7 +62,8 @@ class Capture(ABC):
     @classmethod
     @abstractmethod
     def recognizes(cls, path: Path) -> bool:
-        """Whether the folder ``path`` has this format's layout. Cheap: looks only at names."""
+        """Whether the folder ``path``, or the file with ``reads_files``, has this format's layout. Cheap: looks at
+        names and at the head of a file."""
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -68,7 +74,7 @@ class Capture(ABC):
 
     def raw_depth(self, index: int) -> tuple[NDArray[Any], float] | None:
         """(H, W) depth as stored (0 = no measurement) and its units per meter; None if depth is not stored as integers.
-        Only ``check_depth_scale`` reads it. Raises FrameError."""
+        Only ``depth_units`` reads it. Raises FrameError."""
         return None
 
     def name(self, index: int) -> str:

@@ -75,8 +75,8 @@ def pair_files(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Pat
 class ImagePairs(FileFrames):
     """A capture of numbered color and depth files by one rig; a reader finds the files and the cameras."""
 
-    def __init__(self, path: Path, options: Options, pairs: Pairs, rig: Rig, units_per_meter: float):
-        """units_per_meter: of the stored depth, unless ``options.depth_scale`` is set."""
+    def __init__(self, path: Path, options: Options, pairs: Pairs, rig: Rig, units_per_meter: float | None):
+        """units_per_meter: of the stored depth, unless ``options.depth_scale`` is set; None = nothing states it."""
         self._pairs = pairs
         numbered = enumerate(zip(pairs.color, pairs.depth, strict=True))
         frames = [FrameFiles(color, depth, rig, float(row)) for row, (color, depth) in numbered]

@@ -1,38 +1,23 @@
-"""Finds the reader of a capture, and warns if its depth does not look like a room."""
+"""Finds the reader of a capture."""
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ..core.errors import CaptureError, ConfigError, FrameError
+from ..core.errors import CaptureError, ConfigError
 from ..core.regular_files import user_path
-from ..core.warnings import Notice
 from ..settings import registry
 from .base import Capture, Options
 from .numbered_files import list_folder
-
-VIDEO = "video"
-"""The reader of video files; all others read folders."""
 
 VIDEO_SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"}
 """Suffixes of files that may be a capture, for the hint about an unrecognized folder."""
 
 BUILTIN = "builtin:"
 """Prefix of paths that name a rendered scene, not a folder."""
-
-USUAL_UNITS = (1.0, 100.0, 1000.0, 5000.0, 6553.5, 10000.0)
-"""Common depth units per meter."""
-
-INDOOR_MEDIAN_M = 0.1, 20.0
-"""Range of the median depth of an indoor scan, meters."""
-
-TYPICAL_MEDIAN_M = 2.0
 
 _MOST_BELOW = 1000
 
@@ -54,17 +39,21 @@ def open_capture(
         raise CaptureError(f"There is no folder or video {folder}: check the path of the capture.")
     if not (folder.is_dir() or folder.is_file()):
         raise CaptureError(f"{folder} is neither a folder nor a regular file: give a folder of frames, or a video.")
-    is_video = options.format == VIDEO or (options.format == "auto" and folder.is_file())
-    if folder.is_file() != is_video:
-        raise CaptureError(
-            f"{folder} is a {'folder' if is_video else 'file'}, but capture.format={options.format} reads a "
-            f"{'video file' if is_video else 'folder of frames'}."
-        )
     try:
-        name = VIDEO if is_video else _recognize(folder) if options.format == "auto" else options.format
+        name = _recognize(folder) if options.format == "auto" else options.format
+        _check_kind(name, folder)
         return _construct(name, folder, options, backend_options or {})
     except OSError as error:
         raise CaptureError(f"Cannot read {error.filename or folder}: {error.strerror}.") from error
+
+
+def _check_kind(name: str, path: Path) -> None:
+    """Raise CaptureError if a reader of folders is asked to read a file, or one of videos a folder."""
+    reader = registry.load("capture.readers", name).Reader
+    if path.is_file() and not reader.reads_files:
+        raise CaptureError(f"{path} is a file, but capture.format={name} reads a folder of frames.")
+    if path.is_dir() and reader.reads_files and not reader.recognizes(path):
+        raise CaptureError(f"{path} is a folder, but capture.format={name} reads {reader.layout}.")
 
 
 def select_frames(capture: Capture) -> range:
@@ -77,48 +66,6 @@ def select_frames(capture: Capture) -> range:
             f"{options.start}, capture.stop = {options.stop} select none of them. Change these options."
         )
     return frames
-
-
-def check_depth_scale(capture: Capture, samples: int = 5) -> Notice | None:
-    """A warning if depth seems to be stored in other units than assumed; else None.
-
-    Samples frames across the capture, before depth is clipped at ``max_depth``: clipping would remove all depth that is
-    read 1000 times too large.
-    """
-    median_units, within, units_per_meter = _sample_depth(capture, samples)
-    if median_units is None:
-        return None
-    median_m = median_units / units_per_meter
-    nearest, farthest = INDOOR_MEDIAN_M
-    if nearest <= median_m <= farthest and within >= 0.05:
-        return None
-    likely = min(USUAL_UNITS, key=lambda units: abs(math.log(median_units / units / TYPICAL_MEDIAN_M)))
-    advice = f"capture.depth_scale is probably {likely:g} and not {units_per_meter:g}"
-    if likely == units_per_meter:
-        advice = "check capture.depth_scale and capture.max_depth"
-    return Notice(
-        "depth-scale-doubtful",
-        f"The depth of {capture.path} does not look like a room: its median is {median_m:.3g} m, and {within:.0%} of "
-        f"it lies within capture.max_depth = {capture.options.max_depth:g} m; {advice}.",
-    )
-
-
-def _sample_depth(capture: Capture, samples: int) -> tuple[float | None, float, float]:
-    """Median of the stored depth (None without depth), its share within ``max_depth``, and the units per meter."""
-    values, units_per_meter = [], 1.0
-    for index in np.unique(np.linspace(0, len(capture) - 1, samples).astype(int)).tolist():
-        try:
-            stored = capture.raw_depth(index)
-        except FrameError:
-            continue
-        if stored is not None:
-            raw, units_per_meter = stored
-            values.append(raw[(raw > 0) & (raw < np.iinfo(raw.dtype).max)])
-    measured = np.concatenate(values) if values else np.zeros(0)
-    if not len(measured):
-        return None, 0.0, units_per_meter
-    within = float((measured <= capture.options.max_depth * units_per_meter).mean())
-    return float(np.median(measured)), within, units_per_meter
 
 
 def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mapping[str, Any]]) -> Capture:
@@ -135,7 +82,7 @@ def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mappin
 
 def _recognize(folder: Path) -> str:
     """Name of the reader that recognizes the folder. Raises CaptureError if none does, or several do."""
-    readers = _readers()
+    readers = {name: reader for name, reader in _readers().items() if reader.reads_files or not folder.is_file()}
     found = [name for name, reader in readers.items() if not reader.general and reader.recognizes(folder)]
     found = found or [name for name, reader in readers.items() if reader.general and reader.recognizes(folder)]
     if len(found) > 1:

@@ -41,6 +41,8 @@ class PosedImages(Capture):
     """Undistorts images to pinhole cameras and reduces them to ``capture.max_size``. Each image may have its own
     camera."""
 
+    states_poses = True
+
     def __init__(self, path: Path, options: Options, posed: Sequence[PosedImage], units_in_meters: float | None):
         """units_in_meters: meters per unit of the poses; None = unknown, and the poses stay unchanged."""
         super().__init__(path, options)

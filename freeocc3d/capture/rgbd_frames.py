@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.depth_noise import compute_sensor_sigma
 from ..core.errors import CaptureError, FrameError
 from ..core.image_files import Size
 from ..core.types import Frame, Intrinsics
@@ -173,6 +172,8 @@ class RgbdFrames(Capture):
         confidence = self.stored_confidence(index)
         if confidence is None or (confidence >= 2).all():
             return registration.depth(depth_m), None
+        from ..core.depth_noise import compute_sensor_sigma  # imports Numba, which opening a capture must not
+
         if confidence.shape != depth_m.shape:
             confidence = cv2.resize(confidence, depth_m.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
         depth_m[confidence == 0] = 0

@@ -58,6 +58,11 @@ class ConsoleProgress(Progress):
         if self._on_terminal and (done == self._total or time.monotonic() - self._drawn > 0.1):
             self._draw(done)
 
+    def note(self, text: str) -> None:
+        if text:
+            self._clear()
+            say(text)
+
     def warn(self, text: str) -> None:
         self._clear()
         say(f"warning: {text}")

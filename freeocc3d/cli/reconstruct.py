@@ -32,6 +32,10 @@ def reconstruct(
         str | None,
         typer.Option("--device", metavar="DEVICE", help="Device to compute on: cpu or cuda:0.", show_default="cpu"),
     ] = None,
+    focal: Annotated[
+        float | None,
+        typer.Option("--focal", metavar="PX", help="Focal length of the color images, pixels, if nothing states it."),
+    ] = None,
     scale: Annotated[
         float | None,
         typer.Option("--scale", metavar="S", help="Meters per unit of the poses, for scans without depth."),
@@ -41,8 +45,9 @@ def reconstruct(
     from ..pipeline import run
     from ..settings import config
 
-    of_scale = [] if scale is None else [f"capture.scale={scale}"]
-    settings = config.load(config_file, [*(overrides or []), *of_scale])
+    given = {"scale": scale, "focal": focal}
+    of_flags = [f"capture.{name}={value}" for name, value in given.items() if value is not None]
+    settings = config.load(config_file, [*(overrides or []), *of_flags])
     if device is not None:
         settings = _move(settings, device)
     with ConsoleProgress() as progress:

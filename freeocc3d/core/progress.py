@@ -12,5 +12,8 @@ class Progress:
     def advance(self, done: int) -> None:
         """``done`` steps of the current stage are finished."""
 
+    def note(self, text: str) -> None:
+        """A sentence about what is done, if it is not empty."""
+
     def warn(self, text: str) -> None:
         """The user should know ``text``."""

@@ -13,6 +13,7 @@ from ..editing import adaptive_voxels
 from ..language import scene_vocabulary
 from ..occupancy import splat
 from ..settings.config import Settings
+from .tracking_choice import AUTO
 
 _FEW_TRACKED = 0.5
 
@@ -28,6 +29,8 @@ def check(settings: Settings) -> None:
     splat.check(settings.occupancy)
     scene_vocabulary.load_namer(settings.vocabulary)
     for section in ("tracking", "fitting", "language"):
+        if settings.chosen(section) == AUTO:  # chosen when the capture is open
+            continue
         backend, options = settings.backend(section)
         if hasattr(backend, "check"):
             backend.check(options)

@@ -27,6 +27,7 @@ from ..settings.config import Settings
 from ..storage import map_files
 from ..storage.keyframes import Keyframes
 from ..tracking.base import Tracked, Tracker
+from .tracking_choice import choose_tracker
 
 _FINE = 0.01
 """Edge of cells over the usual depth, if the scale is unknown: about the finest detail that stereo resolves."""
@@ -36,6 +37,7 @@ class Mapper:
     """Takes frames one by one. ``folder`` receives the keyframes. Memory grows with the number of keyframes only."""
 
     def __init__(self, settings: Settings, capture: Capture, folder: Path):
+        settings, _ = choose_tracker(settings, capture)
         self.settings = settings
         self.capture = capture
         self.keyframes = Keyframes(folder / map_files.KEYFRAMES)
@@ -43,8 +45,7 @@ class Mapper:
         if self.tracker.needs_depth and not capture.has_depth:
             raise TrackingError(
                 f"tracking.backend={settings.tracking.backend} needs depth, but {capture.path} has none, or "
-                "capture.depth=false: estimate poses from color with tracking.backend=colmap, or give poses (known, "
-                "file)."
+                "capture.depth=false: leave tracking.backend at auto, or give poses (known, file)."
             )
         self.depth: DepthSource = MeasuredDepth()
         if not (capture.has_depth or self.tracker.brings_depth):

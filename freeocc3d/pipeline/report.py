@@ -7,12 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from ..capture import Capture
 from ..core.types import Submap, Trajectory
 from ..storage.work_folder import WorkFolder
+from .mapper import Mapper
 
 
-def report_of(work: WorkFolder, capture: Capture, trajectory: Trajectory, submaps: list[Submap]) -> dict[str, Any]:
+def report_of(
+    work: WorkFolder, mapper: Mapper, trajectory: Trajectory, submaps: list[Submap], tracking_reason: str
+) -> dict[str, Any]:
+    """The report of a run. tracking_reason: why its tracker was chosen; empty if the configuration names it."""
     status, count = np.unique(trajectory.status, return_counts=True)
     peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
@@ -21,7 +24,8 @@ def report_of(work: WorkFolder, capture: Capture, trajectory: Trajectory, submap
         "frames": {str(s): int(n) for s, n in zip(status, count, strict=True)},
         "broken": {str(index): text for index, text in work.broken.items()},
         "warnings": [notice.to_dict() for notice in work.warnings],
-        "color_focal": getattr(capture, "color_focal", 1.0),
+        "color_focal": getattr(mapper.capture, "color_focal", 1.0),
+        "tracking": {"backend": mapper.settings.tracking.backend, "reason": tracking_reason},
         "submaps": [
             {
                 "frames": len(submap.frames),

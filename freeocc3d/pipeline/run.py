@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..capture import Capture, check_depth_scale, open_capture, select_frames
+from ..capture import Capture, open_capture, select_frames, settle_depth_unit
 from ..capture.focal_correction import Reregistered
 from ..core.errors import Interrupted, MapError, TrackingError, is_interrupt
 from ..core.progress import Progress
@@ -22,6 +22,7 @@ from .checks import check, warn_of_color_focal
 from .mapper import Mapper
 from .run_stages import STAGES, Run
 from .saving import absolute
+from .tracking_choice import choose_tracker
 
 
 def reconstruct(
@@ -47,11 +48,13 @@ def reconstruct(
     work.warn(progress, *resolved.notices)
     try:
         opened = _open(capture, resolved, progress, work)
+        resolved, reason = choose_tracker(resolved, opened)
+        progress.note(reason)
         work.begin([absolute(opened.path), len(opened), __version__], resolved, progress)
         if not work.complete:
             with work.timed("calibration"):
                 opened = _register_color(opened, resolved, progress, work)
-            _run(opened, resolved, work, progress)
+            _run(opened, resolved, work, progress, reason)
         work.finish(output)
         return load_map(output)
     except TrackingError:
@@ -74,9 +77,9 @@ def reconstruct(
         work.close()
 
 
-def _run(capture: Capture, settings: Settings, work: WorkFolder, progress: Progress) -> None:
+def _run(capture: Capture, settings: Settings, work: WorkFolder, progress: Progress, reason: str) -> None:
     encoder: Encoder = settings.load_backend("language", capture)
-    run = Run(Mapper(settings, capture, work.folder), encoder, work, progress)
+    run = Run(Mapper(settings, capture, work.folder), encoder, work, progress, reason)
     for stage in STAGES.values():
         stage(run)
     work.mark_complete()
@@ -85,7 +88,7 @@ def _run(capture: Capture, settings: Settings, work: WorkFolder, progress: Progr
 def _open(capture: str | Path, settings: Settings, progress: Progress, work: WorkFolder) -> Capture:
     opened = open_capture(capture, settings.capture, settings.backends.get("capture"))
     select_frames(opened)
-    warning = check_depth_scale(opened) if opened.has_depth else None
+    warning = settle_depth_unit(opened)
     work.warn(progress, *opened.warnings, *([warning] if warning else []))
     return opened
 

@@ -34,6 +34,8 @@ class Run:
     encoder: Encoder
     work: WorkFolder
     progress: Progress
+    tracking_reason: str = ""
+    """Why this tracker was chosen; empty if the configuration names it."""
     trajectory: Trajectory = field(init=False)
     vocabulary: dict[str, Any] | None = None
     gaussians: Gaussians = field(init=False)
@@ -171,7 +173,17 @@ def save_map(run: Run) -> None:
     if not run.mapper.tracker.metric:
         run.warn(warn_of_scale())
     run.progress.stage("saving")
-    save(run.work, run.mapper, run.trajectory, run.gaussians, run.features, run.occupancy, run.encoder, run.vocabulary)
+    save(
+        run.work,
+        run.mapper,
+        run.trajectory,
+        run.gaussians,
+        run.features,
+        run.occupancy,
+        run.encoder,
+        run.vocabulary,
+        run.tracking_reason,
+    )
 
 
 STAGES: dict[str, Callable[[Run], None]] = {

@@ -37,6 +37,7 @@ def save(
     occupancy: Occupancy,
     encoder: Encoder,
     vocabulary: dict[str, Any] | None,
+    tracking_reason: str,
 ) -> None:
     """Write the map of a run into its work folder."""
     capture, metric, submaps = mapper.capture, mapper.tracker.metric, mapper.tracker.submaps()
@@ -57,7 +58,10 @@ def save(
         render_pictures.write_render_picture(picture, gaussians, shown, mapper.rasterizer, capture.path, metric)
 
     def report() -> dict[str, Any]:
-        return {**report_of(work, capture, trajectory, submaps), "rendering": dataclasses.asdict(fidelity)}
+        return {
+            **report_of(work, mapper, trajectory, submaps, tracking_reason),
+            "rendering": dataclasses.asdict(fidelity),
+        }
 
     parts = MapParts(
         facts, settings, report, occupancy, Codec.fit(features), features, gaussians, trajectory,

@@ -83,7 +83,9 @@ class Settings(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, backends=backends)
 
     def has_backend_option(self, section: str, name: str) -> bool:
-        """Whether the selected backend of a section has an option."""
+        """Whether the selected backend of a section has an option; false if the selection is left open."""
+        if self.chosen(section) == "auto":
+            return False
         backend = registry.backend(SECTIONS[section].folder, self.chosen(section))
         return any(option.name == name for option in backend.options)
 

@@ -71,9 +71,10 @@ class CaptureOptions(TypedOptions, frozen=True):
 class TrackingOptions(TypedOptions, frozen=True):
     """Layer 1: camera poses."""
 
-    backend: str = "rgbd"
+    backend: str = "auto"
     """Source of the poses: "rgbd" estimates them from color and depth, "colmap" from color only; "known" uses the poses
-    in the capture, "file" those of another system."""
+    in the capture, "file" those of another system. "auto" = "rgbd" for captures with depth; without depth "known" for
+    reconstructions (nerfstudio, COLMAP), and else "colmap"."""
 
 
 class StereoOptions(TypedOptions, frozen=True):

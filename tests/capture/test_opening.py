@@ -9,11 +9,10 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from small_captures import data_folder, depth_image, write_image, write_replica, write_scannet, write_seven_scenes
+from small_captures import write_replica, write_scannet, write_seven_scenes
 
-from freeocc3d.capture import Options, check_depth_scale, open_capture, select_frames
+from freeocc3d.capture import Options, open_capture, select_frames, settle_depth_unit
 from freeocc3d.core.errors import CaptureError, ConfigError, FrameError
 from freeocc3d.settings import config, registry
 
@@ -109,39 +108,6 @@ def test_used_frames_follow_the_options(tmp_path: Path) -> None:
         select_frames(open_capture(tmp_path, Options(start=10)))
 
 
-def test_depth_in_its_own_units_raises_no_warning(tmp_path: Path) -> None:
-    assert check_depth_scale(open_capture(write_seven_scenes(tmp_path, 3))) is None
-
-
-@pytest.mark.parametrize(("true_scale", "said_scale"), [(1000, 1), (1000, 100000), (5000, 1000), (6553.5, 1000)])
-def test_depth_in_other_units_names_the_likely_ones(tmp_path: Path, true_scale: float, said_scale: float) -> None:
-    write_seven_scenes(tmp_path, 3)
-    for i in range(3):
-        write_image(tmp_path / f"frame-{i:06d}.depth.png", depth_image(i, true_scale))
-    warning = check_depth_scale(open_capture(tmp_path, Options(depth_scale=said_scale)))
-    assert warning is not None
-    assert f"capture.depth_scale is probably {true_scale} and not {said_scale}" in warning.text
-
-
-def test_depth_all_beyond_the_range_is_warned_of(tmp_path: Path) -> None:
-    warning = check_depth_scale(open_capture(write_seven_scenes(tmp_path, 3), Options(max_depth=1.0)))
-    assert warning is not None
-    assert "check capture.depth_scale and capture.max_depth" in warning.text
-
-
-def test_depth_without_any_measurement_is_not_about_units(tmp_path: Path) -> None:
-    write_seven_scenes(tmp_path, 1)
-    write_image(tmp_path / "frame-000000.depth.png", np.zeros((24, 32), np.uint16))
-    capture = open_capture(tmp_path)
-    assert not capture[0].depth_m.any()
-    assert check_depth_scale(capture) is None
-
-
-@pytest.mark.parametrize("name", ["7scenes-kitchen", "house/living", "house/bedroom"])
-def test_real_captures_are_in_the_units_that_they_state(name: str) -> None:
-    assert check_depth_scale(open_capture(data_folder() / name)) is None
-
-
 def test_opening_a_capture_imports_nothing_heavy() -> None:
     code = "import sys, freeocc3d.capture; print({'open3d', 'torch', 'scipy', 'numba'} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
@@ -166,7 +132,7 @@ def test_a_hostile_image_is_a_broken_frame(tmp_path: Path, name: str, target: st
     with pytest.raises(FrameError, match=rf"{name}"):
         capture[1]
     assert capture[0].color.shape == (24, 32, 3)
-    assert check_depth_scale(capture) is None
+    assert settle_depth_unit(capture) is None
 
 
 @pytest.mark.parametrize("name", ["intrinsic/intrinsic_color.txt", "pose/1.txt", "classes.json"])

@@ -25,6 +25,7 @@ REQUIRES: tuple[str, ...] = ()
 NUMBER = r"(?:[^.\d]\D*)?(\d+)"
 COLOR = rf"{NUMBER}\.(?:png|jpe?g)"
 IMAGE = rf"{NUMBER}\.png"
+DEPTH = rf"{NUMBER}\.(?:png|tiff?|pgm|pfm|exr|np[yz])"
 POSE = rf"{NUMBER}\.txt"
 
 COLOR_CAMERA = ("intrinsic/intrinsic_color.txt", "intrinsic_color.txt")
@@ -34,8 +35,8 @@ ONE_CAMERA = ("intrinsic/intrinsic.txt", "intrinsic.txt", "intrinsic.json", "cam
 
 
 class Reader(ImagePairs):
-    """Depth is uint16 millimeters. Numbers in names have no leading zeros and sort as numbers. ``pose/`` is optional
-    and holds camera-to-world poses; -inf means no pose.
+    """Depth is stored in millimeters, unless this makes no room of the scan. Numbers in names have no leading zeros and
+    sort as numbers. ``pose/`` is optional and holds camera-to-world poses; -inf means no pose.
 
     ``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` hold the color and depth cameras (4 x 4 or 3 x 3). If
     one is missing, it is derived from the other, provided that the images have the same aspect ratio.
@@ -50,7 +51,7 @@ class Reader(ImagePairs):
     layout = "color/N.jpg (or .png) with depth/N.png and intrinsic/intrinsic_color.txt"
 
     def __init__(self, path: Path, options: Options):
-        pairs = pair_files(list_numbered(path / "color", COLOR), list_numbered(path / "depth", IMAGE), path, options)
+        pairs = pair_files(list_numbered(path / "color", COLOR), list_numbered(path / "depth", DEPTH), path, options)
         rig, self.intrinsics_known = build_rig(
             _stated_cameras(path, pairs, options.depth),
             options,
@@ -58,7 +59,7 @@ class Reader(ImagePairs):
             pairs.depth_size if options.depth else None,
         )
         self.focal_stated = self.intrinsics_known
-        super().__init__(path, options, pairs, rig, units_per_meter=1000.0)
+        super().__init__(path, options, pairs, rig, units_per_meter=None)
         self.classes = capture_class_names(path)
 
     @classmethod

@@ -30,6 +30,8 @@ class Reader(Capture):
 
     format = "video"
     layout = "a video file, such as scan.mp4 or scan.mov"
+    reads_files = True
+    general = True
     has_depth = False
 
     def __init__(self, path: Path, options: Options):
