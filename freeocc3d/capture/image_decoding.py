@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FrameError
-from ..core.image_files import PNG_START, ImageFileError, Size, WrongSizeError, read_image, read_image_size
+from ..core.image_files import (
+    PNG_START,
+    ImageFileError,
+    Size,
+    WrongSizeError,
+    check_encoded,
+    decode_bytes,
+    read_image,
+    read_image_size,
+)
 from ..core.regular_files import IMAGE_BYTES, open_regular
 
 
@@ -77,12 +87,36 @@ def image_size(path: Path) -> Size:
 
 def decode_image(path: Path, flags: int, size: Size | None = None) -> NDArray[Any]:
     """Decode an image as ``cv2.imread`` does, with its flags. size: that it must have, if known. Raises FrameError."""
-    try:
+    with _as_frame_errors():
         return read_image(path, flags, size)
+
+
+def decode_image_bytes(data: bytes, source: Path, flags: int, size: Size | None = None) -> NDArray[Any]:
+    """Decode the bytes of an image file, as ``decode_image`` does. source: what they are, for messages."""
+    with _as_frame_errors():
+        return decode_bytes(data, source, flags, size)
+
+
+def decode_color_bytes(data: bytes, source: Path, size: Size | None = None) -> NDArray[np.uint8]:
+    """Decode the bytes of a color image to (H, W, 3) RGB, as ``read_color`` does. Raises FrameError."""
+    image = decode_image_bytes(data, source, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, size)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+
+
+def encoded_size(data: bytes, source: Path) -> Size:
+    """Width and height of an encoded image, from its bytes. Raises FrameError."""
+    with _as_frame_errors():
+        return check_encoded(data, source)
+
+
+@contextlib.contextmanager
+def _as_frame_errors() -> Iterator[None]:
+    try:
+        yield
     except WrongSizeError as error:
         raise FrameError(
-            f"{path} has {error.found[0]} x {error.found[1]} pixels, but other frames have {error.expected[0]} x "
-            f"{error.expected[1]}."
+            f"{error.source} has {error.found[0]} x {error.found[1]} pixels, but other frames have "
+            f"{error.expected[0]} x {error.expected[1]}."
         ) from error
     except ImageFileError as error:
         raise FrameError(str(error)) from error

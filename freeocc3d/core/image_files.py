@@ -35,11 +35,11 @@ class ImageFileError(ValueError):
 
 
 class WrongSizeError(ImageFileError):
-    """An image has another size than the expected one. found, expected: the two sizes."""
+    """An image has another size than the expected one. source: the image.  found, expected: the two sizes."""
 
     def __init__(self, path: Path, found: Size, expected: Size):
         super().__init__(f"{path} has {found[0]} x {found[1]} pixels, not {expected[0]} x {expected[1]}.")
-        self.found, self.expected = found, expected
+        self.source, self.found, self.expected = path, found, expected
 
 
 def read_image(path: Path, flags: int, size: Size | None = None, most_pixels: int = MOST_PIXELS) -> NDArray[Any]:
@@ -49,23 +49,30 @@ def read_image(path: Path, flags: int, size: Size | None = None, most_pixels: in
     decoding, for another size; ImageFileError for no regular file, another format, too many pixels, or a file that is
     cut off or damaged.
     """
+    return decode_bytes(_read(path), path, flags, size, most_pixels)
+
+
+def decode_bytes(
+    data: bytes, source: Path, flags: int, size: Size | None = None, most_pixels: int = MOST_PIXELS
+) -> NDArray[Any]:
+    """Decode the bytes of an image file, as ``read_image`` does. source: what they are, for messages, such as a file
+    and a member of it."""
     import cv2
 
-    data = read_encoded(path, size, most_pixels)
+    check_encoded(data, source, size, most_pixels)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (cv2.error, MemoryError):
         image = None
     if image is None:
-        raise _unreadable(path, data)
+        raise _unreadable(source, data)
     if size is not None and image.shape[1::-1] != size:
-        raise WrongSizeError(path, image.shape[1::-1], size)
+        raise WrongSizeError(source, image.shape[1::-1], size)
     return image
 
 
-def read_encoded(path: Path, size: Size | None = None, most_pixels: int = MOST_PIXELS) -> bytes:
-    """The bytes of an image with a checked header and end. Raises ImageFileError, as ``read_image`` does."""
-    data = _read(path)
+def check_encoded(data: bytes, path: Path, size: Size | None = None, most_pixels: int = MOST_PIXELS) -> Size:
+    """Check the header and the end of an encoded image, and return its size. Raises ImageFileError."""
     width, height = found = _checked_size(path, data, most_pixels)
     if size is not None and found != size:
         raise WrongSizeError(path, found, size)
@@ -76,7 +83,7 @@ def read_encoded(path: Path, size: Size | None = None, most_pixels: int = MOST_P
         raise _unreadable(path, data)
     if data.startswith(JPEG_START) and width * height > len(data) and data.count(b"\xff\xda") > _SCANS:
         raise ImageFileError(f"{path} is a JPEG image of more than {_SCANS} scans: save it anew.")
-    return data
+    return found
 
 
 def read_image_size(path: Path, most_pixels: int = MOST_PIXELS) -> Size:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from freeocc3d.core import image_files
-from freeocc3d.core.image_files import ImageFileError, WrongSizeError, read_image, read_image_size
+from freeocc3d.core.image_files import ImageFileError, WrongSizeError, decode_bytes, read_image, read_image_size
 
 FORMATS = ("png", "jpg", "tif", "bmp", "webp")
 STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
@@ -175,3 +175,13 @@ def test_a_chunk_of_a_png_that_is_longer_than_the_file_is_refused(
             (path := tmp_path / "image.png").write_bytes(data[:at] + struct.pack(">I", length) + data[at + 4 :])
             with pytest.raises(ImageFileError, match="not a readable image"):
                 read_image(path, STORED)
+
+
+def test_bytes_decode_as_their_file_does(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 255, (24, 40, 3), np.uint8)
+    data = cv2.imencode(".png", image)[1].tobytes()
+    assert np.array_equal(decode_bytes(data, tmp_path / "a.zip" / "0.png", cv2.IMREAD_COLOR, (40, 24)), image)
+    with pytest.raises(ImageFileError, match=r"a\.zip/0\.png is cut off"):
+        decode_bytes(data[:-20], tmp_path / "a.zip" / "0.png", cv2.IMREAD_COLOR)
+    with pytest.raises(WrongSizeError, match=r"a\.zip/0\.png has 40 x 24 pixels"):
+        decode_bytes(data, tmp_path / "a.zip" / "0.png", cv2.IMREAD_COLOR, (24, 40))
