@@ -10,6 +10,7 @@ Code = Literal[
     "option-removed",
     "images-left-out",
     "depth-scale-doubtful",
+    "poses-doubtful",
     "intrinsics-unknown",
     "color-focal-corrected",
     "models-apart",

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,12 @@ from ..settings import config
 from ..settings.config import Settings
 from ..storage.work_folder import WorkFolder
 from ..tracking.rgbd import focal_calibration
+from ..tracking.rgbd.measured_pairs import MeasuredPair, measure_pairs
 from .checks import check, warn_of_color_focal
 from .mapper import Mapper
 from .run_stages import STAGES, Run
 from .saving import absolute
-from .tracking_choice import choose_tracker
+from .tracking_choice import GIVEN, choose_tracker
 
 
 def reconstruct(
@@ -53,8 +55,12 @@ def reconstruct(
         work.begin([absolute(opened.path), len(opened), __version__], resolved, progress)
         if not work.complete:
             with work.timed("calibration"):
-                opened = _register_color(opened, resolved, progress, work)
-            _run(opened, resolved, work, progress, reason)
+                opened, pairs = _calibrate(opened, resolved, progress, work)
+            run = _prepare(opened, resolved, work, progress, reason)
+            run.check_poses(pairs)
+            for stage in STAGES.values():
+                stage(run)
+            work.mark_complete()
         work.finish(output)
         return load_map(output)
     except TrackingError:
@@ -77,12 +83,9 @@ def reconstruct(
         work.close()
 
 
-def _run(capture: Capture, settings: Settings, work: WorkFolder, progress: Progress, reason: str) -> None:
+def _prepare(capture: Capture, settings: Settings, work: WorkFolder, progress: Progress, reason: str) -> Run:
     encoder: Encoder = settings.load_backend("language", capture)
-    run = Run(Mapper(settings, capture, work.folder), encoder, work, progress, reason)
-    for stage in STAGES.values():
-        stage(run)
-    work.mark_complete()
+    return Run(Mapper(settings, capture, work.folder), encoder, work, progress, reason)
 
 
 def _open(capture: str | Path, settings: Settings, progress: Progress, work: WorkFolder) -> Capture:
@@ -93,14 +96,19 @@ def _open(capture: str | Path, settings: Settings, progress: Progress, work: Wor
     return opened
 
 
-def _register_color(capture: Capture, settings: Settings, progress: Progress, work: WorkFolder) -> Capture:
-    """The capture with color registered to the depth images, if the focal lengths of its cameras differ."""
+def _calibrate(
+    capture: Capture, settings: Settings, progress: Progress, work: WorkFolder
+) -> tuple[Capture, Sequence[MeasuredPair]]:
+    """The capture with color registered to the depth images, if the focal lengths of its cameras differ, and pairs of
+    frames whose motion depth measures; none if nothing is to be compared with them."""
     ratio = settings.capture.color_focal
-    if not capture.has_depth:
-        return capture
+    given = settings.tracking.backend in GIVEN
+    if not capture.has_depth or (ratio is not None and not given):
+        return (capture if ratio in (None, 1) or not capture.has_depth else Reregistered(capture, ratio)), ()
+    progress.stage("calibration")
+    pairs = measure_pairs(capture, select_frames(capture))
     if ratio is None:
-        progress.stage("calibration")
-        ratio = focal_calibration.estimate_color_focal(capture, select_frames(capture))
+        ratio = focal_calibration.estimate_color_focal(pairs)
         if ratio != 1:
             work.warn(progress, warn_of_color_focal(capture, ratio))
-    return capture if ratio == 1 else Reregistered(capture, ratio)
+    return (capture if ratio == 1 else Reregistered(capture, ratio)), pairs if given else ()

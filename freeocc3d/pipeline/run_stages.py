@@ -4,7 +4,7 @@ the same configuration loads it from there."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +19,8 @@ from ..core.warnings import Notice
 from ..language import scene_vocabulary
 from ..language.encoders.base import Encoder
 from ..storage.work_folder import WorkFolder
+from ..tracking.pose_check import check_poses
+from ..tracking.rgbd.measured_pairs import MeasuredPair
 from .checks import warn_of_camera, warn_of_scale, warn_of_trajectory
 from .mapper import Mapper
 from .saving import evenly, save
@@ -41,6 +43,12 @@ class Run:
     gaussians: Gaussians = field(init=False)
     features: NDArray[np.float16] = field(init=False)
     occupancy: Occupancy = field(init=False)
+
+    def check_poses(self, pairs: Sequence[MeasuredPair]) -> None:
+        """Compare poses that are taken as they are with measured pairs of frames. Raises TrackingError."""
+        poses = self.mapper.tracker.poses_ahead() if pairs else None
+        if poses is not None and (notice := check_poses(poses, pairs, str(self.mapper.capture.path))):
+            self.warn(notice)
 
     def warn(self, *notices: Notice) -> None:
         """Show the notices now, and in the map's report."""

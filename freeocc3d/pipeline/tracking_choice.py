@@ -7,6 +7,9 @@ from ..settings.config import Settings
 
 AUTO = "auto"
 
+GIVEN = ("known", "file")
+"""Trackers that take poses as they are."""
+
 
 def choose_tracker(settings: Settings, capture: Capture) -> tuple[Settings, str]:
     """The settings with a tracker that can take the capture, and the reason for it, a sentence; an empty one if the

@@ -13,8 +13,13 @@ from freeocc3d.core.errors import ConfigError
 from freeocc3d.core.types import Intrinsics
 from freeocc3d.tracking.rgbd import focal_calibration
 from freeocc3d.tracking.rgbd.alignment_views import AlignmentView
-from freeocc3d.tracking.rgbd.focal_calibration import estimate_color_focal
+from freeocc3d.tracking.rgbd.measured_pairs import MeasuredPair, measure_pairs
 from freeocc3d.tracking.rgbd.orb_features import OrbFeatures
+
+
+def estimate_color_focal(capture: Capture, frames: range) -> float:
+    return focal_calibration.estimate_color_focal(measure_pairs(capture, frames))
+
 
 ROOM = {"synthetic": {"frames": 120, "width": 320, "height": 240, "noise": True}}
 
@@ -72,14 +77,14 @@ def test_a_focal_length_out_of_range_is_refused(tmp_path) -> None:
 def decided(monkeypatch, best: float, gain: float = 0.5, pairs: int = 8, matches: int = 63) -> float:
     """The ratio if the error falls by a share to a minimum at ``best``, for pairs of so many matches each."""
     rows = np.zeros((matches, 2), np.int64)
-    monkeypatch.setattr(focal_calibration, "_pairs", lambda capture, frames: [(None, None, None, rows)] * pairs)
+    pair = MeasuredPair(0, 1, None, None, np.eye(4), rows)  # type: ignore[arg-type]
 
     def error(pairs, ratio) -> float:
         deep = 1 - gain
         return deep + (1 - deep) * (np.log(ratio / best) / np.log(1 / best)) ** 2
 
     monkeypatch.setattr(focal_calibration, "_error", error)
-    return estimate_color_focal(None, range(9))  # type: ignore[arg-type]
+    return focal_calibration.estimate_color_focal([pair] * pairs)
 
 
 @pytest.mark.parametrize("best", [0.85, 0.9, 1.1, 1.2])
@@ -120,11 +125,13 @@ def test_the_error_saturates_and_counts_matches_with_a_depth() -> None:
     for off, ratio, wanted in (((3.0, 0.0), 1.0, 0.5), ((0.0, -6.0), 1.0, 0.8), ((0.0, 0.0), 1.0, 0.0)):
         target = SimpleNamespace(features=OrbFeatures(pixels + np.float32(off), nothing))
         rows = np.array([(0, 0), (1, 1), (2, 2)])
-        found = focal_calibration._error([(source, target, np.eye(4), rows)], ratio)
+        found = focal_calibration._error([MeasuredPair(0, 1, source, target, np.eye(4), rows)], ratio)
         assert found == pytest.approx(wanted, abs=1e-4)
     moved = np.eye(4)
     moved[0, 3] = 0.2  # 10 pixels at 2 m
     target = SimpleNamespace(features=OrbFeatures(pixels + np.float32((10, 0)), nothing))
-    assert focal_calibration._error([(source, target, moved, np.array([(0, 0)]))], 1.0) == pytest.approx(0, abs=1e-5)
-    assert focal_calibration._error([(source, target, moved, np.array([(0, 0)]))], 1.3) > 0.3
+    assert focal_calibration._error(
+        [MeasuredPair(0, 1, source, target, moved, np.array([(0, 0)]))], 1.0
+    ) == pytest.approx(0, abs=1e-5)
+    assert focal_calibration._error([MeasuredPair(0, 1, source, target, moved, np.array([(0, 0)]))], 1.3) > 0.3
     assert focal_calibration._error([], 1.0) == 0

@@ -20,6 +20,7 @@ from freeocc3d.core.types import Frame
 from freeocc3d.depth import multi_view_stereo
 from freeocc3d.depth.sparse_points import triangulate
 from freeocc3d.tracking.rgbd import focal_calibration
+from freeocc3d.tracking.rgbd.measured_pairs import measure_pairs
 from freeocc3d.tracking.trackers import known
 
 from .figures import Figures
@@ -38,7 +39,7 @@ def measure_stereo(capture: str, frames: int | None = None) -> Figures:
     stride = 5 if _spacing(opened) < _CLOSE else 3
     opened = open_capture(capture, Options(stride=stride))
     used = list(select_frames(opened))
-    ratio = focal_calibration.estimate_color_focal(opened, select_frames(opened))
+    ratio = focal_calibration.estimate_color_focal(measure_pairs(opened, select_frames(opened)))
 
     def color(frame: Frame) -> Frame:
         camera = frame.intrinsics

@@ -18,6 +18,7 @@ from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.types import Frame, Trajectory
 from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors
 from freeocc3d.tracking.rgbd import focal_calibration
+from freeocc3d.tracking.rgbd.measured_pairs import measure_pairs
 from freeocc3d.tracking.trackers import rgbd
 from freeocc3d.tracking.trajectory_alignment import Poses, align_trajectories
 
@@ -82,7 +83,7 @@ def _left_missing(position: int, frame: Frame) -> Frame:
 def opened(capture: str) -> Capture:
     """A capture as the pipeline gives it to layer 1, which does not read its poses."""
     plain = open_capture(capture, Options())
-    ratio = focal_calibration.estimate_color_focal(plain, select_frames(plain))
+    ratio = focal_calibration.estimate_color_focal(measure_pairs(plain, select_frames(plain)))
     return plain if ratio == 1 else Reregistered(plain, ratio)
 
 
@@ -166,7 +167,7 @@ def measure_lengths(capture: str) -> Figures:
         plain = open_capture(capture, Options(stop=count))
         if len(plain) < count:
             break
-        ratio = focal_calibration.estimate_color_focal(plain, select_frames(plain))
+        ratio = focal_calibration.estimate_color_focal(measure_pairs(plain, select_frames(plain)))
         calibrated = time.perf_counter() - mark
         scan = plain if ratio == 1 else Reregistered(plain, ratio)
         tracker, _, seconds = tracked([(scan, Shown(range(count)))])

@@ -31,7 +31,6 @@ _GAPS = (12, 6, 3, 1)  # frames between the two of a pair, in the order to try t
 _LEAST_MATCHES = 20  # smallest number of a pair's matches with depth on both sides
 _AGREES, _AGREEING = 0.5, 0.5  # largest error of a match, relative to a pair's motion; smallest share of such matches
 _LEAST_STEP = 0.05  # of the depth: frames that are nearer to each other give no reliable scale
-_TOLERATED = 1.1  # largest ratio of the stated and the measured scale, either way
 _CELL = 8  # pixels: within a cell, a cloud's points hide those behind them
 _BEHIND = 0.05  # of the depth: how far behind a point must lie to be hidden
 
@@ -54,7 +53,7 @@ def load(options: Options, capture: Capture) -> FileTracker:
     """Load the tracker for the file ``options.path``.
 
     Raises ConfigError (no path), CaptureError (the file is unreadable or has no pose for this capture), TrackingError
-    (the depth contradicts the scale).
+    (the scale is asked for and cannot be estimated).
     """
     if not options.path:
         raise ConfigError("tracking.backend=file needs a trajectory: set tracking.file.path.")
@@ -118,24 +117,18 @@ def _beside(path: str, capture: Capture) -> Path:
 
 
 def _scale(T_world_cam: NDArray[np.float64], capture: Capture, options: Options) -> float:
-    """Meters per unit: from the options, checked against depth, or else from depth; 1 if unknown."""
+    """Meters per unit: from the options, else from depth; 1 if unknown."""
     if not capture.has_depth:
         return capture.options.scale or options.scale or 1.0
+    if options.scale is not None:
+        return options.scale
     measured = estimate_depth_scale(T_world_cam, capture)
-    if options.scale is None:
-        if measured is None:
-            raise TrackingError(
-                f"The scale of {options.path} cannot be estimated from the depth of {capture.path}: too few frames "
-                "with a pose and depth overlap. Give tracking.file.scale."
-            )
-        return measured
-    off = None if measured is None else max(measured / options.scale, options.scale / measured)
-    if off is not None and off > _TOLERATED:
+    if measured is None:
         raise TrackingError(
-            f"By the depth of {capture.path}, a unit of {options.path} is {measured:.3g} m, not {options.scale:g} m: "
-            "correct tracking.file.scale, set it to null to use depth, or check that the file belongs to this capture."
+            f"The scale of {options.path} cannot be estimated from the depth of {capture.path}: too few frames with a "
+            "pose and depth overlap. Give tracking.file.scale."
         )
-    return options.scale
+    return measured
 
 
 def estimate_depth_scale(T_world_cam: NDArray[np.float64], capture: Capture) -> float | None:
