@@ -1,0 +1,222 @@
+"""Reads ROS bags: .bag of ROS 1 and of RealSense's recorder, .mcap, .db3 and folders of ROS 2. Needs freeocc3d[ros].
+
+Topics are found by type: color is an Image or CompressedImage, depth an Image of 16UC1 (millimeters) or 32FC1 (meters),
+or compressedDepth. CameraInfo gives the cameras, /tf_static where the depth camera is. Opening reads the index and the
+times in the messages' headers; without an index, and where chunks are compressed, it passes through the file once.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import CaptureError, FrameError
+from ...core.warnings import Notice
+from ...settings.typed_options import TypedOptions
+from .. import base
+from ..depth_decoding import METERS, MILLIMETERS, RawDepth
+from ..lenses import Lens
+from ..rgbd_frames import Registration, RgbdFrames, Rig, StatedCameras, build_rig
+from ..ros import stores
+from ..ros.camera_messages import FrameTree, lens_of_info, transform_matrix
+from ..ros.image_messages import decode_color, decode_depth, describe_image
+from ..ros.message_store import BagError, Messages, Place
+from ..ros.message_types import deserialize
+from ..ros.topics import IMAGE_TYPES, INFO_TYPE, TF_TYPES, ImageTopic, choose_color, choose_depth, find_info
+from ..time_pairs import median_interval, pair_nearest
+
+REQUIRES: tuple[str, ...] = ("rosbags",)
+
+_STAMP = np.dtype([("before", "V4"), ("seconds", "<u4"), ("nanoseconds", "<u4")])
+"""First bytes of a message with a header: its number (ROS 1) or CDR's form (ROS 2), and its time."""
+_BIG_ENDIAN_FORMS = (0, 2)
+_TRIES, _MOST_TRANSFORMS = 5, 1000
+_SLACK = 1.1  # of half an interval, for jitter
+
+_REALSENSE_UNITS = re.compile(r"/device_\d+/sensor_\d+/option/Depth[ _]Units/value")
+_REALSENSE_PLACE = "/tf/0"
+
+
+class Options(TypedOptions, frozen=True):
+    """Which cameras."""
+
+    color_topic: str | None = None
+    """Topic of the color images; null = the only one, or the best."""
+    depth_topic: str | None = None
+    """Topic of the depth images; null = the one that goes with the color, aligned to it if there is such a topic."""
+
+
+class Reader(RgbdFrames):
+    """A frame is a color message and the depth message that is nearest in time, by the stamps in their headers.
+    Messages without a partner within half an interval are left out. Depth is registered to the color camera."""
+
+    format = "ros_bag"
+    layout = "a ROS bag: a .bag, .mcap or .db3 file, or a folder of such with metadata.yaml"
+    reads_files = True
+
+    def __init__(self, path: Path, options: base.Options, own: Options | None = None):
+        own = own or Options()
+        self._store, self._source = stores.open_store(path), path
+        topics = self._image_topics(path)
+        color = choose_color(topics, own.color_topic, path)
+        depth = choose_depth(topics, own.depth_topic, color, path) if options.depth else None
+        self._topics = (color, depth)
+        self._messages = [self._find(topic.name) if topic else None for topic in self._topics]
+        times, self._rows, self.warnings = self._pair_messages(path)
+        super().__init__(path, options, times, self._units(depth))
+        self.has_depth = depth is not None
+        stated = self._stated_cameras(color, depth)
+        sizes = color.kind.size, depth.kind.size if depth else None
+        self._rig, self.intrinsics_known = build_rig(stated, options, *sizes)
+        self.focal_stated = self.intrinsics_known
+        Registration(self._rig)  # raises CaptureError for a rig of too large images
+
+    @classmethod
+    def recognizes(cls, path: Path) -> bool:
+        return stores.is_bag(path)
+
+    def stored_color(self, index: int) -> NDArray[np.uint8]:
+        return decode_color(*self._read_frame(index, 0))
+
+    def stored_depth(self, index: int) -> RawDepth | None:
+        return decode_depth(*self._read_frame(index, 1))
+
+    def rig(self, index: int) -> Rig:
+        return self._rig
+
+    def _read_frame(self, index: int, stream: int) -> tuple[Any, str]:
+        """The message of a frame in the color (0) or depth (1) stream, and what it is in words. Raises FrameError."""
+        topic, messages = self._topics[stream], self._messages[stream]
+        assert topic is not None
+        assert messages is not None
+        row = int(self._rows[index, stream])
+        what = f"Message {row} of {topic.name} in {self.path}"
+        try:
+            return self._message(topic.name, messages.place(row)), what
+        except (BagError, OSError) as error:
+            raise FrameError(f"{what} cannot be read: {error}.") from error
+
+    def _find(self, topic: str) -> Messages:
+        try:
+            return self._store.find(topic)
+        except (BagError, OSError) as error:
+            raise CaptureError(f"{self._source} is not a readable ROS bag: {error}.") from error
+
+    def _message(self, topic: str, place: Place) -> Any:
+        """A message. Raises BagError, OSError."""
+        data = self._store.read(place)
+        try:
+            return deserialize(data, self._store.topics[topic], self._store.ros1)
+        except Exception as error:  # the generated code checks nothing
+            raise BagError("it is damaged: the message does not fit its type") from error
+
+    def _some(self, topic: str, most: int) -> list[Any]:
+        """The first messages of a topic, without those that are damaged."""
+        found, messages = [], self._find(topic)
+        for row in range(min(most, len(messages))):
+            try:
+                found.append(self._message(topic, messages.place(row)))
+            except (BagError, OSError):
+                continue
+        return found
+
+    def _image_topics(self, path: Path) -> list[ImageTopic]:
+        found = []
+        for name in sorted(name for name, kind in self._store.topics.items() if kind in IMAGE_TYPES):
+            for message in self._some(name, _TRIES):
+                try:
+                    found.append(ImageTopic(name, describe_image(message, f"{name} in {path}")))
+                    break
+                except FrameError:
+                    continue
+        return found
+
+    def _pair_messages(self, path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], tuple[Notice, ...]]:
+        """(N,) seconds, (N, 2) rows of the color and depth messages of frames, and warnings. Raises CaptureError."""
+        color, depth = self._messages
+        assert color is not None
+        a, order_a = _ascending(self._stamps(color))
+        if depth is None:
+            return a, np.column_stack((order_a, order_a)), ()
+        b, order_b = _ascending(self._stamps(depth))
+        within = 0.5 * _SLACK * min(median_interval(a), median_interval(b))
+        pairs = pair_nearest(a, b, within)
+        if not len(pairs):  # the stamps may be of two clocks: recording them had one
+            pairs = pair_nearest(color.times[order_a] * 1e-9, depth.times[order_b] * 1e-9, within)
+        if not len(pairs):
+            raise CaptureError(
+                f"{path} holds {len(a)} color and {len(b)} depth images, but none of the two are of the same time: map "
+                "color only with capture.depth=false, or choose other topics with capture.ros_bag.depth_topic."
+            )
+        rows = np.column_stack((order_a[pairs[:, 0]], order_b[pairs[:, 1]]))
+        left = len(color) - len(pairs), len(depth) - len(pairs)
+        if not any(left):
+            return a[pairs[:, 0]], rows, ()
+        text = (
+            f"{path} holds {len(color)} color and {len(depth)} depth images; {left[0]} and {left[1]} of them have no "
+            f"partner within {within * 1e3:.0f} ms and are left out."
+        )
+        return a[pairs[:, 0]], rows, (Notice("images-left-out", text),)
+
+    def _stamps(self, messages: Messages) -> NDArray[np.float64]:
+        """(N,) seconds of messages, from their headers; the time of recording where a header has none."""
+        try:
+            heads = np.ascontiguousarray(self._store.heads(messages, _STAMP.itemsize))
+        except (BagError, OSError) as error:
+            raise CaptureError(f"{self._source} is not a readable ROS bag: {error}.") from error
+        stamps = heads.view(_STAMP)[:, 0]
+        if not self._store.ros1 and len(heads) and heads[0, 1] in _BIG_ENDIAN_FORMS:
+            stamps = heads.view(_STAMP.newbyteorder())[:, 0]
+        seconds = stamps["seconds"] + stamps["nanoseconds"] * 1e-9
+        return np.where(seconds > 0, seconds, messages.times * 1e-9)
+
+    def _units(self, depth: ImageTopic | None) -> float:
+        """Units per meter of the depth: what RealSense's recorder states, or those of the encoding."""
+        if depth is None or depth.kind.encoding == "32FC1":
+            return METERS
+        device = depth.name.partition("/sensor_")[0] + "/"
+        for name in self._store.topics:
+            if _REALSENSE_UNITS.fullmatch(name) and name.startswith(device):
+                meters = [float(message.data) for message in self._some(name, 1)]
+                if meters and 1e-6 <= meters[0] <= 1:
+                    return round(1 / meters[0], 2)
+        return MILLIMETERS
+
+    def _stated_cameras(self, color: ImageTopic, depth: ImageTopic | None) -> StatedCameras:
+        infos = {name: self._some(name, 1) for name, kind in self._store.topics.items() if kind == INFO_TYPE}
+        frames = {name: str(found[0].header.frame_id).lstrip("/") for name, found in infos.items() if found}
+
+        def lens(topic: ImageTopic) -> Lens | None:
+            name = find_info(topic, frames)
+            if name is None:
+                return None
+            return lens_of_info(infos[name][0], topic.kind.size, topic.rectified, f"{name} in {self._source}")
+
+        if depth is None:
+            return StatedCameras(lens(color))
+        return StatedCameras(lens(color), lens(depth), self._find_T_color_depth(color, depth))
+
+    def _find_T_color_depth(self, color: ImageTopic, depth: ImageTopic) -> NDArray[np.float64] | None:
+        """(4, 4) depth to color camera frame; None if the two coincide, or nothing says where they are."""
+        placed = [topic.namespace.rpartition("/")[0] + _REALSENSE_PLACE for topic in (color, depth)]
+        if all(name in self._store.topics for name in placed):  # T_stream_reference of RealSense's recorder
+            T_color, T_depth = (next(map(transform_matrix, self._some(name, 1)), None) for name in placed)
+            return None if T_color is None or T_depth is None else T_color @ np.linalg.inv(T_depth)
+        frames = color.kind.frame_id, depth.kind.frame_id
+        if frames[0] == frames[1] or not all(frames):
+            return None
+        tree = FrameTree()
+        names = [name for name, kind in self._store.topics.items() if kind in TF_TYPES]
+        for name in sorted(names, key=lambda name: not name.endswith("static")):
+            tree.add(self._some(name, _MOST_TRANSFORMS))
+        return tree.find(*frames)
+
+
+def _ascending(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Times, ascending and each once, and their rows."""
+    found, rows = np.unique(times, return_index=True)
+    return found, rows.astype(np.int64)

@@ -1,0 +1,1 @@
+"""ROS bags: where their messages lie, which topics are cameras, and what the messages hold."""

@@ -1,0 +1,116 @@
+"""Opens the storage of a bag: a .bag, .mcap or .db3 file, or a folder of rosbag2."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import CaptureError
+from ...core.regular_files import check_regular, open_regular, read_text
+from ...core.yaml_documents import InvalidYaml, parse_yaml
+from ..numbered_files import list_folder
+from . import bag1_store, database_store, mcap_store
+from .bag1_store import Bag1Store
+from .database_store import DatabaseStore, is_bag_database
+from .mcap_store import McapStore
+from .message_store import BagError, Messages, MessageStore, Place, join_messages
+
+METADATA = "metadata.yaml"
+SUFFIXES = (".mcap", ".db3")
+"""Suffixes of the files of a rosbag2 folder."""
+
+_METADATA_BYTES = 16 << 20
+_PACKED = tuple(f"{suffix}.zstd" for suffix in SUFFIXES)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a file starts as a bag does, or is named like one, or a folder holds the files of rosbag2."""
+    if path.is_dir():
+        return any(name.endswith((*SUFFIXES, *_PACKED)) for name in list_folder(path))
+    if path.suffix.lower() in (".bag", *SUFFIXES):
+        return True
+    try:
+        start = _start(path)
+    except OSError:
+        return False
+    if start.startswith(database_store.START):
+        return is_bag_database(path)
+    return start.startswith((bag1_store.START, mcap_store.START))
+
+
+def open_store(path: Path) -> MessageStore:
+    """The messages of a bag. Raises CaptureError for a bag that is damaged, or of another kind."""
+    try:
+        return _open_folder(path) if path.is_dir() else _open_file(path)
+    except BagError as error:
+        raise CaptureError(f"{path} is not a readable ROS bag: {error}.") from error
+    except OSError as error:
+        raise CaptureError(f"Cannot read {error.filename or path}: {error.strerror}.") from error
+
+
+def _start(path: Path) -> bytes:
+    with open_regular(path) as stream:
+        return stream.read(16)
+
+
+def _open_file(path: Path, compressed: bool = False) -> MessageStore:
+    start = _start(path)
+    if start.startswith(bag1_store.START):
+        return Bag1Store(path)
+    if start.startswith(mcap_store.START):
+        return McapStore(path)
+    if start.startswith(database_store.START):
+        return DatabaseStore(path, compressed)
+    raise BagError(f"it holds {'nothing' if not start else 'none of the formats .bag 2.0, .mcap and .db3'}")
+
+
+def _open_folder(folder: Path) -> MessageStore:
+    stated = _read_metadata(folder)
+    names = list_folder(folder)
+    listed = stated.get("relative_file_paths")
+    wanted = [str(name).replace("\\", "/").rpartition("/")[2] for name in listed] if isinstance(listed, list) else []
+    found = [name for name in wanted or names if name.endswith(SUFFIXES) and name in names]
+    if missing := [name for name in wanted if name not in names]:
+        raise BagError(f"its {METADATA} names {missing[0]}, which is missing")
+    if not found and any(name.endswith(_PACKED) for name in names):
+        raise BagError("its files are compressed: unpack them with zstd -d, and remove metadata.yaml")
+    if not found:
+        raise BagError("the folder holds no .mcap or .db3 file")
+    compressed = str(stated.get("compression_mode") or "").lower() == "message"
+    for name in found:
+        check_regular(folder / name)
+    return JoinedStore([_open_file(folder / name, compressed) for name in found])
+
+
+def _read_metadata(folder: Path) -> dict[str, Any]:
+    """What metadata.yaml states about the bag; without the file, nothing."""
+    if not (folder / METADATA).exists():
+        return {}
+    try:
+        stated = parse_yaml(read_text(folder / METADATA, _METADATA_BYTES))
+    except (InvalidYaml, UnicodeDecodeError) as error:
+        raise BagError(f"its {METADATA} is damaged ({error}): run ros2 bag reindex") from error
+    found = stated.get("rosbag2_bagfile_information") if isinstance(stated, dict) else None
+    if not isinstance(found, dict):
+        raise BagError(f"its {METADATA} does not describe a bag: run ros2 bag reindex")
+    return found
+
+
+class JoinedStore(MessageStore):
+    """The messages of several files, as if they were one."""
+
+    def __init__(self, stores: list[MessageStore]):
+        self._stores = stores
+        self.ros1 = any(store.ros1 for store in stores)
+        if self.ros1 != all(store.ros1 for store in stores):
+            raise BagError("it mixes messages of ROS 1 and ROS 2")
+        self.topics = {topic: kind for store in stores for topic, kind in store.topics.items()}
+
+    def find(self, topic: str) -> Messages:
+        parts = [store.find(topic) for store in self._stores]
+        for number, part in enumerate(parts):
+            part.places[:, 0] = number
+        return join_messages(parts)
+
+    def read(self, place: Place, first: int | None = None) -> bytes:
+        return self._stores[place[0]].read((0, *place[1:]), first)

@@ -1,0 +1,127 @@
+"""CameraInfo becomes lenses, and tf the place of the depth camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ros_bags import COLOR, DEPTH, Messages, Sent, write_bag
+from small_captures import SIZE, color_image, depth_image, pose_matrix
+
+from freeocc3d.capture.base import Options
+from freeocc3d.capture.lenses import Lens
+from freeocc3d.capture.readers.ros_bag import Reader
+from freeocc3d.capture.ros.camera_messages import FrameTree, lens_of_info
+from freeocc3d.core.errors import CaptureError
+from freeocc3d.core.transforms import invert
+
+K = 40.0, 41.0, 15.5, 11.5
+
+
+def lens(size: tuple[int, int] = SIZE, rectified: bool = False, **stated: Any) -> Lens | None:
+    values = {"K": K, **stated}
+    return lens_of_info(Messages("db3").info(SIZE, **values), size, rectified, "camera_info")
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", "Brown Conrady"])
+def test_coefficients_keep_opencvs_order(model: str) -> None:
+    found = lens(D=(0.1, -0.2, 0.01, 0.02, 0.3), model=model)
+    assert found == Lens(found.camera, (0.1, -0.2, 0.01, 0.02, 0.3))  # type: ignore[union-attr]
+    assert (found.camera.fx, found.camera.fy, found.camera.cx, found.camera.cy) == K  # type: ignore[union-attr]
+
+
+def test_eight_coefficients_and_zeros_behind_them() -> None:
+    D = tuple(0.01 * n for n in range(1, 9))
+    assert lens(D=(*D, 0, 0, 0, 0, 0, 0), model="rational_polynomial").distortion == D  # type: ignore[union-attr]
+
+
+def test_a_fisheye() -> None:
+    found = lens(D=(0.1, 0.2, 0.3, 0.4), model="equidistant")
+    assert found is not None
+    assert (found.fisheye, found.distortion) == (True, (0.1, 0.2, 0.3, 0.4))
+
+
+def test_rectified_images_have_the_camera_p_and_no_distortion() -> None:
+    found = lens(rectified=True, D=(0.1, 0, 0, 0, 0), P=(30, 31, 14, 10))
+    assert found is not None
+    assert (found.camera.fx, found.camera.cy, found.distortion) == (30, 10, ())
+
+
+def test_no_camera_is_stated() -> None:
+    assert lens(K=(0, 0, 0, 0)) is None
+
+
+def test_larger_images_rescale_the_camera_and_binning_reduces_it() -> None:
+    twice = lens(size=(64, 48))
+    assert twice is not None
+    assert (twice.camera.fx, twice.camera.cx) == (80, 31.5)
+    half = lens(size=(16, 12), binning_x=2, binning_y=2)
+    assert half is not None
+    assert (half.camera.fx, half.camera.cx) == (20, 7.5)
+
+
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        ({"D": (0.1, 0, 0, 0), "model": "ftheta"}, "'ftheta', which is not supported"),
+        ({"D": tuple(range(20))}, "20 coefficients"),
+        ({"D": (np.nan, 0, 0, 0)}, "not those of a lens"),
+        ({"K": (np.nan, 40, 15, 11)}, "unusable intrinsics"),
+    ],
+)
+def test_impossible_cameras_are_refused(stated: dict[str, Any], said: str) -> None:
+    with pytest.raises(CaptureError, match=said):
+        lens(**stated)
+
+
+def test_frames_are_found_along_the_tree() -> None:
+    A, B, C = (pose_matrix(n) for n in (3, 7, 11))
+    tree = FrameTree()
+    tree.add([Messages("bag").transforms(("base", "/color", A), ("base", "left", B)), *others(C)])
+    np.testing.assert_allclose(tree.find("color", "depth"), invert(A) @ B @ C, atol=1e-9)
+    assert tree.find("color", "arm") is None
+    assert tree.find("color", "nowhere") is None
+
+
+def others(C: Any) -> list[Any]:
+    messages = Messages("bag")
+    moving = [messages.transforms(("base", "arm", pose_matrix(n))) for n in (1, 2)]
+    return [messages.transforms(("left", "depth", C)), *moving]
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_depth_moves_to_the_color_camera(kind: Any, tmp_path: Path) -> None:
+    """A depth camera 20 cm to the left: at 2 m, depth appears 0.2 * 40 / 2 = 4 pixels to the left."""
+    messages = Messages(kind)
+    T_base_depth, T_base_color = np.eye(4), np.eye(4)
+    T_base_color[0, 3] = 0.2
+    edges = messages.transforms(("base", "depth", T_base_depth), ("base", "color", T_base_color))
+    sent: list[Sent] = [
+        ("/tf_static", 0, edges),
+        ("/camera/color/camera_info", 0, messages.info(SIZE, K, frame="color")),
+        ("/camera/depth/camera_info", 0, messages.info(SIZE, K, frame="depth")),
+    ]
+    for index in range(3):
+        sent.append((COLOR, index, messages.image(color_image(index), "rgb8", index + 1, frame="color")))
+        depth = depth_image(0)
+        depth[:, 16:] = 3000
+        sent.append((DEPTH, index, messages.image(depth, "16UC1", index + 1, frame="depth")))
+    capture = Reader(write_bag(tmp_path / "scan", messages, sent), Options())
+    row = capture[1].depth_m[12]
+    assert row[10] == pytest.approx(2)
+    assert row[13] == pytest.approx(3)
+    np.testing.assert_array_equal(capture[1].color, color_image(1))
+
+
+def test_a_camera_is_found_by_its_frame(tmp_path: Path) -> None:
+    messages = Messages("db3")
+    sent: list[Sent] = [
+        ("/somewhere/camera_info", 0, messages.info(SIZE, K, frame="eye")),
+        ("/other/camera_info", 0, messages.info(SIZE, (20, 20, 15, 11), frame="other")),
+        *[("/images", n, messages.image(color_image(n), "rgb8", n + 1, frame="eye")) for n in range(2)],
+    ]
+    capture = Reader(write_bag(tmp_path / "scan", messages, sent), Options())
+    assert capture.intrinsics_known
+    assert capture[0].intrinsics.fx == 40
