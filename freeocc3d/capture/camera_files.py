@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -178,6 +179,49 @@ def read_pose(path: Path) -> NDArray[np.float64] | None:
     tracking was lost."""
     matrix = read_matrix(path) if os.path.lexists(path) else None
     return matrix if matrix is not None and is_pose(matrix) else None
+
+
+def explain_no_pose(T: NDArray[np.float64] | None) -> str:
+    """Why a matrix of a file, or None for a file without one, is no camera-to-world pose; part of a sentence."""
+    if T is None or T.shape != (4, 4):
+        return "is not a matrix of 4 x 4 numbers"
+    if not np.isfinite(T).all():
+        return "holds numbers that are not finite"
+    if not T[:3, :3].any():
+        return "is all zeros"
+    if not is_rigid(np.block([[T[:3, :3], np.zeros((3, 1))], [np.eye(4)[3:]]])):
+        return _explain_axes(T[:3, :3])
+    if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-3:
+        transposed = "it is transposed, with the position in its last row" if T[3, 3] == 1 else "not 0 0 0 1"
+        return f"has the last row {' '.join(f'{value:g}' for value in T[3])} ({transposed})"
+    return f"has a position farther than {FARTHEST:g}"
+
+
+def _explain_axes(R: NDArray[np.float64]) -> str:
+    scale = float(np.cbrt(abs(np.linalg.det(R))))
+    if scale == 0 or np.abs(R @ R.T / scale**2 - np.eye(3)).max() > 1e-2:
+        return "has axes that are not at right angles or not of one length"
+    if np.linalg.det(R) < 0:
+        return f"has determinant {np.linalg.det(R):.3g} (mirrored axes, those of a left-handed world)"
+    return f"has axes of length {scale:.4g}, not 1 (is it scaled?)"
+
+
+def check_pose_files(files: Sequence[Path], where: str) -> None:
+    """Raise CaptureError if there are files but none holds a pose; stops at the first that does. where: names the files
+    in the message."""
+    faults = dict[bool, str]()
+    for file in files:
+        matrix = read_matrix(file)
+        if matrix is not None and is_pose(matrix):
+            return
+        stated = matrix is not None and bool(np.isfinite(matrix).all())  # not of a frame that was lost
+        faults.setdefault(stated, f"{file.name} {explain_no_pose(matrix)}")
+    if faults:
+        be = "file, which is not" if len(files) == 1 else "files, of which none is"
+        raise CaptureError(
+            f"{where} holds {len(files)} pose {be} a rigid right-handed camera-to-world matrix: "
+            f"{faults.get(True) or faults[False]}. Correct or remove them."
+        )
 
 
 def is_pose(T: NDArray[np.float64]) -> bool:

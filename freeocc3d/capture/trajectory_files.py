@@ -1,7 +1,7 @@
 """Reads trajectory files of other systems, and assigns their poses to the frames of a capture.
 
 All formats become camera-to-world poses in OpenCV axes. A pose is matched by its time (TUM), by the name of its image
-(COLMAP, nerfstudio, 7-Scenes), or by its position in the file (KITTI, Replica, Open3D's .log).
+(COLMAP, nerfstudio, 7-Scenes), by a frame number, or by its position in the file (KITTI, Replica, Open3D's .log).
 
 Sources: J. Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012 (TUM's form, association by
 time); A. Geiger et al., KITTI's odometry development kit; the format pages of COLMAP, nerfstudio and Open3D.
@@ -11,35 +11,34 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import tum_files
 from ..core.errors import CaptureError
 from ..core.regular_files import user_path
 from ..core.transforms import invert, is_rigid
+from ..core.warnings import Notice
 from .base import Capture
-from .camera_files import FARTHEST, read_matrix
+from .camera_files import FARTHEST, explain_no_pose, read_matrix
 from .colmap_models import colmap_folder, read_colmap_model
 from .nerfstudio_files import read_transforms
-from .number_files import NumberRows, read_number_rows
+from .number_files import read_number_rows
 from .numbered_files import list_folder
+from .pose_tables import UNITS, read_pose_table
 
 SAME_TIME_S = 0.02
 """Largest difference of timestamps that match, as in the TUM RGB-D benchmark."""
 
 FORMS = (
-    "TUM (timestamp, position, quaternion xyzw), KITTI or Replica (12 or 16 numbers per line), Open3D's .log, "
-    "COLMAP's images.txt or images.bin, nerfstudio's transforms.json, or a folder of 7-Scenes' *.pose.txt"
+    "TUM (timestamp, position, quaternion xyzw), a table whose heading names such columns, KITTI or Replica (12 or 16 "
+    "numbers per line), Open3D's .log, COLMAP's images.txt or images.bin, nerfstudio's transforms.json, "
+    "or a folder of 7-Scenes' *.pose.txt"
 )
 """The supported formats, in words."""
-
-_MOST_POSES = 1_000_000
-_LATEST = 1e12
-"""Largest time of a pose, seconds."""
 
 
 @dataclass(frozen=True)
@@ -47,19 +46,22 @@ class PoseFile:
     """The M poses of a file.
 
     T_world_cam: (M, 4, 4); NaN where the file has none.  timestamps: (M,) seconds, or None.
-    names: M image names, or empty.
+    names: M image names, or empty.  numbers: (M,) of the frames, or None.
     """
 
     path: Path
     T_world_cam: NDArray[np.float64]
     timestamps: NDArray[np.float64] | None = None
     names: tuple[str, ...] = ()
+    numbers: NDArray[np.int64] | None = None
 
     def times(self) -> NDArray[np.float64]:
-        """(M,) seconds. Without times, the number in the image's name or the position in the file; captures without
-        times count the same way."""
+        """(M,) seconds. Without times, the frame's number, that in the image's name or the position in the file;
+        captures without times count the same way."""
         if self.timestamps is not None:
             return self.timestamps
+        if self.numbers is not None:
+            return self.numbers.astype(np.float64)
         numbers = [_number(name) for name in self.names]
         if numbers and all(numbers):
             return np.array([float(number[-18:]) for number in numbers])
@@ -68,16 +70,15 @@ class PoseFile:
     def of_frames(self, capture: Capture, tolerance_s: float = SAME_TIME_S) -> NDArray[np.float64]:
         """(N, 4, 4) poses of a capture's N frames; NaN where the file has none.
 
-        Images match by name, else by the number in the name; times match the nearest within the tolerance, seconds.
+        Images match by name, else by the number in the name; times match the nearest within the tolerance, seconds,
+        and are of the unit that fits more than one frame; then frame numbers match, and last positions in the file.
         Raises CaptureError if nothing matches.
         """
         T = np.full((len(capture), 4, 4), np.nan)
         if self.names:
             rows = _by_name(self.names, [capture.name(index) for index in range(len(capture))])
-        elif self.timestamps is not None:
-            order = np.argsort(self.timestamps, kind="stable")
-            own, frames = associate(self.timestamps[order], capture.timestamps, tolerance_s)
-            rows = dict(zip(frames.tolist(), order[own].tolist(), strict=True))
+        elif self.timestamps is not None or self.numbers is not None:
+            rows = self._by_time(capture.timestamps, tolerance_s) or self._by_number(capture)
         else:
             rows = {index: index for index in range(min(len(T), len(self.T_world_cam)))}
         for frame, row in rows.items():
@@ -85,6 +86,44 @@ class PoseFile:
         if not np.isfinite(T).any():
             raise CaptureError(f"No pose of {self.path} matches a frame of {capture.path}: {self._mismatch(capture)}.")
         return T
+
+    def report_missing(self, T_world_cam: NDArray[np.float64], frames: Sequence[int], capture: Path) -> Notice | None:
+        """A warning that says how many of the frames have a pose; None if all have one.
+
+        T_world_cam: the result of ``of_frames``.  frames: those that are used.  capture: for the message.
+        """
+        posed = int(np.isfinite(T_world_cam[list(frames)]).all(axis=(1, 2)).sum())
+        if posed == len(frames):
+            return None
+        held = np.isfinite(self.T_world_cam).all(axis=(1, 2))
+        none = "" if held.all() else f", and {int((~held).sum())} rows without one"
+        return Notice(
+            "poses-missing",
+            f"{posed} of {len(frames)} frames of {capture} have a pose in {self.path}, which holds {int(held.sum())} "
+            f"poses{none}; the other {len(frames) - posed} are lost.",
+        )
+
+    def _by_time(self, times: NDArray[np.float64], tolerance_s: float) -> dict[int, int]:
+        """Frame -> row of the pose of that time. The unit is that which matches most frames, seconds if several do."""
+        best: dict[int, int] = {}
+        if self.timestamps is None:
+            return best
+        order = np.argsort(self.timestamps, kind="stable")
+        for unit in (*UNITS, *(1 / unit for unit in UNITS[1:])):
+            own, frames = associate(self.timestamps[order] * unit, times, tolerance_s)
+            found = dict(zip(frames.tolist(), order[own].tolist(), strict=True))
+            if len(set(found.values())) > max(len(best), 0 if unit == 1 else 1):
+                best = found
+        return best
+
+    def _by_number(self, capture: Capture) -> dict[int, int]:
+        """Frame -> row of the pose with the number in the frame's name, or of the frame's position."""
+        if self.numbers is None:
+            return {}
+        rows = {number: row for row, number in enumerate(self.numbers.tolist())}
+        named = [int(_number(capture.name(frame)) or -1) for frame in range(len(capture))]
+        keys = named if len(set(named)) == len(named) else range(len(capture))
+        return {frame: rows[key] for frame, key in enumerate(keys) if key in rows}
 
     def _mismatch(self, capture: Capture) -> str:
         if self.names:
@@ -117,8 +156,14 @@ def _checked(found: PoseFile) -> PoseFile:
         )
     if (np.abs(found.T_world_cam[finite, :3, 3]) > FARTHEST).any():
         raise CaptureError(f"{found.path} holds a position that is not possible: correct it.")
-    if not all(is_rigid(pose) for pose in found.T_world_cam[finite]):
-        raise CaptureError(f"{found.path} holds a matrix that is not a rigid camera-to-world pose.")
+    wrong = [row for row in np.flatnonzero(finite).tolist() if not is_rigid(found.T_world_cam[row])]
+    if wrong:
+        name = f"{found.names[wrong[0]]}'s" if found.names else f"number {wrong[0] + 1}"
+        be = "is not a" if len(wrong) == 1 else "are no"
+        raise CaptureError(
+            f"{found.path} holds {len(found.T_world_cam)} matrices, of which {len(wrong)} {be} rigid right-handed "
+            f"camera-to-world pose{'s' * (len(wrong) > 1)}: {name} {explain_no_pose(found.T_world_cam[wrong[0]])}."
+        )
     return found
 
 
@@ -143,36 +188,10 @@ def _read_pose(path: Path) -> NDArray[np.float64]:
 
 def _read_text(path: Path) -> PoseFile:
     try:
-        rows = read_number_rows(path)
-        table = rows.table()
-        if table is not None and table.shape[1] == tum_files.NUMBERS:
-            timestamps, T = tum_files.tum_poses(table)
-            if (np.abs(timestamps) > _LATEST).any():
-                raise ValueError("a time is out of range")
-            found = PoseFile(path, T, timestamps)
-        elif table is not None and table.shape[1] in (12, 16):
-            T = np.tile(np.eye(4), (len(table), 1, 1))
-            T[:, : table.shape[1] // 4] = table.reshape(len(table), -1, 4)
-            found = PoseFile(path, T)
-        else:
-            found = _read_log(path, rows)
+        table = read_pose_table(read_number_rows(path, headed=True))
     except ValueError as error:
-        raise CaptureError(f"{path} is not a trajectory: expected {FORMS}.") from error
-    return _checked(found)
-
-
-def _read_log(path: Path, rows: NumberRows) -> PoseFile:
-    """Read Open3D's .log: per pose a line of three numbers, first the frame number, then four lines of the matrix."""
-    count = len(rows.lengths) // 5
-    if not count or not np.array_equal(rows.lengths, np.tile((3, 4, 4, 4, 4), count)):
-        raise ValueError("no log")
-    blocks = rows.values.reshape(count, 3 + 16)
-    numbers = blocks[:, 0]
-    if not ((numbers >= 0) & (numbers < _MOST_POSES)).all():
-        raise ValueError("a frame number is out of range")
-    T = np.full((int(numbers.max()) + 1, 4, 4), np.nan)
-    T[numbers.astype(np.int64)] = blocks[:, 3:].reshape(count, 4, 4)
-    return PoseFile(path, T)
+        raise CaptureError(f"{path} is not a trajectory: {error}. Expected {FORMS}.") from error
+    return _checked(PoseFile(path, table.T_world_cam, table.times, numbers=table.numbers))
 
 
 def _read_nerfstudio(path: Path) -> PoseFile:

@@ -48,8 +48,9 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def tum_poses(rows: Sequence[Sequence[str]] | NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(M,) timestamps and (M, 4, 4) poses from M lines of words or numbers. Raises ValueError that says what is
     wrong."""
-    if any(len(row) != NUMBERS for row in rows):
-        raise ValueError(f"a line does not hold {NUMBERS} numbers")
+    for number, row in enumerate(rows, 1):
+        if len(row) != NUMBERS:
+            raise ValueError(f"pose {number} does not hold {NUMBERS} numbers, but {len(row)}")
     if not isinstance(rows, np.ndarray) and any(len(word) > _LONGEST_WORD for row in rows for word in row):
         raise ValueError("a word is too long for a number")
     table = np.array(rows, np.float64).reshape(-1, NUMBERS)
@@ -59,7 +60,12 @@ def tum_poses(rows: Sequence[Sequence[str]] | NDArray[np.float64]) -> tuple[NDAr
     lengths = np.linalg.norm(quats_wxyz, axis=1, keepdims=True)
     if (lengths == 0).any():
         raise ValueError("a quaternion is all zeros")
-    T = np.tile(np.eye(4), (len(table), 1, 1))
-    T[:, :3, 3] = table[:, 1:4]
-    T[:, :3, :3] = quats_to_rotations(quats_wxyz / lengths)
-    return table[:, 0], T
+    return table[:, 0], compose_poses(table[:, 1:4], quats_wxyz / lengths)
+
+
+def compose_poses(positions: NDArray[np.float64], quats_wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(M, 4, 4) poses of (M, 3) positions and (M, 4) unit quaternions."""
+    T = np.tile(np.eye(4), (len(positions), 1, 1))
+    T[:, :3, 3] = positions
+    T[:, :3, :3] = quats_to_rotations(quats_wxyz)
+    return T

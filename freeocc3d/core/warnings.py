@@ -16,6 +16,7 @@ Code = Literal[
     "models-apart",
     "broken-frames",
     "frames-lost",
+    "poses-missing",
     "submaps-apart",
     "scale-unknown",
     "vocabulary-incomplete",

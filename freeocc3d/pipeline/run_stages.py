@@ -65,7 +65,7 @@ def track(run: Run) -> None:
         frames = select_frames(capture)
         if mapper.offline:
             mapper.prepare(work.begin_offline(), frames, progress)
-            run.warn(*mapper.tracker.warnings)
+        run.warn(*mapper.tracker.warnings)
         state = work.restore_tracking()
         first = 0 if state is None else mapper.restore(state)
         progress.stage("tracking", len(frames))

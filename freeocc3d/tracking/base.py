@@ -77,7 +77,7 @@ class Tracker(ABC):
     offline: bool = False
     """Whether ``prepare`` processes the whole scan before ``track`` gets the first frame."""
     warnings: tuple[Notice, ...] = ()
-    """Warnings of ``prepare`` for the user."""
+    """Warnings of ``load`` and ``prepare`` for the user."""
     brings_depth: bool = False
     """Whether ``prepare_frame`` adds depth, so that a capture without depth needs no other depth source."""
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...core.transforms import invert
 from ..base import Options
-from ..camera_files import read_intrinsics, read_pose, read_rigid
+from ..camera_files import check_pose_files, read_intrinsics, read_pose, read_rigid
 from ..class_files import capture_class_names
 from ..image_pairs import ImagePairs, Pairs, pair_files
 from ..lenses import Lens
@@ -75,7 +75,9 @@ class Reader(ImagePairs):
 
     @functools.cached_property
     def _pose_files(self) -> dict[int, Path]:
-        return list_numbered(self.path / "pose", POSE)
+        files = list_numbered(self.path / "pose", POSE)
+        check_pose_files(list(files.values()), str(self.path / "pose"))
+        return files
 
     @functools.cached_property
     def _class_files(self) -> dict[int, Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from pathlib import Path
 
@@ -9,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import Options
-from ..camera_files import Calibration, read_given_calibration, read_intrinsics, read_pose, rescale_camera
+from ..camera_files import (
+    Calibration,
+    check_pose_files,
+    read_given_calibration,
+    read_intrinsics,
+    read_pose,
+    rescale_camera,
+)
 from ..image_pairs import ImagePairs, pair_files
 from ..lenses import Lens
 from ..numbered_files import has_file, list_numbered
@@ -18,6 +26,7 @@ from ..rgbd_frames import Rig
 REQUIRES: tuple[str, ...] = ()
 
 COLOR = r"frame-(\d+)\.color\.(?:png|jpe?g)"
+POSE = r"frame-(\d+)\.pose\.txt"
 DEPTH = r"frame-(\d+)\.depth\.png"
 
 KINECT = Calibration((585.0, 585.0, 320.0, 240.0), (640, 480), "the Kinect calibration of 7-Scenes")
@@ -48,6 +57,11 @@ class Reader(ImagePairs):
         return has_file(path, COLOR)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
-        image = self._pairs.color[index] or self._pairs.depth[index]
-        assert image is not None  # a frame has at least one of the two
-        return read_pose(image.with_name(f"{image.name.split('.', 1)[0]}.pose.txt"))
+        path = self._pose_files.get(self._pairs.numbers[index])
+        return None if path is None else read_pose(path)
+
+    @functools.cached_property
+    def _pose_files(self) -> dict[int, Path]:
+        files = list_numbered(self.path, POSE)
+        check_pose_files(list(files.values()), str(self.path))
+        return files

@@ -1,4 +1,4 @@
-"""Reads another system's poses from a file: TUM, KITTI, Open3D .log, COLMAP, nerfstudio, 7-Scenes."""
+"""Reads another system's poses from a file: TUM and such tables, KITTI, Open3D .log, COLMAP, nerfstudio, 7-Scenes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from ...capture import read_trajectory
+from ...capture import read_trajectory, select_frames
 from ...capture.base import Capture
 from ...capture.point_files import read_points
 from ...core.errors import ConfigError, TrackingError
@@ -64,6 +64,8 @@ def load(options: Options, capture: Capture) -> FileTracker:
     T_world_cam[:, :3, 3] *= scale
     scaled = None if points is None else points * np.float32(scale)
     tracker = FileTracker(T_world_cam, options.keyframe_overlap, scaled)
+    missing = found.report_missing(T_world_cam, select_frames(capture), capture.path)
+    tracker.warnings = () if missing is None else (missing,)
     tracker.metric = capture.has_depth or options.scale is not None or capture.options.scale is not None
     return tracker
 
