@@ -9,6 +9,7 @@ and NAME.avoid.yaml with the costs of all words. Source: nav2_map_server's map_i
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +21,7 @@ from ..core.errors import ConfigError, ExportError
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
 from ..query.scan_map import Map
 from ..settings.option_types import Share
-from .export_frames import BoxOptions, UprightFrame, find_floor_z, place_voxels, write_description
+from .export_frames import BoxOptions, PlacedVoxels, UprightFrame, find_floor_z, place_voxels, write_description
 from .keepout_masks import parse_avoided, write_layers
 from .map_server_files import PLAN, CellGrid, write_map
 
@@ -30,7 +31,7 @@ _PIXEL = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
 _MOST_PIXELS = 1 << 28
 
 
-class Options(BoxOptions, frozen=True):
+class PlanOptions(BoxOptions, frozen=True):
     """The heights of obstacles, and what counts as free."""
 
     frame: UprightFrame = "gravity"
@@ -43,6 +44,16 @@ class Options(BoxOptions, frozen=True):
     """Least share of a column's voxels between the heights that must be free for a free cell, 0…1; 0 = any."""
     inflation: Annotated[float, Meta(ge=0, le=1000)] = 0.0
     """Radius around obstacles that is occupied too, meters; most planners inflate obstacles themselves."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.min_height >= self.max_height:
+            raise ConfigError(f"'min_height' must be below 'max_height', got {self.min_height} and {self.max_height}.")
+
+
+class Options(PlanOptions, frozen=True):
+    """The plan, and what the robot has to avoid."""
+
     avoid: tuple[str, ...] = ()
     """Words with a cost for the robot, as in [carpet:40%, glass:0.5]. WORD: the robot must not enter. WORD:METERS: it
     must keep this distance. WORD:COST%: it may enter at a cost of 1 to 99. WORD:METERS:COST%: the cost falls to 0 over
@@ -50,9 +61,18 @@ class Options(BoxOptions, frozen=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.min_height >= self.max_height:
-            raise ConfigError(f"'min_height' must be below 'max_height', got {self.min_height} and {self.max_height}.")
         parse_avoided(self.avoid)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Obstacles seen from above. cells: (X, Y) FREE, OCCUPIED or UNKNOWN.  floor_z: height of the floor in the frame.
+    there: the voxels that it was made of."""
+
+    cells: NDArray[np.uint8]
+    grid: CellGrid
+    floor_z: float
+    there: PlacedVoxels
 
 
 def write(scan_map: Map, path: Path, options: Options) -> list[str]:
@@ -60,20 +80,26 @@ def write(scan_map: Map, path: Path, options: Options) -> list[str]:
     named .yaml, ExportError if nothing is known between the heights, or if the map does not understand a word."""
     if path.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"The name of a map_server map must end in .yaml, got '{path.name}'.")
+    made = make_plan(scan_map, options)
+    there, grid, floor = made.there, made.grid, made.floor_z
+    pixels = np.zeros(256, np.uint8)
+    pixels[list(_PIXEL)] = list(_PIXEL.values())
+    about = f"obstacles {options.min_height:g} to {options.max_height:g} m above the floor"
+    write_map(path, pixels[made.cells], grid, PLAN, about)
+    layers, notes = write_layers(scan_map, path, there, parse_avoided(options.avoid), grid, floor + options.max_height)
+    described = {"floor_z_m": floor, "min_height_m": options.min_height, "max_height_m": options.max_height}
+    write_description(path, {**there.described(), **described, **({"avoid": layers} if layers else {})})
+    return notes
+
+
+def make_plan(scan_map: Map, options: PlanOptions) -> Plan:
+    """Returns the plan that the options ask for. Raises ExportError if nothing is known between the heights."""
     there = place_voxels(scan_map, options.frame, box=options.box)
     floor, size = find_floor_z(scan_map, there.T_frame_map), there.occupancy.voxel_size
     cells, origin = plan(there.occupancy, floor + options.min_height, floor + options.max_height, options.min_free)
     if options.inflation > 0:
         cells = inflate(cells, options.inflation / size)
-    grid = CellGrid(origin, size, (cells.shape[0], cells.shape[1]), there.frame)
-    pixels = np.zeros(256, np.uint8)
-    pixels[list(_PIXEL)] = list(_PIXEL.values())
-    about = f"obstacles {options.min_height:g} to {options.max_height:g} m above the floor"
-    write_map(path, pixels[cells], grid, PLAN, about)
-    layers, notes = write_layers(scan_map, path, there, parse_avoided(options.avoid), grid, floor + options.max_height)
-    described = {"floor_z_m": floor, "min_height_m": options.min_height, "max_height_m": options.max_height}
-    write_description(path, {**there.described(), **described, **({"avoid": layers} if layers else {})})
-    return notes
+    return Plan(cells, CellGrid(origin, size, (cells.shape[0], cells.shape[1]), there.frame), floor, there)
 
 
 def plan(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.errors import ConfigError, ExportError
 from ..core.types import FREE, OCCUPIED, Occupancy
 from ..query.scan_map import Map
-from .export_frames import VoxelOptions, place_voxels, write_description
+from .export_frames import PlacedVoxels, VoxelOptions, place_voxels, write_description
 from .octree import KEY_ORIGIN, Leaves, Octree, build_octree
 
 REQUIRES: tuple[str, ...] = ()
@@ -44,15 +44,22 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         )
     if binary and options.color:
         raise ConfigError("A .bt holds no colors: name the file .ot.")
-    there = place_voxels(scan_map, options.frame, origin=(0.0, 0.0, 0.0), box=options.box)
-    tree = build_octree(collect_leaves(there.occupancy, log_odds=not binary, color=options.color))
+    there, tree = make_tree(scan_map, options, log_odds=not binary, color=options.color)
     with path.open("wb") as stream:
         kind = "OcTree binary" if binary else "OcTree"
         name = "ColorOcTree" if options.color else "OcTree"
         header = f"# Octomap {kind} file\n# freeocc3d, {there.frame} frame, {there.unit}\nid {name}\nsize {len(tree)}\n"
         stream.write(f"{header}res {there.occupancy.finest:.12g}\ndata\n".encode("ascii"))
-        stream.write(_binary_nodes(tree) if binary else _full_nodes(tree, options.color))
+        stream.write(encode_binary(tree) if binary else _full_nodes(tree, options.color))
     write_description(path, there.described())
+
+
+def make_tree(
+    scan_map: Map, options: VoxelOptions, log_odds: bool = False, color: bool = False
+) -> tuple[PlacedVoxels, Octree]:
+    """Returns the map's voxels on the lattice of a tree, and the tree. log_odds, color: see ``collect_leaves``."""
+    there = place_voxels(scan_map, options.frame, origin=(0.0, 0.0, 0.0), box=options.box)
+    return there, build_octree(collect_leaves(there.occupancy, log_odds, color))
 
 
 def collect_leaves(occupancy: Occupancy, log_odds: bool, color: bool) -> list[Leaves]:
@@ -89,8 +96,9 @@ def _log_odds(probability: NDArray[np.float32], occupied: NDArray[np.bool_]) -> 
     return np.where(occupied, np.maximum(odds, _LEAST), np.minimum(odds, -_LEAST)).astype(np.float32)
 
 
-def _binary_nodes(tree: Octree) -> bytes:
-    """Returns two bytes for each node with children, two bits per child. Leaves appear only in their parents."""
+def encode_binary(tree: Octree) -> bytes:
+    """Returns the nodes of a .bt: two bytes for each node with children, two bits per child. Leaves appear only in
+    their parents."""
     return tree.kinds[tree.children > 0].astype("<u2").tobytes()
 
 

@@ -1,4 +1,4 @@
-"""Reads ROS bags: .bag of ROS 1 and of RealSense's recorder, .mcap, .db3 and folders of ROS 2. Needs freeocc3d[ros].
+"""Reads ROS bags: .bag of ROS 1 and of RealSense's recorder, .mcap, .db3 and folders of ROS 2.
 
 Topics are found by type: color is an Image or CompressedImage, depth an Image of 16UC1 (millimeters) or 32FC1 (meters),
 or compressedDepth. CameraInfo gives the cameras, /tf_static where the depth camera is. Opening reads the index and the

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.regular_files import open_regular
-from .message_store import MOST_BYTES, BagError, Messages, MessageStore, Place, decompress, sort_messages
+from .message_store import MOST_BYTES, BagError, Messages, MessageStore, Place, sort_messages
 
 START = b"SQLite format 3\0"
 
@@ -32,12 +32,12 @@ def is_bag_database(path: Path) -> bool:
 
 
 class DatabaseStore(MessageStore):
-    """Messages of a .db3. compressed: whether each message is compressed with zstd, which metadata.yaml states."""
+    """Messages of a .db3."""
 
     ros1 = False
 
-    def __init__(self, path: Path, compressed: bool = False):
-        self._compressed, self._lock = compressed, threading.Lock()
+    def __init__(self, path: Path):
+        self._lock = threading.Lock()
         self._database = _connect(path)
         weakref.finalize(self, self._database.close)
         if self._rows(_TABLES) != [(2,)]:
@@ -63,19 +63,16 @@ class DatabaseStore(MessageStore):
         return sort_messages(table[:, 0], np.column_stack((zeros, zeros - 1, table[:, 1])))
 
     def read(self, place: Place, first: int | None = None) -> bytes:
-        part = None if self._compressed else first
         rows = self._rows("SELECT length(data) FROM messages WHERE id = ?", place[2])
         if not rows or not isinstance(rows[0][0], int) or rows[0][0] > MOST_BYTES:
             raise BagError("it is damaged: a message is missing or too large")
-        size = rows[0][0] if part is None else part
+        size = rows[0][0] if first is None else first
         data = self._rows("SELECT substr(data, 1, ?) FROM messages WHERE id = ?", size, place[2])[0][0]
         if not isinstance(data, bytes):
             raise BagError("it is damaged: a message is not made of bytes")
-        return decompress("zstd", data)[:first] if self._compressed else data
+        return data
 
     def heads(self, messages: Messages, size: int) -> NDArray[np.uint8]:
-        if self._compressed:
-            return super().heads(messages, size)
         found = np.zeros((len(messages), size), np.uint8)
         rows = {offset: row for row, offset in enumerate(messages.places[:, 2].tolist())}
         low, high = (min(rows), max(rows)) if rows else (0, -1)

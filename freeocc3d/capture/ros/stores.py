@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ...core.errors import CaptureError
 from ...core.regular_files import check_regular, open_regular, read_text
 from ...core.yaml_documents import InvalidYaml, parse_yaml
@@ -13,7 +16,7 @@ from . import bag1_store, database_store, mcap_store
 from .bag1_store import Bag1Store
 from .database_store import DatabaseStore, is_bag_database
 from .mcap_store import McapStore
-from .message_store import BagError, Messages, MessageStore, Place, join_messages
+from .message_store import BagError, Messages, MessageStore, Place, decompress, join_messages
 
 METADATA = "metadata.yaml"
 SUFFIXES = (".mcap", ".db3")
@@ -53,14 +56,14 @@ def _start(path: Path) -> bytes:
         return stream.read(16)
 
 
-def _open_file(path: Path, compressed: bool = False) -> MessageStore:
+def _open_file(path: Path) -> MessageStore:
     start = _start(path)
     if start.startswith(bag1_store.START):
         return Bag1Store(path)
     if start.startswith(mcap_store.START):
         return McapStore(path)
     if start.startswith(database_store.START):
-        return DatabaseStore(path, compressed)
+        return DatabaseStore(path)
     raise BagError(f"it holds {'nothing' if not start else 'none of the formats .bag 2.0, .mcap and .db3'}")
 
 
@@ -79,7 +82,7 @@ def _open_folder(folder: Path) -> MessageStore:
     compressed = str(stated.get("compression_mode") or "").lower() == "message"
     for name in found:
         check_regular(folder / name)
-    return JoinedStore([_open_file(folder / name, compressed) for name in found])
+    return JoinedStore([_open_file(folder / name) for name in found], compressed)
 
 
 def _read_metadata(folder: Path) -> dict[str, Any]:
@@ -97,10 +100,10 @@ def _read_metadata(folder: Path) -> dict[str, Any]:
 
 
 class JoinedStore(MessageStore):
-    """The messages of several files, as if they were one."""
+    """The messages of several files, as if they were one. compressed: whether each message is compressed with zstd."""
 
-    def __init__(self, stores: list[MessageStore]):
-        self._stores = stores
+    def __init__(self, stores: list[MessageStore], compressed: bool = False):
+        self._stores, self._compressed = stores, compressed
         self.ros1 = any(store.ros1 for store in stores)
         if self.ros1 != all(store.ros1 for store in stores):
             raise BagError("it mixes messages of ROS 1 and ROS 2")
@@ -113,4 +116,14 @@ class JoinedStore(MessageStore):
         return join_messages(parts)
 
     def read(self, place: Place, first: int | None = None) -> bytes:
-        return self._stores[place[0]].read((0, *place[1:]), first)
+        store, there = self._stores[place[0]], (0, *place[1:])
+        return decompress("zstd", store.read(there))[:first] if self._compressed else store.read(there, first)
+
+    def heads(self, messages: Messages, size: int) -> NDArray[np.uint8]:
+        if self._compressed:
+            return super().heads(messages, size)
+        found = np.zeros((len(messages), size), np.uint8)
+        for number, store in enumerate(self._stores):
+            own = messages.places[:, 0] == number
+            found[own] = store.heads(Messages(messages.times[own], messages.places[own] * (0, 1, 1)), size)
+        return found
