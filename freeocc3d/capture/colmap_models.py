@@ -1,4 +1,4 @@
-"""Finds and reads COLMAP models (cameras, images, points3D, as .bin or .txt) and their lenses.
+"""Reads COLMAP models (cameras, images, points3D, as .bin or .txt) and their lenses.
 
 Read here and not by pycolmap, whose reader takes the counts in a damaged file at their word: it loops without end, or
 takes all memory. ``rigs`` and ``frames`` of newer models are not needed, because ``images`` states each image's pose.
@@ -91,12 +91,6 @@ class ColmapModel:
         if len(ids) and (rows.max() >= len(self.point_ids) or (self.point_ids[rows] != ids).any()):
             raise KeyError("a point")
         return rows
-
-
-def colmap_folder(folder: Path) -> Path | None:
-    """The folder of the COLMAP model: ``folder`` itself, ``sparse/0``, ``sparse`` or ``0``; None if there is none."""
-    models = (folder, folder / "sparse" / "0", folder / "sparse", folder / "0")
-    return next((m for m in models if any((m / name).is_file() for name in ("images.bin", "images.txt"))), None)
 
 
 def read_colmap_model(folder: Path) -> ColmapModel:

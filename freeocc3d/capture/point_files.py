@@ -61,7 +61,7 @@ def _ascii_ply_points(path: Path, header: PlyHeader, columns: list[int]) -> NDAr
 
 
 def _xyz_points(path: Path) -> NDArray[np.float64]:
-    return _columns(read_bytes(path, _MOST_TEXT_BYTES).decode("utf-8"), [0, 1, 2])
+    return _columns(read_bytes(path, _MOST_TEXT_BYTES).decode("utf-8-sig"), [0, 1, 2])
 
 
 def _columns(text: str, columns: list[int], most: int | None = None) -> NDArray[np.float64]:

@@ -24,7 +24,8 @@ from ..core.transforms import invert, is_rigid
 from ..core.warnings import Notice
 from .base import Capture
 from .camera_files import FARTHEST, explain_no_pose, read_matrix
-from .colmap_models import colmap_folder, read_colmap_model
+from .colmap_models import read_colmap_model
+from .colmap_projects import colmap_folder
 from .nerfstudio_files import read_transforms
 from .number_files import read_number_rows
 from .numbered_files import list_folder

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -116,7 +117,12 @@ def broken_nerfstudio(folder: Path, key: str, value: object, frame: bool) -> Non
         ("fl_x", "wide", False, "'fl_x' has text instead of a number"),
         ("fl_x", None, False, "states no focal length"),
         ("k4", 0.1, False, "states k4"),
-        ("file_path", "../../elsewhere.png", True, "lies outside "),
+        (
+            "file_path",
+            "../../elsewhere.png",
+            True,
+            "Only one of the 2 images .* the first that is missing is ../../elsew",
+        ),
         ("transform_matrix", [[1, 2], [3, 4]], True, "has 2 entries instead of 4"),
         ("frames", [], False, "not a trajectory|holds 0 images"),
     ],
@@ -131,10 +137,10 @@ def test_what_nerfstudio_files_lack_is_reported(
 
 def test_an_image_that_is_missing_or_does_not_fit_its_camera_is_a_broken_frame(tmp_path: Path) -> None:
     write_nerfstudio(tmp_path, 3, depth=False)
-    (tmp_path / "images" / "frame_0.png").unlink()
     write_image(tmp_path / "images" / "frame_1.png", color_image(0, (24, 32)))
     write_image(tmp_path / "images" / "frame_2.png", color_image(2, (16, 12)))
     capture = open_capture(tmp_path)
+    (tmp_path / "images" / "frame_0.png").unlink()
     with pytest.raises(FrameError, match=r"Cannot read .*frame_0\.png"):
         capture[0]
     with pytest.raises(FrameError, match=r"frame_1\.png has 24 x 32 pixels, but its camera has 32 x 24"):
@@ -178,8 +184,136 @@ def test_damaged_models_and_cameras_that_are_not_read_are_reported(tmp_path: Pat
     write_colmap(tmp_path / "outside", 2)
     images = tmp_path / "outside" / "sparse" / "0" / "images.txt"
     images.write_text(images.read_text().replace("view1.png", "../../../view1.png"))
-    with pytest.raises(CaptureError, match="lies outside "):
+    (tmp_path / "outside" / "images" / "view1.png").rename(tmp_path / "view1.png")
+    with pytest.raises(
+        CaptureError, match=r"Only one of the 2 images that the model .* missing is \.\./\.\./\.\./view1\.png"
+    ):
         open_capture(tmp_path / "outside")
+
+
+def rewrite(file: Path, change) -> None:
+    file.write_text(change(file.read_text()))
+
+
+@pytest.mark.parametrize(
+    ("place", "images"),
+    [("colmap/sparse/0", "images"), ("colmap/sparse/0", "colmap/images"), ("sparse/3", "images"),
+     ("dense/sparse", "dense/images"), ("dense/0/sparse", "dense/0/images"), ("0", "images"), ("", "images")],
+)  # fmt: skip
+def test_models_are_found_where_programs_write_them(tmp_path: Path, place: str, images: str) -> None:
+    write_colmap(tmp_path, 3, place=place)
+    if images != "images":
+        (tmp_path / "images").rename(tmp_path / images)
+    capture = open_capture(tmp_path)
+    assert capture.format == "colmap_model"
+    np.testing.assert_array_equal(capture[2].color, color_image(2))
+    assert capture.warnings == ()
+
+
+@pytest.mark.parametrize("form", ["txt", "bin"])
+def test_the_largest_of_several_models_is_taken(tmp_path: Path, form: str) -> None:
+    for number, count in ((0, 2), (1, 5), (10, 3)):
+        write_colmap(tmp_path, count, place=f"sparse/{number}")
+        if form == "bin":
+            model = pycolmap.Reconstruction(str(tmp_path / "sparse" / str(number)))
+            for file in (tmp_path / "sparse" / str(number)).iterdir():
+                file.unlink()
+            model.write_binary(str(tmp_path / "sparse" / str(number)))
+    capture = open_capture(tmp_path)
+    assert len(capture) == 5
+    (notice,) = capture.warnings
+    assert notice.code == "models-apart"
+    assert "holds 3 models: 1 with 5 images is taken; 10 with 3, 0 with 2 are left out" in notice.text
+    assert len(read_poses(tmp_path).timestamps) == 5
+    if form == "bin":  # a damaged count does not make a model the largest
+        file = tmp_path / "sparse" / "0" / "images.bin"
+        file.write_bytes((1 << 60).to_bytes(8, "little") + file.read_bytes()[8:])
+        assert len(open_capture(tmp_path)) == 5
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda name: name.upper(),
+        lambda name: name.replace(".png", ".JPG"),
+        lambda name: "D:\\scan\\images\\" + name,
+        lambda name: "/home/me/scan/images/" + name,
+        lambda name: "left/" + name,
+    ],
+)
+def test_names_of_a_model_are_those_of_files_where_that_is_clear(tmp_path: Path, change) -> None:
+    write_colmap(tmp_path, 3)
+    rewrite(tmp_path / "sparse/0/images.txt", lambda text: re.sub(r"view\d\.png", lambda m: change(m[0]), text))
+    capture = open_capture(tmp_path)
+    assert [capture.name(i) for i in range(3)] == ["view0.png", "view1.png", "view2.png"]
+    np.testing.assert_allclose(capture.pose(2)[:3, :3], pose_matrix(2)[:3, :3], atol=1e-9)
+    assert capture.warnings == ()
+
+
+def test_names_may_have_spaces(tmp_path: Path) -> None:
+    write_colmap(tmp_path, 3)
+    for i in range(3):
+        (tmp_path / f"images/view{i}.png").rename(tmp_path / f"images/my view {i}.png")
+    rewrite(tmp_path / "sparse/0/images.txt", lambda text: text.replace("view", "my view "))
+    assert open_capture(tmp_path).name(1) == "my view 1.png"
+
+
+@pytest.mark.parametrize("form", ["colmap", "nerfstudio"])
+def test_images_that_are_listed_but_missing_are_left_out_at_opening(tmp_path: Path, form: str) -> None:
+    if form == "colmap":
+        folder, first = write_colmap(tmp_path, 6) / "images", "view0.png"
+        names = [f"view{i}.png" for i in (0, 3, 4)]
+    else:
+        folder, first = write_nerfstudio(tmp_path, 6) / "images", "images/frame_4.png"  # the list is in reverse
+        names = [f"frame_{i}.png" for i in (0, 3, 4)]
+    for name in names:
+        (folder / name).unlink()
+    capture = open_capture(tmp_path)
+    assert len(capture) == 3
+    np.testing.assert_array_equal(capture[1].color, color_image(2))
+    np.testing.assert_allclose(capture.pose(1)[:3, :3], pose_matrix(2)[:3, :3], atol=1e-9)
+    (notice,) = capture.warnings
+    assert notice.code == "images-left-out"
+    assert notice.text.startswith("3 of the 6 images that ")
+    assert f"the first is {first}" in notice.text
+    for name in names:
+        (folder / name).touch()
+    for file in folder.iterdir():
+        file.rename(folder / f"other_{file.stem}.tif")
+    with pytest.raises(CaptureError, match=r"None of the 6 images .*there is other_\w+\.tif"):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda text: text.replace("images/", "images\\\\").replace("depth/", "depth\\\\"),
+        lambda text: text.replace("images/", "C:/Users/me/scan/images/").replace("depth/", "/x/depth/"),
+        lambda text: text.replace("images/", "./images/").replace("depth/", "../scan/depth/"),
+        lambda text: "\ufeff" + text.replace(", ", ",\r\n"),
+        lambda text: text.replace("images/frame", "Images/Frame").replace(".png", ".PNG"),
+        lambda text: text.replace(".png", ""),
+    ],
+)
+def test_transforms_from_other_machines_name_files_that_are_found(tmp_path: Path, write) -> None:
+    rewrite(write_nerfstudio(tmp_path, 6) / "transforms.json", write)
+    capture = open_capture(tmp_path)
+    assert (len(capture), capture.warnings) == (6, ())
+    np.testing.assert_array_equal(capture[5].color, color_image(5))
+    np.testing.assert_allclose(capture[5].depth_m[:, 1:], 2.05, atol=1e-6)
+
+
+def test_depth_that_is_listed_but_missing_is_told(tmp_path: Path) -> None:
+    write_nerfstudio(tmp_path, 4)
+    (tmp_path / "depth" / "frame_2.png").unlink()
+    capture = open_capture(tmp_path)
+    assert not capture[2].depth_m.any()
+    assert [notice.text[:50] for notice in capture.warnings] == ["1 of the 4 depth images that transforms.json names"]
+    for i in (0, 1, 3):
+        (tmp_path / "depth" / f"frame_{i}.png").unlink()
+    with pytest.raises(CaptureError, match="None of the 4 depth images that transforms"):
+        open_capture(tmp_path)
+    assert len(open_capture(tmp_path, Options(depth=False))) == 4
 
 
 def rays(camera: pycolmap.Camera) -> NDArray[np.float64]:

@@ -6,17 +6,19 @@ Source: nerfstudio's "Data conventions".
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import CaptureError
 from ...core.types import Intrinsics
+from ...core.warnings import Notice
 from ..base import Options
 from ..camera_files import Calibration
+from ..file_finding import FileFinder, report_missing
 from ..lenses import BROWN_MODELS, PINHOLE_MODELS, Lens, lens_of
 from ..nerfstudio_files import read_transforms
 from ..point_files import read_points
@@ -48,26 +50,40 @@ class Reader(PosedImages):
         file = path / TRANSFORMS
         content = read_transforms(file)
         poses = read_trajectory(file).T_world_cam  # also checks that they are rigid
+        images, left_out = _find([frame.file_path for frame in content.frames], path, "color")
+        depths, without_depth = _find(
+            [frame.depth_file_path for frame in content.frames if options.depth], path, "depth"
+        )
         posed = []
-        for frame, T_world_cam in zip(content.frames, poses, strict=True):
-            image = resolve_inside(path, frame.file_path, file)
-            if not image.suffix:  # as in NeRF's synthetic scenes
-                image = image.with_suffix(".png")
-            depth = frame.depth_file_path if options.depth else None
-            depth_path = None if depth is None else resolve_inside(path, depth, file)
-            lens = _lens({**content.stated(), **frame.stated()}, image, file)
-            posed.append(PosedImage(image, depth_path, lens, T_world_cam))
+        for row, (frame, T_world_cam) in enumerate(zip(content.frames, poses, strict=True)):
+            if (image := images[row]) is not None:
+                lens = _lens({**content.stated(), **frame.stated()}, image, file)
+                posed.append(PosedImage(image, depths[row] if depths else None, lens, T_world_cam))
         posed.sort(key=lambda view: make_natural_key(view.image))
         comes_with_depth = any(frame.depth_file_path is not None for frame in content.frames)
         scale = options.scale
         if scale is None and not comes_with_depth and (points := content.ply_file_path):
-            scale = compute_nominal_scale(posed, _points(resolve_inside(path, points, file)))
+            scale = compute_nominal_scale(posed, _points(resolve_inside(path, points.replace("\\", "/"), file)))
         super().__init__(path, options, posed, scale)
         self.metric_poses = comes_with_depth or options.scale is not None
+        self.warnings = (*left_out, *without_depth)
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
         return (path / TRANSFORMS).is_file()
+
+
+def _find(
+    names: Sequence[str | None], path: Path, kind: Literal["color", "depth"]
+) -> tuple[list[Path | None], tuple[Notice, ...]]:
+    """The file of each name, None without one, and a warning about names without a file. Raises CaptureError."""
+    finder = FileFinder(path, kind)
+    stated = [name for name in names if name is not None]
+    files = finder.find_all(stated)
+    what = "images" if kind == "color" else "depth images"
+    notices = report_missing(stated, files, finder, TRANSFORMS, what) if len(stated) > 1 else ()
+    found = iter(files)
+    return [None if name is None else next(found) for name in names], notices
 
 
 def _points(file: Path) -> NDArray[np.float64]:

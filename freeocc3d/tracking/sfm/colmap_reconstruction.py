@@ -9,7 +9,8 @@ import numpy as np
 import pycolmap
 
 from ...capture.base import Capture
-from ...capture.colmap_models import ColmapModel, ModelCamera, ModelImage, colmap_folder, read_colmap_model
+from ...capture.colmap_models import ColmapModel, ModelCamera, ModelImage, read_colmap_model
+from ...capture.colmap_projects import colmap_folder
 from ...capture.lenses import Lens
 from ...core.errors import CaptureError, TrackingError
 from ...core.transforms import invert
