@@ -24,6 +24,7 @@ from ..base import Capture, Options
 from ..camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
 from ..image_decoding import read_color
 from ..numbered_files import list_folder
+from ..paired_folders import find_folders
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -97,7 +98,8 @@ class Reader(Capture):
     @classmethod
     def recognizes(cls, path: Path) -> bool:
         found = list_images(path)
-        return bool(found or _unreadable(path)) and not any("depth" in image.name.lower() for image in found)
+        with_depth = any("depth" in image.name.lower() for image in found) or find_folders(path) is not None
+        return bool(found or _unreadable(path)) and not with_depth
 
     def __getitem__(self, index: int) -> Frame:
         if not 0 <= index < len(self):

@@ -10,10 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import CaptureError
 from ...core.transforms import invert
 from ..base import Options
+from ..camera_discovery import find_cameras
 from ..camera_files import check_pose_files, read_intrinsics, read_pose, read_rigid
 from ..class_files import capture_class_names
+from ..image_lists import find_lists
 from ..image_pairs import ImagePairs, Pairs, pair_files
 from ..lenses import Lens
 from ..numbered_files import has_file, list_numbered
@@ -34,12 +37,18 @@ ONE_CAMERA = ("intrinsic/intrinsic.txt", "intrinsic.txt", "intrinsic.json", "cam
 """Files of a camera that color and depth share; the JSON files are Open3D's."""
 
 
+MOST_ALONE, MOST_ALONE_STATED = 0.1, 0.7
+"""Folders of which more images lack their partner are paired in other ways, such as by time; the second with
+``intrinsic/``, which few other layouts have."""
+
+
 class Reader(ImagePairs):
     """Depth is stored in millimeters, unless this makes no room of the scan. Numbers in names have no leading zeros and
     sort as numbers. ``pose/`` is optional and holds camera-to-world poses; -inf means no pose.
 
     ``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` hold the color and depth cameras (4 x 4 or 3 x 3). If
-    one is missing, it is derived from the other, provided that the images have the same aspect ratio.
+    one is missing, it is derived from the other, provided that the images have the same aspect ratio; if both are, a
+    file of another form may state the camera (see ``camera_discovery``).
     ``extrinsic_color.txt`` and ``extrinsic_depth.txt`` in the same folder map each camera to the rig. If they differ,
     depth moves to the color camera; otherwise color is resampled to the depth pixels (see ``depth_registration``). With
     ``capture.depth=false`` color stays unchanged.
@@ -64,7 +73,17 @@ class Reader(ImagePairs):
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
-        return has_file(path / "color", COLOR)
+        if not has_file(path / "color", COLOR):
+            return False
+        stated = (path / "intrinsic").is_dir()
+        if not stated and find_lists(path).usable:
+            return False
+        try:
+            color, depth = list_numbered(path / "color", COLOR), list_numbered(path / "depth", DEPTH)
+        except CaptureError:  # two files of one frame, which the constructor tells
+            return True
+        few = MOST_ALONE_STATED if stated else MOST_ALONE
+        return not depth or len(color.keys() ^ depth.keys()) <= few * len(color.keys() | depth.keys())
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         path = self._pose_files.get(self._pairs.numbers[index])
@@ -88,6 +107,8 @@ def _stated_cameras(path: Path, pairs: Pairs, with_depth: bool) -> StatedCameras
     """What the files state about the two cameras. Raises CaptureError for an unusable file."""
     color = _first(path, (*COLOR_CAMERA, *ONE_CAMERA))
     depth = _first(path, DEPTH_CAMERA) if with_depth else None
+    if color is None and depth is None:
+        return find_cameras(path, pairs.color_size, pairs.depth_size if with_depth else None).stated
     return StatedCameras(
         Lens(read_intrinsics(color).camera(pairs.color_size)) if color else None,
         Lens(read_intrinsics(depth).camera(pairs.depth_size)) if depth else None,

@@ -1,0 +1,101 @@
+"""RGB-D frames of color and depth files that lists or the names of the files pair."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import CaptureError, FrameError
+from .base import Options
+from .camera_discovery import FoundCameras, find_cameras
+from .depth_decoding import read_raw_depth
+from .frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
+from .lenses import Lens
+from .paired_folders import PairList
+from .paired_poses import assign_poses, find_pose_file, read_pose_folder, usable_pose
+from .rgbd_frames import Registration, StatedCameras, build_rig
+from .trajectory_files import read_trajectory
+
+_MIRROR = np.diag((1.0, -1.0, 1.0, 1.0))
+_SAMPLES = 3
+
+
+class PairedFrames(FileFrames):
+    """Frames of a list of pairs by one rig. Cameras and the depth unit come from files beside the images, poses from a
+    folder or a file, which is read when the first pose is requested."""
+
+    def __init__(
+        self,
+        path: Path,
+        options: Options,
+        frames: PairList,
+        usual: Lens | None = None,
+        units_per_meter: float | None = None,
+        pose_folder: Path | None = None,
+        mirrored: bool = False,
+    ):
+        """usual: the camera of color and depth, if no file states another.  units_per_meter: likewise of depth.
+        mirrored: the y axes of the poses and of their world point up in a left-handed frame, as those of ICL-NUIM."""
+        color = [pair.color for pair in frames.pairs]
+        depth = [pair.depth for pair in frames.pairs if pair.depth is not None]
+        color_size = read_first_size(color, path)
+        depth_size = read_first_depth_size(depth, path) if depth else None
+        _check_depth(depth, path)
+        found = _cameras(path, options, color_size, depth_size, usual)
+        rig, self.intrinsics_known = build_rig(found.stated, options, color_size, depth_size)
+        self.focal_stated = self.intrinsics_known
+        Registration(rig)  # raises CaptureError for a rig of too large images
+        files = [
+            FrameFiles(pair.color, pair.depth, rig, pair.time, confidence=pair.confidence) for pair in frames.pairs
+        ]
+        super().__init__(path, options, files, found.units_per_meter or units_per_meter)
+        self.warnings = frames.notices
+        self._listed, self._pose_folder, self._mirrored = frames, pose_folder, mirrored
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        """As in ``Capture``. Raises CaptureError if the poses do not fit the frames."""
+        T_world_cam = self._poses[index]
+        if T_world_cam is None or not self._mirrored:
+            return T_world_cam
+        return np.asarray(_MIRROR @ T_world_cam @ _MIRROR)
+
+    @functools.cached_property
+    def _poses(self) -> list[NDArray[np.float64] | None]:
+        if self._pose_folder is not None:
+            return read_pose_folder(self._pose_folder, self._listed)
+        file = find_pose_file(self.path)
+        if file is None:
+            return [None] * len(self)
+        return [usable_pose(T) for T in assign_poses(read_trajectory(file), self._listed)]
+
+
+def _cameras(
+    path: Path, options: Options, color_size: tuple[int, int], depth_size: tuple[int, int] | None, usual: Lens | None
+) -> FoundCameras:
+    """What files state; a given color camera replaces a file that is not usable."""
+    try:
+        found = find_cameras(path, color_size, depth_size)
+    except CaptureError:
+        if not (options.intrinsics or options.focal):
+            raise
+        return FoundCameras(StatedCameras())
+    if usual is not None and found.stated.color is None and found.stated.depth is None:
+        return FoundCameras(StatedCameras(color=usual), found.units_per_meter)
+    return found
+
+
+def _check_depth(depth: list[Path], path: Path) -> None:
+    """Raise CaptureError if the files hold no depth, such as pictures of it, according to a few of them."""
+    reason = ""
+    for row in np.unique(np.linspace(0, len(depth) - 1, min(_SAMPLES, len(depth))).astype(int)).tolist():
+        try:
+            read_raw_depth(depth[row])
+        except FrameError as error:
+            reason = reason or str(error)
+        else:
+            return
+    if reason:
+        raise CaptureError(f"The depth of {path} cannot be used: {reason}")
