@@ -7,16 +7,18 @@ color files count, and no depth file is read.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import CaptureError
+from ..core.errors import CaptureError, FrameError
 from ..core.image_files import Size
 from .base import Options
+from .depth_decoding import read_raw_depth
 from .frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
 from .image_decoding import read_classes
 from .rgbd_frames import Registration, Rig
@@ -76,11 +78,12 @@ class ImagePairs(FileFrames):
     """A capture of numbered color and depth files by one rig; a reader finds the files and the cameras."""
 
     def __init__(self, path: Path, options: Options, pairs: Pairs, rig: Rig, units_per_meter: float | None):
-        """units_per_meter: of the stored depth, unless ``options.depth_scale`` is set; None = nothing states it."""
+        """units_per_meter: of depth that is stored as integers, unless ``options.depth_scale`` is set; None = nothing
+        states it."""
         self._pairs = pairs
         numbered = enumerate(zip(pairs.color, pairs.depth, strict=True))
         frames = [FrameFiles(color, depth, rig, float(row)) for row, (color, depth) in numbered]
-        super().__init__(path, options, frames, units_per_meter)
+        super().__init__(path, options, frames, None if _holds_floats(pairs.depth) else units_per_meter)
         Registration(rig)  # raises CaptureError for a rig of too large images
 
     def _class_image(self, index: int, path: Path | None) -> NDArray[np.uint8] | None:
@@ -88,3 +91,15 @@ class ImagePairs(FileFrames):
         if path is None or not self.classes:
             return None
         return self._registered(index).classes(read_classes(path, len(self.classes), self._pairs.color_size))
+
+
+def _holds_floats(depth: Sequence[Path | None]) -> bool:
+    """Whether the first readable depth file holds floats, which have a unit of their own."""
+    for path in depth:
+        if path is None:
+            continue
+        if path.suffix.lower() in (".png", ".pgm"):
+            return False
+        with contextlib.suppress(FrameError):
+            return bool(read_raw_depth(path).dtype.kind == "f")
+    return False

@@ -33,7 +33,7 @@ from ..rgbd_frames import Rig
 REQUIRES: tuple[str, ...] = ()
 
 COLOR = r"frame(\d+)\.(?:png|jpe?g)"
-DEPTH = r"depth(\d+)\.png"
+DEPTH = r"depth(\d+)\.(?:png|tiff?|pgm|pfm|exr|np[yz])"
 CLASSES = r"semantic_class_(\d+)\.png"
 
 UNITS_PER_METER = 6553.5

@@ -27,7 +27,10 @@ REQUIRES: tuple[str, ...] = ()
 
 COLOR = r"frame-(\d+)\.color\.(?:png|jpe?g)"
 POSE = r"frame-(\d+)\.pose\.txt"
-DEPTH = r"frame-(\d+)\.depth\.png"
+DEPTH = r"frame-(\d+)\.depth\.(?:png|tiff?|pgm|pfm|exr|np[yz])"
+
+BUNDLEFUSION = r"_?info\.txt"
+"""A file of the format ``bundlefusion``, which has the same names of images."""
 
 KINECT = Calibration((585.0, 585.0, 320.0, 240.0), (640, 480), "the Kinect calibration of 7-Scenes")
 """The calibration on the data set's page; a camera-intrinsics.txt in the folder overrides it."""
@@ -54,7 +57,7 @@ class Reader(ImagePairs):
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
-        return has_file(path, COLOR)
+        return has_file(path, COLOR) and not has_file(path, BUNDLEFUSION)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         path = self._pose_files.get(self._pairs.numbers[index])
