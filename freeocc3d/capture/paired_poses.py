@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import CaptureError
 from ..core.transforms import quats_to_rotations, rotations_to_quats
-from .camera_files import is_pose, read_pose
+from .camera_files import check_pose_files, is_pose, read_pose
 from .name_matching import SAME_TIME_S, match_names
 from .numbered_files import list_folder
 from .paired_folders import PairList, list_images
@@ -21,6 +21,7 @@ MOST_BETWEEN_S = 0.1
 """Poses are interpolated between neighbors that are both within this many seconds."""
 
 _EXACT_S = 1e-6
+_MOST_POSES = 1_000_000
 _POSE_FILES = tuple(
     re.compile(pattern, re.IGNORECASE)
     for pattern in (
@@ -51,6 +52,7 @@ def read_pose_folder(folder: Path, frames: PairList) -> list[NDArray[np.float64]
     if not found.first:
         raise CaptureError(f"No pose of {folder} has the number of a color image: the first is {names[0]}.")
     files = dict(zip(found.first, found.second, strict=True))
+    check_pose_files([folder / names[row] for row in found.second], str(folder))
     return [read_pose(folder / names[files[row]]) if row in files else None for row in range(len(own))]
 
 
@@ -60,27 +62,30 @@ def assign_poses(poses: PoseFile, frames: PairList) -> NDArray[np.float64]:
     if poses.names:
         found = match_names([pair.color.name for pair in frames.pairs], poses.names, by_time=False)
         return _taken(poses.T_world_cam, dict(zip(found.first, found.second, strict=True)), len(frames.pairs))
-    if poses.timestamps is not None:
-        if frames.has_times:
-            T = interpolate_poses(
-                poses.timestamps, poses.T_world_cam, np.array([pair.time for pair in frames.pairs])
-            )  # fmt: skip
-        else:
-            rows = {float(time): row for row, time in enumerate(poses.timestamps)}
-            own = {
-                i: rows[float(pair.number)] for i, pair in enumerate(frames.pairs)
-                if pair.number is not None and float(pair.number) in rows
-            }  # fmt: skip
-            T = _taken(poses.T_world_cam, own, len(frames.pairs))
+    T_world_cam = poses.T_world_cam
+    if poses.timestamps is not None and frames.has_times:
+        times = np.array([pair.time for pair in frames.pairs])
+        T = interpolate_poses(poses.timestamps, T_world_cam, times)
         if np.isfinite(T).any():
             return T
-    rows_by_order = _rows_in_order(len(poses.T_world_cam), frames)
+    keys = poses.timestamps if poses.numbers is None else poses.numbers
+    if keys is not None:
+        rows = {float(key): row for row, key in enumerate(keys.tolist())}
+        numbers = [pair.number for pair in frames.pairs]
+        own = {i: rows[number] for i, number in enumerate(numbers) if number is not None and number in rows}
+        if own and (poses.numbers is None or len(own) == len(numbers)):
+            return _taken(T_world_cam, own, len(frames.pairs))
+    if poses.numbers is not None and (largest := int(poses.numbers.max())) < _MOST_POSES and poses.numbers.min() >= 0:
+        T_world_cam = _taken(
+            T_world_cam, dict(zip(poses.numbers.tolist(), range(largest + 1), strict=False)), largest + 1
+        )
+    rows_by_order = _rows_in_order(len(T_world_cam), frames)
     if rows_by_order is None:
         raise CaptureError(
-            f"{poses.path} holds {len(poses.T_world_cam)} poses for {len(frames.pairs)} frames, and neither their "
+            f"{poses.path} holds {len(T_world_cam)} poses for {len(frames.pairs)} frames, and neither their "
             "times nor their numbers agree: correct or remove it."
         )
-    return _taken(poses.T_world_cam, dict(enumerate(rows_by_order)), len(frames.pairs))
+    return _taken(T_world_cam, dict(enumerate(rows_by_order)), len(frames.pairs))
 
 
 def interpolate_poses(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,11 @@ from numpy.typing import NDArray
 from ...core.errors import CaptureError
 from ..base import Options
 from ..camera_documents import CameraDocument, read_cameras
-from ..camera_files import read_pose
+from ..camera_files import check_pose_files, read_pose
 from ..image_pairs import ImagePairs, pair_files
 from ..numbered_files import has_file, list_numbered
 from ..rgbd_frames import StatedCameras, build_rig
-from .seven_scenes import COLOR, DEPTH
+from .seven_scenes import COLOR, DEPTH, POSE
 
 REQUIRES: tuple[str, ...] = ()
 
@@ -38,6 +39,7 @@ class Reader(ImagePairs):
         folder = _find_folder(path)
         if folder is None:
             raise CaptureError(f"{path} holds no images of this format beside an info.txt: expected {self.layout}.")
+        self._folder = folder
         pairs = pair_files(list_numbered(folder, COLOR), list_numbered(folder, DEPTH), folder, options)
         document = _read_info(path, folder, options)
         stated = StatedCameras(
@@ -56,9 +58,14 @@ class Reader(ImagePairs):
         return _find_folder(path) is not None
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
-        image = self._pairs.color[index] or self._pairs.depth[index]
-        assert image is not None  # a frame has at least one of the two
-        return read_pose(image.with_name(f"{image.name.split('.', 1)[0]}.pose.txt"))
+        path = self._pose_files.get(self._pairs.numbers[index])
+        return None if path is None else read_pose(path)
+
+    @functools.cached_property
+    def _pose_files(self) -> dict[int, Path]:
+        files = list_numbered(self._folder, POSE)
+        check_pose_files(list(files.values()), str(self._folder))
+        return files
 
 
 def _find_folder(path: Path) -> Path | None:
