@@ -36,12 +36,15 @@ _LEAST_PAIRS = 6
 _OFF_SHARE, _OFF_M = 0.3, 0.04
 """A predicted motion agrees if it differs from the measured one by less than this share of it, or by fewer meters."""
 
-_RIGHT, _EXPLAINED, _WRONG = 0.5, 0.7, 0.25
+_RIGHT, _EXPLAINED, _WRONG = 0.7, 0.7, 0.25
 """Shares of agreeing pairs: with more than the first, poses are right; a change explains them with more than the
 second; without such a change, they are wrong with fewer than the third."""
 
-_GAIN = 0.3
+_GAIN = 0.2
 """Smallest increase of the share of agreeing pairs by a change that explains wrong poses."""
+
+_CLEARLY = 0.6
+"""A less simple change must bring the median difference below this share of that of a simpler one."""
 
 _USUAL_UNITS = {0.01: "centimeters", 0.001: "millimeters", 0.0254: "inches", 0.3048: "feet", 1000.0: "kilometers"}
 _SAME_UNIT = 0.15
@@ -103,21 +106,21 @@ def compare_poses(T_world_cam: Poses, pairs: Sequence[MeasuredPair]) -> PoseAgre
     if motions is None:
         return PoseAgreement(0, 0)
     total, given = motions.count, T_world_cam
-    agreeing = motions.agreeing(motions.predicted(given))
+    agreeing = int((motions.errors(motions.predicted(given)) < 1).sum())
     if agreeing >= _RIGHT * total:
         for unit, _ in _in_other_units(motions.predicted(given), motions):
             if _has_other_unit(motions.predicted(given), motions):
                 return PoseAgreement(total, 0, _sentence("", unit), agreeing)
         return PoseAgreement(total, agreeing)
-    best = (_EXPLAINED * total, "")
+    best, least = PoseAgreement(total, agreeing), np.inf
     for words, changed in _changes(given, motions):
         for unit, scaled in ((1.0, changed), *_in_other_units(changed, motions)):
-            explained = motions.agreeing(scaled)
-            if explained > best[0] and explained >= agreeing + _GAIN * total:
-                best = explained, _sentence(words, unit)
-        if best[0] >= 0.95 * total:
-            break
-    return PoseAgreement(total, agreeing, best[1], int(best[0]) if best[1] else 0)
+            errors = motions.errors(scaled)
+            explained, error = int((errors < 1).sum()), float(np.median(errors))
+            enough = explained >= max(_EXPLAINED * total, agreeing + _GAIN * total, best.explained)
+            if enough and error < _CLEARLY * least:
+                best, least = PoseAgreement(total, agreeing, _sentence(words, unit), explained), error
+    return best
 
 
 @dataclass(frozen=True)
@@ -138,11 +141,11 @@ class _Motions:
         """(K, 4, 4) T_target_source by the poses."""
         return np.asarray(invert(T_world_cam[self.rows[:, 1]]) @ T_world_cam[self.rows[:, 0]])
 
-    def agreeing(self, predicted: Poses) -> int:
-        """How many of (K, 4, 4) predicted motions agree with the measured ones."""
+    def errors(self, predicted: Poses) -> NDArray[np.float64]:
+        """(K,) differences of (K, 4, 4) predicted motions from the measured ones; those below 1 agree."""
         off = _apply(predicted, self.points) - _apply(self.T, self.points)
-        error = np.sqrt((off**2).sum(axis=2).mean(axis=1))
-        return int((error < np.maximum(_OFF_SHARE * self.moved, _OFF_M)).sum())
+        off_m = np.sqrt((off**2).sum(axis=2).mean(axis=1))
+        return np.asarray(off_m / np.maximum(_OFF_SHARE * self.moved, _OFF_M))
 
 
 def _apply(T: Poses, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -151,8 +154,8 @@ def _apply(T: Poses, points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _comparable(T_world_cam: Poses, pairs: Sequence[MeasuredPair]) -> _Motions | None:
     """The pairs with poses and enough motion; None if there are too few."""
-    has_pose = np.isfinite(T_world_cam).all(axis=(1, 2))
-    posed = [pair for pair in pairs if has_pose[pair.source_index] and has_pose[pair.target_index]]
+    known = set(np.flatnonzero(np.isfinite(T_world_cam).all(axis=(1, 2))).tolist())
+    posed = [pair for pair in pairs if {pair.source_index, pair.target_index} <= known]
     sampled = [(pair, points) for pair in posed if len(points := _sample_points(pair)) == _POINTS]
     if not sampled:
         return None

@@ -128,6 +128,12 @@ MEASUREMENTS = {
         table="fusion_of_mistakes:tabulate_fusion",
         map_of=TRUE_CLASSES,
     ),
+    "pose_check": Measurement(
+        "given poses against depth: right ones that pass, distorted ones that are refused with their cause",
+        "capture",
+        "pose_mistakes:measure_pose_check",
+        table="pose_mistakes:tabulate_pose_check",
+    ),
     "damaged_input": Measurement(
         "10,000 damaged inputs, runs that are killed, torn checkpoints: how they end (a quarter of an hour)",
         "nothing",
