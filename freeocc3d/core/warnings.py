@@ -12,6 +12,7 @@ Code = Literal[
     "depth-scale-doubtful",
     "poses-doubtful",
     "intrinsics-unknown",
+    "focal-estimated",
     "color-focal-corrected",
     "models-apart",
     "broken-frames",

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..capture import Capture
+from ..core.image_files import Size
 from ..core.types import Trajectory
 from ..core.warnings import Notice
 from ..editing import adaptive_voxels
@@ -16,6 +17,10 @@ from ..settings.config import Settings
 from .tracking_choice import AUTO
 
 _FEW_TRACKED = 0.5
+
+_FOCALS = {"Kinect or PrimeSense": 0.82, "RealSense D400": 0.96, "iPhone": 0.78}
+_WIDE_FOCALS = {"RealSense D400": 0.72, "Azure Kinect": 0.48, "iPhone": 0.75}
+"""Focal lengths of usual sensors over the width, for images of 4:3 and of 16:9."""
 
 
 def check(settings: Settings) -> None:
@@ -43,6 +48,26 @@ def warn_of_camera(capture: Capture) -> Notice:
         "intrinsics-unknown",
         f"The camera of {capture.path} is unknown: its focal length is {focal}, and an error in it bends the map. "
         "Give capture.intrinsics if you know them.",
+    )
+
+
+def warn_of_estimated_focal(capture: Capture, focal_px: float, uncertainty: float) -> Notice:
+    """Warns that the scan itself told the focal length, ``focal_px`` in pixels of the stored color images."""
+    return Notice(
+        "focal-estimated",
+        f"Nothing states the camera of {capture.path}. The scan shows a focal length of {focal_px:.0f} pixels "
+        f"(± {max(uncertainty, 0.01):.0%}), which is used: give --focal if you know it better.",
+    )
+
+
+def explain_unknown_camera(capture: Capture, size: Size) -> str:
+    """Says that nothing tells the focal length, and what to give. size: of the stored color images."""
+    width = max(size)
+    wide = max(size) > 1.5 * min(size)
+    usual = ", ".join(f"{name} {ratio * width:.0f}" for name, ratio in (_WIDE_FOCALS if wide else _FOCALS).items())
+    return (
+        f"Nothing states the camera of {capture.path}, and the scan shows too little to estimate its focal length: "
+        f"give --focal with the focal length of its color images in pixels (usual for {size[0]} x {size[1]}: {usual})."
     )
 
 

@@ -11,16 +11,17 @@ from typing import Any
 from .. import __version__
 from ..capture import Capture, open_capture, select_frames, settle_depth_unit
 from ..capture.focal_correction import Reregistered
-from ..core.errors import Interrupted, MapError, TrackingError, is_interrupt
+from ..capture.rgbd_frames import RgbdFrames
+from ..core.errors import CaptureError, Interrupted, MapError, TrackingError, is_interrupt
 from ..core.progress import Progress
 from ..language.encoders.base import Encoder
 from ..query.scan_map import Map, load_map
 from ..settings import config
 from ..settings.config import Settings
 from ..storage.work_folder import WorkFolder
-from ..tracking.rgbd import focal_calibration
+from ..tracking.rgbd import focal_calibration, self_calibration
 from ..tracking.rgbd.measured_pairs import MeasuredPair, measure_pairs
-from .checks import check, warn_of_color_focal
+from .checks import check, explain_unknown_camera, warn_of_color_focal, warn_of_estimated_focal
 from .mapper import Mapper
 from .run_stages import STAGES, Run
 from .saving import absolute
@@ -52,6 +53,7 @@ def reconstruct(
         opened = _open(capture, resolved, progress, work)
         resolved, reason = choose_tracker(resolved, opened)
         progress.note(reason)
+        opened, resolved = _know_camera(opened, resolved, progress, work)
         work.begin([absolute(opened.path), len(opened), __version__], resolved, progress)
         if not work.complete:
             with work.timed("calibration"):
@@ -94,6 +96,28 @@ def _open(capture: str | Path, settings: Settings, progress: Progress, work: Wor
     warning = settle_depth_unit(opened)
     work.warn(progress, *opened.warnings, *([warning] if warning else []))
     return opened
+
+
+def _know_camera(
+    capture: Capture, settings: Settings, progress: Progress, work: WorkFolder
+) -> tuple[Capture, Settings]:
+    """The capture with depth, and the settings, with a focal length that the scan shows if nothing states it. Raises
+    CaptureError if the scan does not show it."""
+    if not isinstance(capture, RgbdFrames) or not capture.has_depth or capture.intrinsics_known:
+        return capture, settings
+    progress.stage("self-calibration")
+    frames = select_frames(capture)
+    stored, guess = capture.rig(frames[0]).color.camera, capture[frames[0]].intrinsics
+    found = self_calibration.estimate_focal(capture, frames)
+    if found is None or not found.sure:
+        raise CaptureError(explain_unknown_camera(capture, (stored.width, stored.height)))
+    focal_px = round(stored.fx * found.focal_px / guess.fx, 1)
+    work.warn(progress, warn_of_estimated_focal(capture, focal_px, found.uncertainty))
+    settings = settings.changed("capture", focal=focal_px)
+    known = open_capture(capture.path, settings.capture, settings.backends.get("capture"))
+    assert isinstance(known, RgbdFrames)
+    known.units_per_meter = capture.units_per_meter
+    return known, settings
 
 
 def _calibrate(

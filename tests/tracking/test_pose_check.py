@@ -108,6 +108,12 @@ def test_noise_and_drift_as_trackers_have_them_pass(room) -> None:
     assert compare_poses(noisy, pairs).right
 
 
+@pytest.mark.parametrize(("factor", "right"), [(1.1, True), (1 / 1.1, True), (1.25, False), (0.8, False)])
+def test_a_unit_that_is_off_is_noticed_where_turns_dominate(room, factor: float, right: bool) -> None:
+    poses, pairs = room
+    assert compare_poses(scaled(factor)(poses), pairs).right == right
+
+
 def test_poses_of_another_scan_are_refused_without_a_cause(room) -> None:
     poses, pairs = room
     rng = np.random.default_rng(1)
