@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,9 @@ FOCAL_35MM = "focal_length.35mm_equivalent"
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg,asf,flv,ogg,h264,hevc"
 """FFmpeg's names of the formats that are opened. Others render text, or open files and addresses that they name."""
 
+RAW_STREAMS = ("h264", "hevc")
+"""Formats that are only the packets of a codec of the same name, without times."""
+
 MOST_PIXELS = 1 << 26
 MOST_BYTES = 2304 << 20
 """Largest memory of the process that decodes: enough for 8K video, less than 2 GB of it used."""
@@ -43,6 +47,7 @@ BEAT_S = 1.0
 _MOST_THREADS = 8
 _LEAST_FRAMES = 2
 _NEVER = -(1 << 62)
+_SLOWEST, _FASTEST = 1, 240  # frames a second; some encoders state their clock instead
 
 
 _OPEN_OPTIONS = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
@@ -53,6 +58,9 @@ class VideoDecoder:
 
     beat: is called often.  keys: (N,) int64 presentation times in units of ``time_base``, ascending.  upright_size:
     size of the frames with square pixels, after rotation.
+
+    Some streams do not say when a frame is shown: raw ones, and H.264 in AVI, which states the order of decoding. Their
+    frames are counted as they come out of the decoder, which is the order of display, always from the first one.
     """
 
     def __init__(self, path: Path, beat: Callable[[], None] = lambda: None):
@@ -66,9 +74,9 @@ class VideoDecoder:
                 "off, or an image? Give images as a folder of many."
             )
         self.keys, self._starts = keys, starts
-        self.time_base = self._stream.time_base
-        self._frames: Iterator[Any] = iter(())
-        self._last: Any = None
+        self.time_base = _frame_time(self._stream) if self._raw else self._stream.time_base
+        self._frames: Iterator[tuple[int, Any]] = iter(())
+        self._last: tuple[int, Any] | None = None
         first = self._first_frame()
         self._turns = round(first.rotation / 90) % 4
         aspect = self._stream.sample_aspect_ratio
@@ -92,7 +100,7 @@ class VideoDecoder:
         import av
 
         try:
-            frame = self._frame(int(self.keys[index]))
+            frame = self._frame(index if self._counted else int(self.keys[index]))
         except (av.error.FFmpegError, StopIteration) as error:
             self._last = None
             said = "the file ends before it" if isinstance(error, StopIteration) else str(error)
@@ -104,39 +112,41 @@ class VideoDecoder:
         return np.ascontiguousarray(np.rot90(color, self._turns))
 
     def _frame(self, key: int) -> Any:
-        """The frame at that time; None if the file lists it but it does not decode."""
-        if self._last is not None and _key(self._last) == key:
-            return self._last
+        """The frame at that time, or of that number; None if the file lists it but it does not decode."""
+        if self._last is not None and self._last[0] == key:
+            return self._last[1]
         start = self._starts[max(int(np.searchsorted(self._starts, key, side="right")) - 1, 0)]
-        if self._last is None or not start <= _key(self._last) < key:
+        if self._last is None or not start <= self._last[0] < key:
             self._seek(int(start))
-        for frame in self._frames:
-            self._last = frame
-            if _key(frame) >= key:
-                return frame if _key(frame) == key else None
+        for found, frame in self._frames:
+            self._last = found, frame
+            if found >= key:
+                return frame if found == key else None
         raise StopIteration
 
     def _seek(self, start: int) -> None:
         """Go to a key frame, or to the beginning if the container jumps past the requested time."""
-        self._last = None
-        self._container.seek(start, stream=self._stream)
-        frames = self._decoded()
-        first = next(frames, None)
-        if first is None or _key(first) > start:
+        self._last = first = None
+        if not self._counted:
+            self._container.seek(start, stream=self._stream)
+            frames = self._decoded()
+            first = next(frames, None)
+        if first is None or first[0] > start:
             self._open()
             frames = self._decoded()
             first = next(frames)
         self._frames = itertools.chain((first,), frames)
 
-    def _decoded(self) -> Iterator[Any]:
-        """Decode frames from the current position; skip packets that do not decode."""
+    def _decoded(self) -> Iterator[tuple[int, Any]]:
+        """Decode frames, with their times or numbers, from the current position; skip packets that do not decode."""
         import av
 
+        numbers = itertools.count()
         for packet in self._packets():
             with contextlib.suppress(av.error.InvalidDataError):
                 for frame in packet.decode():
                     self._beat()
-                    yield frame
+                    yield next(numbers) if self._counted else _key(frame), frame
 
     def _packets(self) -> Iterator[Any]:
         """The packets from the current position. A damaged index may list the same bytes again and again: once the
@@ -156,7 +166,7 @@ class VideoDecoder:
         try:
             self._seek(int(self._starts[0]))
             self._last = next(self._frames)
-            return self._last
+            return self._last[1]
         except (av.error.FFmpegError, StopIteration) as error:
             raise CaptureError(
                 f"No frame of {self.path} can be decoded ({self._stream.codec_context.name}). Convert the video to "
@@ -181,6 +191,9 @@ class VideoDecoder:
                 f"{self.path} holds no video that this build of FFmpeg can decode: convert it to H.264 in mp4."
             )
         self._stream = pictured[0]
+        self._raw = self._container.format.name in RAW_STREAMS
+        in_avi = self._container.format.name == "avi" and self._stream.codec_context.name in RAW_STREAMS
+        self._counted = self._raw or (in_avi and self._stream.codec_context.has_b_frames)
         self._stream.thread_type = "AUTO"
         self._stream.codec_context.thread_count = min(os.cpu_count() or 1, _MOST_THREADS)
         self._stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
@@ -189,17 +202,26 @@ class VideoDecoder:
         """Times of all frames and of the key frames, ascending. Of a cut-off file, the existing part is used."""
         import av
 
-        keys, starts = [], []
+        keys, starts = list[int](), list[int]()
         try:
             for packet in self._packets():
-                if packet.size and not packet.is_discard and _key(packet) > _NEVER:
-                    keys.append(_key(packet))
+                key = len(keys) if self._raw else _key(packet)
+                if packet.size and not packet.is_discard and key > _NEVER:
+                    keys.append(key)
                     if packet.is_keyframe:
-                        starts.append(_key(packet))
+                        starts.append(key)
         except av.error.FFmpegError:
             pass
         found = np.unique(np.array(keys, np.int64))
+        if self._counted:
+            return found - found[:1], np.zeros(1, np.int64)
         return found, np.unique(np.array(starts or keys[:1], np.int64))
+
+
+def _frame_time(stream: Any) -> Fraction:
+    """Seconds per frame of a raw stream, by the rate that it states; 1 if it states none."""
+    rate = stream.codec_context.framerate
+    return 1 / Fraction(rate) if rate and _SLOWEST <= rate <= _FASTEST else Fraction(1)
 
 
 def _key(timed: Any) -> int:

@@ -16,6 +16,7 @@ from freeocc3d.capture.camera_files import DIAGONAL_35MM, USUAL_FOCAL
 from freeocc3d.capture.video_decoding import VideoDecoder
 from freeocc3d.core.errors import CaptureError, ConfigError, FrameError
 
+OPEN = "open-gop=1:b-pyramid=normal:bframes=3:b-adapt=0"
 VARIABLE_MS = np.cumsum([0] + [20 + 13 * (n % 4) + 100 * (n == 30) for n in range(59)]).tolist()
 
 
@@ -28,6 +29,11 @@ VARIABLE_MS = np.cumsum([0] + [20 + 13 * (n % 4) + 100 * (n == 30) for n in rang
         ("scan.webm", "libvpx-vp9"),
         ("scan.avi", "mpeg4"),
         ("scan.avi", "mjpeg"),
+        ("scan.avi", "libx264"),
+        ("scan.mpg", "mpeg2video"),
+        ("scan.h264", "libx264"),
+        ("scan.hevc", "libx265"),
+        ("scan", "libx264"),
         ("scan.ts", "libx264"),
     ],
 )
@@ -45,6 +51,27 @@ def test_every_frame_is_the_one_of_its_index_in_any_order(tmp_path: Path, name: 
     assert frame.depth_m.shape == frame.color.shape[:2]
     assert not capture.has_depth
     assert capture.raw_depth(0) is None
+
+
+@pytest.mark.parametrize(("codec", "options"), [("mpeg4", {"bf": "2"}), ("libx264", {"bf": "3", "x264-params": OPEN})])
+@pytest.mark.parametrize("suffix", ["avi", "mkv"])
+def test_frames_that_are_decoded_in_another_order_have_the_index_of_their_display(
+    tmp_path: Path, codec: str, options: dict[str, str], suffix: str
+) -> None:
+    capture = open_capture(write_video(tmp_path / f"scan.{suffix}", codec=codec, options=options))
+    np.testing.assert_allclose(np.diff(capture.timestamps), 1 / 30, atol=2e-3)
+    for index in [*range(60), 7, 3, 40, 39]:
+        assert number_of(capture[index].color) == index
+
+
+def test_a_raw_stream_without_a_rate_counts_its_frames(tmp_path: Path) -> None:
+    options = {"x265-params": "vui-timing-info=0:log-level=none"}
+    path = write_video(tmp_path / "scan.265", codec="libx265", options=options, form="hevc")
+    capture = open_capture(path)
+    np.testing.assert_array_equal(np.diff(capture.timestamps), np.diff(capture.timestamps)[0])
+    assert number_of(capture[59].color) == 59
+    truncate(path)
+    assert number_of(open_capture(path)[20].color) == 20
 
 
 def test_times_of_a_variable_rate_are_the_files_own(tmp_path: Path) -> None:

@@ -44,19 +44,24 @@ def write_video(
     size: tuple[int, int] = SIZE,
     gop: int = 12,
     tags: dict[str, str] | None = None,
+    options: dict[str, str] | None = None,
+    form: str | None = None,
 ) -> Path:
     """times_ms: when each frame is shown, by default 30 times a second.  rotation: degrees, counterclockwise, by which
-    a player has to turn the frames; what is coded is turned the other way, so that played frames are upright."""
+    a player has to turn the frames; what is coded is turned the other way, so that played frames are upright.
+    options: of the encoder.  form: FFmpeg's name of the container, by default that of the suffix; H.264 alone without
+    one."""
     times = [round(1000 * n / 30) for n in range(count)] if times_ms is None else times_ms
     turns = rotation // 90 % 4
-    options = {"movflags": "use_metadata_tags"} if tags else {}
-    with av.open(str(path), "w", options=options) as container:
+    form = form or (None if path.suffix else "h264")
+    muxing = {"movflags": "use_metadata_tags"} if tags else {}
+    with av.open(str(path), "w", format=form, options=muxing) as container:
         container.metadata.update(tags or {})
-        stream = container.add_stream(codec, rate=30)
+        stream = container.add_stream(codec, rate=30, options=options or {})
         stream.width, stream.height = size if turns % 2 == 0 else size[::-1]
         stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-        # AVI counts frames, at one rate.
-        unit = Fraction(1, 30) if path.suffix == ".avi" else Fraction(1, 1000)
+        counts = form in ("h264", "hevc") or path.suffix in (".avi", ".mpg", ".h264", ".hevc")  # frames, at one rate
+        unit = Fraction(1, 30) if counts else Fraction(1, 1000)
         stream.time_base = stream.codec_context.time_base = unit
         stream.gop_size = gop
         stream.codec_context.bit_rate = 2_000_000
@@ -65,7 +70,7 @@ def write_video(
         for number, time in enumerate(times):
             image = np.ascontiguousarray(np.rot90(numbered_image(number, size), -turns))
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-            frame.pts, frame.time_base = (number if path.suffix == ".avi" else time), unit
+            frame.pts, frame.time_base = (number if counts else time), unit
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     return path

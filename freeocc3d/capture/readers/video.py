@@ -2,7 +2,8 @@
 
 Opening reads the whole file once, without decoding, to know the time of every frame. Decoding a frame continues from
 the decoder's position or starts at the last key frame before the frame, whichever is nearer. So reading in ascending
-order, with any stride, passes through the file once. A process of its own decodes (see ``video_process``).
+order, with any stride, passes through the file once. Raw H.264 and H.265 streams have the rate that they state, else
+one frame a second, and are read from their start. A process of its own decodes (see ``video_process``).
 """
 
 from __future__ import annotations
