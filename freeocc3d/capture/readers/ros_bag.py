@@ -19,15 +19,16 @@ from ...core.warnings import Notice
 from ...settings.typed_options import TypedOptions
 from .. import base
 from ..depth_decoding import METERS, MILLIMETERS, RawDepth
+from ..file_bytes import DamagedFile
 from ..lenses import Lens
 from ..rgbd_frames import Registration, RgbdFrames, Rig, StatedCameras, build_rig
 from ..ros import stores
 from ..ros.camera_messages import FrameTree, lens_of_info, transform_matrix
 from ..ros.image_messages import decode_color, decode_depth, describe_image
-from ..ros.message_store import BagError, Messages, Place
+from ..ros.message_store import Messages, Place
 from ..ros.message_types import deserialize
 from ..ros.topics import IMAGE_TYPES, INFO_TYPE, TF_TYPES, ImageTopic, choose_color, choose_depth, find_info
-from ..time_pairs import median_interval, pair_nearest
+from ..time_pairs import pair_streams
 
 REQUIRES: tuple[str, ...] = ("rosbags",)
 
@@ -35,7 +36,6 @@ _STAMP = np.dtype([("before", "V4"), ("seconds", "<u4"), ("nanoseconds", "<u4")]
 """First bytes of a message with a header: its number (ROS 1) or CDR's form (ROS 2), and its time."""
 _BIG_ENDIAN_FORMS = (0, 2)
 _TRIES, _MOST_TRANSFORMS = 5, 1000
-_SLACK = 1.1  # of half an interval, for jitter
 
 _REALSENSE_UNITS = re.compile(r"/device_\d+/sensor_\d+/option/Depth[ _]Units/value")
 _REALSENSE_PLACE = "/tf/0"
@@ -97,22 +97,22 @@ class Reader(RgbdFrames):
         what = f"Message {row} of {topic.name} in {self.path}"
         try:
             return self._message(topic.name, messages.place(row)), what
-        except (BagError, OSError) as error:
+        except (DamagedFile, OSError) as error:
             raise FrameError(f"{what} cannot be read: {error}.") from error
 
     def _find(self, topic: str) -> Messages:
         try:
             return self._store.find(topic)
-        except (BagError, OSError) as error:
+        except (DamagedFile, OSError) as error:
             raise CaptureError(f"{self._source} is not a readable ROS bag: {error}.") from error
 
     def _message(self, topic: str, place: Place) -> Any:
-        """A message. Raises BagError, OSError."""
+        """A message. Raises DamagedFile, OSError."""
         data = self._store.read(place)
         try:
             return deserialize(data, self._store.topics[topic], self._store.ros1)
         except Exception as error:  # the generated code checks nothing
-            raise BagError("it is damaged: the message does not fit its type") from error
+            raise DamagedFile("it is damaged: the message does not fit its type") from error
 
     def _some(self, topic: str, most: int) -> list[Any]:
         """The first messages of a topic, without those that are damaged."""
@@ -120,7 +120,7 @@ class Reader(RgbdFrames):
         for row in range(min(most, len(messages))):
             try:
                 found.append(self._message(topic, messages.place(row)))
-            except (BagError, OSError):
+            except (DamagedFile, OSError):
                 continue
         return found
 
@@ -143,30 +143,16 @@ class Reader(RgbdFrames):
         if depth is None:
             return a, np.column_stack((order_a, order_a)), ()
         b, order_b = _ascending(self._stamps(depth))
-        within = 0.5 * _SLACK * min(median_interval(a), median_interval(b))
-        pairs = pair_nearest(a, b, within)
-        if not len(pairs):  # the stamps may be of two clocks: recording them had one
-            pairs = pair_nearest(color.times[order_a] * 1e-9, depth.times[order_b] * 1e-9, within)
-        if not len(pairs):
-            raise CaptureError(
-                f"{path} holds {len(a)} color and {len(b)} depth images, but none of the two are of the same time: map "
-                "color only with capture.depth=false, or choose other topics with capture.ros_bag.depth_topic."
-            )
+        received = color.times[order_a] * 1e-9, depth.times[order_b] * 1e-9
+        pairs, notices = pair_streams(path, (a, b), received)
         rows = np.column_stack((order_a[pairs[:, 0]], order_b[pairs[:, 1]]))
-        left = len(color) - len(pairs), len(depth) - len(pairs)
-        if not any(left):
-            return a[pairs[:, 0]], rows, ()
-        text = (
-            f"{path} holds {len(color)} color and {len(depth)} depth images; {left[0]} and {left[1]} of them have no "
-            f"partner within {within * 1e3:.0f} ms and are left out."
-        )
-        return a[pairs[:, 0]], rows, (Notice("images-left-out", text),)
+        return a[pairs[:, 0]], rows, notices
 
     def _stamps(self, messages: Messages) -> NDArray[np.float64]:
         """(N,) seconds of messages, from their headers; the time of recording where a header has none."""
         try:
             heads = np.ascontiguousarray(self._store.heads(messages, _STAMP.itemsize))
-        except (BagError, OSError) as error:
+        except (DamagedFile, OSError) as error:
             raise CaptureError(f"{self._source} is not a readable ROS bag: {error}.") from error
         stamps = heads.view(_STAMP)[:, 0]
         if not self._store.ros1 and len(heads) and heads[0, 1] in _BIG_ENDIAN_FORMS:

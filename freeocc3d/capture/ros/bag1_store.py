@@ -9,19 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .message_store import (
-    KEPT_CHUNKS,
-    BagError,
-    Bytes,
-    ChunkBytes,
-    FileBytes,
-    Messages,
-    MessageStore,
-    Place,
-    check_length,
-    decompress,
-    sort_messages,
-)
+from ..file_bytes import Bytes, DamagedFile, FileBytes, HeldBytes
+from .message_store import KEPT_CHUNKS, Messages, MessageStore, Place, check_length, decompress, sort_messages
 
 START = b"#ROSBAG V"
 
@@ -60,7 +49,7 @@ class Bag1Store(MessageStore):
         except OSError:
             raise
         except Exception as error:  # rosbags checks little of a damaged file
-            raise BagError("its index is missing, damaged or cut off: run rosbag reindex") from error
+            raise DamagedFile("its index is missing, damaged or cut off: run rosbag reindex") from error
         positions = np.array(sorted(rows), np.int64)
         order = np.array([rows[position] for position in positions.tolist()], np.int64)
         for entries in (entries for parts in self._found.values() for entries in parts):
@@ -79,9 +68,9 @@ class Bag1Store(MessageStore):
         chunk = self._chunk(row)
         return _message(chunk, offset, chunk.size, first)
 
-    def _decompressed(self, row: int) -> ChunkBytes:
+    def _decompressed(self, row: int) -> HeldBytes:
         at, size, compression = self._chunks[row]
-        return ChunkBytes(decompress(compression, self._file.read(at, check_length(size))))
+        return HeldBytes(decompress(compression, self._file.read(at, check_length(size))))
 
 
 def _message(source: Bytes, at: int, end: int, first: int | None) -> bytes:
@@ -94,7 +83,7 @@ def _message(source: Bytes, at: int, end: int, first: int | None) -> bytes:
                 known = source.read(at, check_length(8 + length))
             operation, size = _operation(known[4 : 4 + length]), struct.unpack_from("<I", known, 4 + length)[0]
         except struct.error as error:
-            raise BagError("it is cut off or damaged: a record reaches beyond its end") from error
+            raise DamagedFile("it is cut off or damaged: a record reaches beyond its end") from error
         start, at = 8 + length, at + 8 + length
         if operation == _MESSAGE:
             wanted = check_length(size if first is None else min(first, size))
@@ -102,7 +91,7 @@ def _message(source: Bytes, at: int, end: int, first: int | None) -> bytes:
         if operation != _CONNECTION:
             break
         at += size
-    raise BagError("its index is damaged: it leads to no message")
+    raise DamagedFile("its index is damaged: it leads to no message")
 
 
 def _operation(header: bytes) -> int:

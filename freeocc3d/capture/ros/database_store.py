@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.regular_files import open_regular
-from .message_store import MOST_BYTES, BagError, Messages, MessageStore, Place, sort_messages
+from ..file_bytes import DamagedFile
+from .message_store import MOST_BYTES, Messages, MessageStore, Place, sort_messages
 
 START = b"SQLite format 3\0"
 
@@ -41,7 +42,7 @@ class DatabaseStore(MessageStore):
         self._database = _connect(path)
         weakref.finalize(self, self._database.close)
         if self._rows(_TABLES) != [(2,)]:
-            raise BagError("it is a database without ROS messages")
+            raise DamagedFile("it is a database without ROS messages")
         self._numbers: dict[str, list[int]] = {}
         self.topics = {}
         for number, name, kind, form in self._rows("SELECT id, name, type, serialization_format FROM topics"):
@@ -58,18 +59,18 @@ class DatabaseStore(MessageStore):
         try:
             table = np.array(rows, np.int64).reshape(-1, 2)
         except (ValueError, TypeError, OverflowError) as error:
-            raise BagError("it is damaged: a message has no time") from error
+            raise DamagedFile("it is damaged: a message has no time") from error
         zeros = np.zeros(len(table), np.int64)
         return sort_messages(table[:, 0], np.column_stack((zeros, zeros - 1, table[:, 1])))
 
     def read(self, place: Place, first: int | None = None) -> bytes:
         rows = self._rows("SELECT length(data) FROM messages WHERE id = ?", place[2])
         if not rows or not isinstance(rows[0][0], int) or rows[0][0] > MOST_BYTES:
-            raise BagError("it is damaged: a message is missing or too large")
+            raise DamagedFile("it is damaged: a message is missing or too large")
         size = rows[0][0] if first is None else first
         data = self._rows("SELECT substr(data, 1, ?) FROM messages WHERE id = ?", size, place[2])[0][0]
         if not isinstance(data, bytes):
-            raise BagError("it is damaged: a message is not made of bytes")
+            raise DamagedFile("it is damaged: a message is not made of bytes")
         return data
 
     def heads(self, messages: Messages, size: int) -> NDArray[np.uint8]:
@@ -88,7 +89,7 @@ class DatabaseStore(MessageStore):
             with self._lock:
                 return self._database.execute(query, values).fetchall()
         except (sqlite3.Error, ValueError, OverflowError) as error:  # ValueError: a text is not UTF-8
-            raise BagError(f"its database is damaged ({error})") from error
+            raise DamagedFile(f"its database is damaged ({error})") from error
 
 
 def _connect(path: Path) -> sqlite3.Connection:

@@ -12,25 +12,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .message_store import (
-    KEPT_CHUNKS,
-    BagError,
-    Bytes,
-    ChunkBytes,
-    FileBytes,
-    Messages,
-    MessageStore,
-    Place,
-    check_length,
-    decompress,
-    sort_messages,
-)
+from ..file_bytes import Bytes, DamagedFile, FileBytes, HeldBytes
+from .message_store import KEPT_CHUNKS, Messages, MessageStore, Place, check_length, decompress, sort_messages
 
 START = b"\x89MCAP0\r\n"
 
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _CHUNK_INDEX, _DATA_END = 1, 2, 3, 4, 5, 6, 7, 8, 15
 _PREFIX = 9  # bytes of a record before its content: one of its kind, eight of its length
 _MESSAGE_HEAD = 22
+_MOST_RECORDS = 10_000_000
+"""Most records that are visited one by one: those of hours."""
 _TAIL = _PREFIX + 20 + len(START)
 
 
@@ -57,7 +48,7 @@ class McapStore(MessageStore):
         try:
             self._passed = None if self._read_summary() else self._pass_through()
         except (struct.error, UnicodeDecodeError) as error:
-            raise BagError("it is damaged: run mcap recover") from error
+            raise DamagedFile("it is damaged: run mcap recover") from error
         self.ros1 = "ros1" in self._encodings
         self.topics = {topic: _ros2_name(kind) for topic, kind in self._channels.values()}
 
@@ -83,9 +74,9 @@ class McapStore(MessageStore):
             start = source.read(base + at, _PREFIX)
             kind, size = struct.unpack("<BQ", start)
         except struct.error as error:
-            raise BagError("it is damaged: run mcap recover") from error
+            raise DamagedFile("it is damaged: run mcap recover") from error
         if kind != _MESSAGE or size < _MESSAGE_HEAD:
-            raise BagError("its index is damaged: it leads to no message")
+            raise DamagedFile("its index is damaged: it leads to no message")
         wanted = check_length(size - _MESSAGE_HEAD if first is None else min(first, size - _MESSAGE_HEAD))
         return source.read(base + at + _PREFIX + _MESSAGE_HEAD, wanted)
 
@@ -105,15 +96,15 @@ class McapStore(MessageStore):
         self._headers[start] = start + _PREFIX + head.at, check_length(stored), compression
         return self._headers[start]
 
-    def _decompressed(self, row: int) -> ChunkBytes:
+    def _decompressed(self, row: int) -> HeldBytes:
         at, size, compression = self._chunk_header(self._chunks[row].start)
-        return ChunkBytes(decompress(compression, self._file.read(at, size)))
+        return HeldBytes(decompress(compression, self._file.read(at, size)))
 
     def _indexed(self, row: int, at: int) -> NDArray[np.int64]:
         """(N, 3) time, chunk, offset of the messages that a message index lists."""
         kind, _, _, length = struct.unpack("<BQHI", self._file.read(at, _PREFIX + 6))
         if kind != _INDEX:
-            raise BagError("its index is damaged: run mcap recover")
+            raise DamagedFile("its index is damaged: run mcap recover")
         data = self._file.read(at + _PREFIX + 6, check_length(length // 16 * 16))
         table = np.frombuffer(data, "<i8").reshape(-1, 2)
         return np.column_stack((table[:, 0], np.full(len(table), row), table[:, 1])).astype(np.int64)
@@ -121,11 +112,11 @@ class McapStore(MessageStore):
     def _read_summary(self) -> bool:
         """Read the channels and chunks that the end of the file lists; false if it does not list all."""
         if self._file.size < len(START) + _TAIL or self._file.read(self._file.size - len(START), len(START)) != START:
-            raise BagError("it is cut off, for its end is missing: run mcap recover")
+            raise DamagedFile("it is cut off, for its end is missing: run mcap recover")
         end = self._file.size - _TAIL
         kind, _, start = struct.unpack_from("<BQQ", self._file.read(end, _TAIL))
         if kind != _FOOTER or (start and not len(START) <= start <= end):
-            raise BagError("its end is damaged: run mcap recover")
+            raise DamagedFile("its end is damaged: run mcap recover")
         if not start:
             return False
         check_length(end - start)
@@ -184,7 +175,7 @@ class _Shifted:
         self._source, self._base, self.size = source, base, source.size - base
 
     def read(self, offset: int, size: int) -> bytes:
-        """Exactly so many bytes. Raises BagError if there are fewer."""
+        """Exactly so many bytes. Raises DamagedFile if there are fewer."""
         return self._source.read(self._base + offset, size)
 
 
@@ -211,14 +202,17 @@ class _Fields:
 
 
 def _records(source: Bytes, at: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """Kind, offset of the content and its size, of the records between two offsets. Raises BagError."""
-    while at + _PREFIX <= end:
+    """Kind, offset of the content and its size, of the records between two offsets. Raises DamagedFile."""
+    for _ in range(_MOST_RECORDS):
+        if at + _PREFIX > end:
+            return
         kind, size = struct.unpack("<BQ", source.read(at, _PREFIX))
         at += _PREFIX
         if at + size > end:
-            raise BagError("it is cut off or damaged: run mcap recover")
+            raise DamagedFile("it is cut off or damaged: run mcap recover")
         yield kind, at, size
         at += size
+    raise DamagedFile(f"it has more than {_MOST_RECORDS:,} records without an index: run mcap recover")
 
 
 def _ros2_name(kind: str) -> str:

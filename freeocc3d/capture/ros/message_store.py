@@ -4,18 +4,14 @@ read when it is asked for, and a few decompressed chunks are kept."""
 from __future__ import annotations
 
 import bz2
-import os
-import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.regular_files import open_regular
+from ..file_bytes import DamagedFile
 
 MOST_BYTES = 512 << 20
 """Largest message, and largest chunk after decompression."""
@@ -25,10 +21,6 @@ KEPT_CHUNKS = 3
 
 Place = tuple[int, int, int]
 """File, chunk (-1 = none) and offset of a message."""
-
-
-class BagError(ValueError):
-    """A bag is damaged or of another kind. The message is the end of a sentence that starts with the bag's name."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +56,7 @@ def join_messages(parts: Sequence[Messages]) -> Messages:
 
 
 class MessageStore(ABC):
-    """The messages of a bag. The constructor raises BagError and OSError. Thread-safe."""
+    """The messages of a bag. The constructor raises DamagedFile and OSError. Thread-safe."""
 
     ros1: bool
     """Whether messages are serialized as in ROS 1; else they are CDR."""
@@ -73,14 +65,14 @@ class MessageStore(ABC):
 
     @abstractmethod
     def find(self, topic: str) -> Messages:
-        """All messages of a topic. Raises BagError, OSError."""
+        """All messages of a topic. Raises DamagedFile, OSError."""
 
     @abstractmethod
     def read(self, place: Place, first: int | None = None) -> bytes:
-        """The bytes of a message, or the first ones. Raises BagError, OSError."""
+        """The bytes of a message, or the first ones. Raises DamagedFile, OSError."""
 
     def heads(self, messages: Messages, size: int) -> NDArray[np.uint8]:
-        """(N, size) first bytes of messages, filled up with zeros. Raises BagError, OSError."""
+        """(N, size) first bytes of messages, filled up with zeros. Raises DamagedFile, OSError."""
         found = np.zeros((len(messages), size), np.uint8)
         for row in np.lexsort(messages.places.T[::-1]).tolist():
             data = self.read(messages.place(row), size)
@@ -88,71 +80,28 @@ class MessageStore(ABC):
         return found
 
 
-class Bytes(Protocol):
-    """Bytes of a file or of a decompressed chunk."""
-
-    size: int
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Exactly so many bytes. Raises BagError if there are fewer."""
-
-
-class FileBytes:
-    """The bytes of a regular file. Thread-safe."""
-
-    def __init__(self, path: Path):
-        with open_regular(path) as stream:
-            self._descriptor = os.dup(stream.fileno())
-        weakref.finalize(self, os.close, self._descriptor)
-        self.size = os.fstat(self._descriptor).st_size
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Exactly so many bytes. Raises BagError if there are fewer."""
-        _check(offset, size, self.size)
-        data = os.pread(self._descriptor, size, offset)
-        _check(0, size, len(data))
-        return data
-
-
-class ChunkBytes:
-    """The bytes of a decompressed chunk."""
-
-    def __init__(self, data: bytes):
-        self._data, self.size = data, len(data)
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Exactly so many bytes. Raises BagError if there are fewer."""
-        _check(offset, size, self.size)
-        return self._data[offset : offset + size]
-
-
-def _check(offset: int, size: int, end: int) -> None:
-    if offset < 0 or size < 0 or offset + size > end:
-        raise BagError("it is cut off or damaged: a record reaches beyond its end")
-
-
 def check_length(size: int) -> int:
-    """The length of a message or chunk, if it is possible. Raises BagError."""
+    """The length of a message or chunk, if it is possible. Raises DamagedFile."""
     if not 0 <= size <= MOST_BYTES:
-        raise BagError(f"it is damaged: it states a part of {size} bytes")
+        raise DamagedFile(f"it is damaged: it states a part of {size} bytes")
     return size
 
 
 def decompress(kind: str, data: bytes, most: int = MOST_BYTES) -> bytes:
-    """The content of compressed bytes: "bz2", "lz4", "zstd"; "" and "none" = as they are. Raises BagError, also for
+    """The content of compressed bytes: "bz2", "lz4", "zstd"; "" and "none" = as they are. Raises DamagedFile, also for
     more than ``most`` bytes."""
     if kind in ("", "none"):
         return data
     try:
         found = _decompressed(kind, data, most + 1)
     except (OSError, RuntimeError, EOFError, ValueError) as error:
-        raise BagError(f"it is damaged: a part does not decompress ({kind})") from error
+        raise DamagedFile(f"it is damaged: a part does not decompress ({kind})") from error
     except Exception as error:  # zstd's own error has no public base
         if type(error).__name__ != "ZstdError":
             raise
-        raise BagError(f"it is damaged: a part does not decompress ({kind})") from error
+        raise DamagedFile(f"it is damaged: a part does not decompress ({kind})") from error
     if len(found) > most:
-        raise BagError(f"a part of it holds more than {most >> 20} MB, which is not read")
+        raise DamagedFile(f"a part of it holds more than {most >> 20} MB, which is not read")
     return found
 
 
@@ -169,4 +118,4 @@ def _decompressed(kind: str, data: bytes, most: int) -> bytes:
         except ImportError:
             from backports.zstd import ZstdDecompressor
         return bytes(ZstdDecompressor().decompress(data, max_length=most))
-    raise BagError(f"its compression {kind!r} is not known")
+    raise DamagedFile(f"its compression {kind!r} is not known")

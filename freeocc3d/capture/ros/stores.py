@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from ...core.errors import CaptureError
 from ...core.regular_files import check_regular, open_regular, read_text
 from ...core.yaml_documents import InvalidYaml, parse_yaml
+from ..file_bytes import DamagedFile
 from ..numbered_files import list_folder
 from . import bag1_store, database_store, mcap_store
 from .bag1_store import Bag1Store
 from .database_store import DatabaseStore, is_bag_database
 from .mcap_store import McapStore
-from .message_store import BagError, Messages, MessageStore, Place, decompress, join_messages
+from .message_store import Messages, MessageStore, Place, decompress, join_messages
 
 METADATA = "metadata.yaml"
 SUFFIXES = (".mcap", ".db3")
@@ -45,7 +46,7 @@ def open_store(path: Path) -> MessageStore:
     """The messages of a bag. Raises CaptureError for a bag that is damaged, or of another kind."""
     try:
         return _open_folder(path) if path.is_dir() else _open_file(path)
-    except BagError as error:
+    except DamagedFile as error:
         raise CaptureError(f"{path} is not a readable ROS bag: {error}.") from error
     except OSError as error:
         raise CaptureError(f"Cannot read {error.filename or path}: {error.strerror}.") from error
@@ -64,7 +65,7 @@ def _open_file(path: Path) -> MessageStore:
         return McapStore(path)
     if start.startswith(database_store.START):
         return DatabaseStore(path)
-    raise BagError(f"it holds {'nothing' if not start else 'none of the formats .bag 2.0, .mcap and .db3'}")
+    raise DamagedFile(f"it holds {'nothing' if not start else 'none of the formats .bag 2.0, .mcap and .db3'}")
 
 
 def _open_folder(folder: Path) -> MessageStore:
@@ -74,11 +75,11 @@ def _open_folder(folder: Path) -> MessageStore:
     wanted = [str(name).replace("\\", "/").rpartition("/")[2] for name in listed] if isinstance(listed, list) else []
     found = [name for name in wanted or names if name.endswith(SUFFIXES) and name in names]
     if missing := [name for name in wanted if name not in names]:
-        raise BagError(f"its {METADATA} names {missing[0]}, which is missing")
+        raise DamagedFile(f"its {METADATA} names {missing[0]}, which is missing")
     if not found and any(name.endswith(_PACKED) for name in names):
-        raise BagError("its files are compressed: unpack them with zstd -d, and remove metadata.yaml")
+        raise DamagedFile("its files are compressed: unpack them with zstd -d, and remove metadata.yaml")
     if not found:
-        raise BagError("the folder holds no .mcap or .db3 file")
+        raise DamagedFile("the folder holds no .mcap or .db3 file")
     compressed = str(stated.get("compression_mode") or "").lower() == "message"
     for name in found:
         check_regular(folder / name)
@@ -92,10 +93,10 @@ def _read_metadata(folder: Path) -> dict[str, Any]:
     try:
         stated = parse_yaml(read_text(folder / METADATA, _METADATA_BYTES))
     except (InvalidYaml, UnicodeDecodeError) as error:
-        raise BagError(f"its {METADATA} is damaged ({error}): run ros2 bag reindex") from error
+        raise DamagedFile(f"its {METADATA} is damaged ({error}): run ros2 bag reindex") from error
     found = stated.get("rosbag2_bagfile_information") if isinstance(stated, dict) else None
     if not isinstance(found, dict):
-        raise BagError(f"its {METADATA} does not describe a bag: run ros2 bag reindex")
+        raise DamagedFile(f"its {METADATA} does not describe a bag: run ros2 bag reindex")
     return found
 
 
@@ -106,7 +107,7 @@ class JoinedStore(MessageStore):
         self._stores, self._compressed = stores, compressed
         self.ros1 = any(store.ros1 for store in stores)
         if self.ros1 != all(store.ros1 for store in stores):
-            raise BagError("it mixes messages of ROS 1 and ROS 2")
+            raise DamagedFile("it mixes messages of ROS 1 and ROS 2")
         self.topics = {topic: kind for store in stores for topic, kind in store.topics.items()}
 
     def find(self, topic: str) -> Messages:
