@@ -1,6 +1,6 @@
-"""Reads nerfstudio's transforms.json: images with poses, lenses and depth.
+"""Reads nerfstudio's transforms.json: images with poses, lenses and depth. Instant-ngp and NeRFCapture write it, too.
 
-Source: nerfstudio's "Data conventions".
+Sources: nerfstudio's "Data conventions"; instant-ngp's nerfcapture2nerf.py (depth_path, integer_depth_scale).
 """
 
 from __future__ import annotations
@@ -22,7 +22,22 @@ _Side = Annotated[float, Meta(ge=0, le=1e6)]
 _Row = tuple[Number, Number, Number, Number]
 
 
-class StatedLens(msgspec.Struct, kw_only=True):
+class StatedUnit(msgspec.Struct, kw_only=True):
+    """What a frame, or the file for all frames, states about its depth; None or no positive number = nothing. Meters
+    per unit: depth_unit_scale_factor of any depth, integer_depth_scale of integers."""
+
+    depth_unit_scale_factor: Number | None = None
+    integer_depth_scale: Number | None = None
+
+    def units_per_meter(self, floats: bool) -> float | None:
+        """Of depth that is stored as floats, or as integers; None = not stated."""
+        for meters in (self.depth_unit_scale_factor, None if floats else self.integer_depth_scale):
+            if meters is not None and meters > 0:
+                return 1.0 / meters
+        return None
+
+
+class StatedLens(StatedUnit, kw_only=True):
     """What a frame, or the file for all frames, states about the camera; None = nothing. Pixels and radians."""
 
     camera_model: str | None = None
@@ -53,6 +68,12 @@ class PosedFrame(StatedLens, kw_only=True):
     file_path: FileName
     transform_matrix: tuple[_Row, _Row, _Row, _Row]
     depth_file_path: FileName | None = None
+    depth_path: FileName | None = None
+
+    @property
+    def depth_name(self) -> str | None:
+        """The file of the depth, under whichever name it is stated."""
+        return self.depth_file_path or self.depth_path
 
 
 class Transforms(StatedLens, kw_only=True):

@@ -94,15 +94,6 @@ def test_nerfstudio_cameras_may_be_given_by_the_angle_and_by_frame(tmp_path: Pat
     assert capture[1].intrinsics.fx == 40.0
 
 
-def test_depth_of_another_size_is_brought_to_the_colors_pixels(tmp_path: Path) -> None:
-    write_nerfstudio(tmp_path, 2)
-    small = np.array([[1000, 2000], [3000, 0]], np.uint16)
-    write_image(tmp_path / "depth" / "frame_0.png", small)
-    depth_m = open_capture(tmp_path)[0].depth_m
-    found = [depth_m[y, x] for y, x in ((0, 0), (11, 15), (11, 16), (12, 15), (23, 31))]
-    np.testing.assert_allclose(found, [1, 1, 2, 3, 0], atol=1e-6)
-
-
 def broken_nerfstudio(folder: Path, key: str, value: object, frame: bool) -> None:
     write_nerfstudio(folder, 2, depth=False)
     content = json.loads((folder / "transforms.json").read_text())
