@@ -23,7 +23,7 @@ from ..core.warnings import Notice
 Kind = Literal["color", "depth", "any"]
 
 SUFFIXES = {
-    "color": (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif"),
+    "color": (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"),
     "depth": (".png", ".tif", ".tiff", ".exr", ".npy", ".npz", ".pgm", ".pfm"),
     "any": (),
 }

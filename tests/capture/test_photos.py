@@ -18,6 +18,7 @@ from small_captures import (
 
 from freeocc3d.capture import Options, open_capture
 from freeocc3d.capture.camera_files import DIAGONAL_35MM, USUAL_FOCAL
+from freeocc3d.capture.heif_files import register_heif
 from freeocc3d.capture.readers.photos import apply_orientation, list_images
 from freeocc3d.core.errors import CaptureError, FrameError
 
@@ -217,3 +218,85 @@ def test_a_folder_with_depth_images_among_others_is_not_taken_for_photographs(tm
     write_image(tmp_path / "frame000000.png", color_image(0))
     write_image(tmp_path / "depth000000.png", depth_image(0))
     assert open_capture(tmp_path).format == "image_folders"
+
+
+def write_heif(path: Path, index: int, orientation: int = 1, kind: str = "HEIF", time: str = "", **more) -> Path:
+    """A photograph as phones store it: the stored image of a camera that is turned, with the file's own turn."""
+    register_heif()
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769).update({0xA405: 28, **({0x9003: time} if time else {})})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = Image.fromarray(color_image(index, SIZE))
+    image.save(path, kind, exif=exif.tobytes(), quality=95, **more)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["HEIF", "AVIF"])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_heif_images_are_turned_once_also_among_others(tmp_path: Path, kind: str, orientation: int) -> None:
+    for index in range(3):
+        write_photo(tmp_path / f"IMG_{index}.jpg", index, orientation=orientation)
+    for index in range(3, 6):
+        path = write_heif(tmp_path / f"IMG_{index}.{kind}", index, orientation, kind)
+        if kind == "HEIF":
+            assert (b"irot" in path.read_bytes()) == (orientation != 1)
+    path.rename(tmp_path / "IMG_5.JPG")  # as some programs name it
+    capture = open_capture(tmp_path)
+    assert (len(capture), capture.warnings) == (6, ())
+    for index in (0, 4, 5):
+        expected = apply_orientation(color_image(index, SIZE), orientation)
+        assert capture[index].color.shape == expected.shape
+        assert np.abs(capture[index].color.astype(int) - expected).mean() < 4
+
+
+def test_heif_images_state_lens_and_time_and_are_turned_to_the_size_of_most(tmp_path: Path) -> None:
+    for index in range(4):
+        time = f"2024:05:01 10:00:0{index}"
+        write_heif(tmp_path / f"IMG_{index}.HEIC", index, 1 if index < 3 else 6, time=time)
+    capture = open_capture(tmp_path)
+    np.testing.assert_array_equal(capture.timestamps, np.arange(4))
+    assert capture.focal_stated
+    assert capture.intrinsics.fx == pytest.approx(28 / DIAGONAL_35MM * np.hypot(*SIZE))
+    assert (capture.turned(0), capture.turned(3)) == (0, 1)
+    assert np.abs(capture[3].color.astype(int) - color_image(3, SIZE)).mean() < 4
+
+
+def test_images_that_cannot_be_decoded_are_counted_and_left_out(tmp_path: Path) -> None:
+    write_photos(tmp_path, 7)
+    for index in range(20, 33):
+        (tmp_path / f"IMG_{index}.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(2000))
+    (tmp_path / "IMG_40.DNG").write_bytes(b"II*\0" + bytes(100))
+    (tmp_path / "IMG_8.DNG").write_bytes(b"II*\0" + bytes(100))  # beside its JPEG
+    capture = open_capture(tmp_path)
+    assert len(capture) == 7
+    dng, heic = (notice.text for notice in capture.warnings)
+    assert dng.startswith("1 .dng (DNG) of 21 images")
+    assert heic.startswith("13 .heic (HEIC) of 21 images")
+    assert "first IMG_20.HEIC" in heic
+    for index in range(7):
+        (tmp_path / f"IMG_{index + 8}.jpg").unlink()
+    with pytest.raises(CaptureError, match="similar files, which cannot be decoded: convert them to JPEG"):
+        open_capture(tmp_path)
+
+
+def test_a_heic_image_beside_its_jpeg_is_left_out(tmp_path: Path) -> None:
+    write_photos(tmp_path, 3)
+    write_heif(tmp_path / "IMG_9.HEIC", 1)
+    capture = open_capture(tmp_path)
+    assert [capture.name(index) for index in range(len(capture))] == ["IMG_8.jpg", "IMG_9.jpg", "IMG_10.jpg"]
+    assert "1 .heic (HEIC) of 4 images" in capture.warnings[0].text
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.98])
+def test_a_heif_image_that_is_cut_off_later_is_a_broken_frame(tmp_path: Path, share: float) -> None:
+    for index in range(3):
+        write_heif(tmp_path / f"IMG_{index}.heic", index)
+    capture = open_capture(tmp_path)
+    truncate(tmp_path / "IMG_1.heic", share)
+    with pytest.raises(FrameError, match=r"IMG_1\.heic is not a readable image"):
+        capture[1]
+    (tmp_path / "IMG_1.heic").unlink()
+    with pytest.raises(FrameError, match=r"IMG_1\.heic is not a readable image"):
+        capture[1]
+    assert capture[2].color.shape == (48, 64, 3)

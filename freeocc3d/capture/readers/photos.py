@@ -1,4 +1,4 @@
-"""Reads a folder of photographs or video frames (jpg, png, tif, bmp, webp), in natural order of their names."""
+"""Reads a folder of photographs or video frames (jpg, heic, png, tif, …), in natural order of their names."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from ...core.types import Frame, Intrinsics
 from ...core.warnings import Notice
 from ..base import Capture, Options
 from ..camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
+from ..heif_files import HEIF_FORMATS, read_heif, register_heif
 from ..image_decoding import read_color
 from ..numbered_files import list_folder
 from ..paired_folders import find_folders
@@ -29,12 +30,15 @@ from ..paired_folders import find_folders
 if TYPE_CHECKING:
     from PIL import Image
 
-REQUIRES: tuple[str, ...] = ("PIL",)
+REQUIRES: tuple[str, ...] = ("PIL", "pillow_heif")
 
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
-_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
-UNREADABLE = {".heic", ".heif", ".dng"}
-"""Image formats of phones that no decoder here reads."""
+HEIF_SUFFIXES = {".heic", ".heif", ".hif", ".avif"}
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF_SUFFIXES}
+_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", *HEIF_FORMATS)
+UNREADABLE = {
+    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw", ".jxl", ".insp",
+}  # fmt: skip
+"""Image formats of phones and cameras that no decoder here reads."""
 
 SAME_LENS = 0.05
 """Largest relative spread of the stated focal lengths of images from one lens."""
@@ -47,19 +51,23 @@ _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
 @dataclass(frozen=True)
 class Header:
     """The header of an image. size: upright.  orientation: EXIF's, 1…8.  focal: over the diagonal, or None.
-    time: seconds, or None."""
+    time: seconds, or None.  heif: whether it is HEIF or AVIF by its content.  by_decoder: whether decoding turns it
+    upright."""
 
     size: Size
     orientation: int
     focal: float | None
     time: float | None
+    heif: bool = False
+    by_decoder: bool = False
 
 
 class Reader(Capture):
     """The images lie in the folder or in its ``images/``. The EXIF orientation is applied, and images are reduced to
     ``capture.max_size``. All images have one camera. Images with swapped width and height are turned by a quarter to
-    the most common size (``turned``). Images of any other size are left out with a warning. Frame numbers count the
-    images that remain. Poses, pixels and pictures refer to the turned images.
+    the most common size (``turned``). Images of any other size or in a format of cameras that is not read, and HEIC
+    images of which there is a JPEG, are left out with a warning. Frame numbers count the images that remain. Poses,
+    pixels and pictures refer to the turned images.
 
     The camera is ``capture.intrinsics``, for the upright size before reduction. Otherwise it is a guess with the focal
     length in the EXIF data of most images (35 mm equivalent, or focal length and sensor resolution). This is accurate
@@ -68,22 +76,21 @@ class Reader(Capture):
     """
 
     format = "photos"
-    layout = "images (jpg, png, tif, bmp, webp) by one camera"
+    layout = "images (jpg, heic, png, tif, bmp, webp) by one camera"
     general = True
     has_depth = False
 
     def __init__(self, path: Path, options: Options):
         super().__init__(path, options)
-        paths = list_images(path)
-        if len(paths) < 2:
-            raise CaptureError(_too_few(path, paths))
-        images = [(image, read_header(image)) for image in paths]
+        images, unreadable = _decodable(list_images(path))
+        if len(images) < 2:
+            raise CaptureError(_too_few(path, [image for image, _ in images]))
+        left_out = _tell_unreadable(path, unreadable, len(images)) if unreadable else []
         self._size = _common_size(path, [header for _, header in images if header is not None])
         both = self._size, self._size[::-1]
         odd = [(image, header) for image, header in images if header is not None and header.size not in both]
         images = [(image, header) for image, header in images if header is None or header.size in both]
-        if odd:
-            self.warnings = (_left_out(path, odd, len(images), self._size),)
+        self.warnings = (*left_out, *([_left_out(path, odd, len(images), self._size)] if odd else []))
         self._paths, headers = [image for image, _ in images], [header for _, header in images]
         self._headers = headers
         stated, lens = (
@@ -105,7 +112,8 @@ class Reader(Capture):
         if not 0 <= index < len(self):
             raise IndexError(f"Frame {index} of {len(self)} images.")
         path, header, camera = self._paths[index], self._headers[index], self.intrinsics
-        color = apply_orientation(read_color(path), header.orientation if header else 1)
+        stored = read_heif(path) if header and header.heif else read_color(path)
+        color = apply_orientation(stored, header.orientation if header and not header.by_decoder else 1)
         color = np.ascontiguousarray(np.rot90(color, self.turned(index)))
         height, width = color.shape[:2]
         if (width, height) != self._size:
@@ -155,17 +163,22 @@ def read_header(path: Path) -> Header | None:
     try:
         with open_regular(path, IMAGE_BYTES) as stream, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large images and damaged EXIF data
+            register_heif()
             with Image.open(stream, formats=_FORMATS) as image:
                 width, height = image.size
                 exif, inner = _exif(image)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+                heif, turned = image.format in HEIF_FORMATS, image.info.get("original_orientation")
+    except (OSError, ValueError, SyntaxError, RuntimeError, EOFError, Image.DecompressionBombError):
         return None
     if width * height > MOST_PIXELS:
         return None
     orientation = exif.get(_ORIENTATION, 1)
     orientation = orientation if orientation in range(1, 9) else 1
     size = (height, width) if orientation >= 5 else (width, height)
-    return Header(size, orientation, _stated_focal(inner, width, height), _stated_time(inner))
+    focal, time = _stated_focal(inner, width, height), _stated_time(inner)
+    if isinstance(turned, int) and 2 <= turned <= 8:
+        return Header(size, turned, focal, time, heif, by_decoder=True)
+    return Header(size, orientation, focal, time, heif)
 
 
 def _exif(image: Image.Image) -> tuple[Mapping[int, Any], Mapping[int, Any]]:
@@ -253,12 +266,47 @@ def _left_out(folder: Path, odd: Sequence[tuple[Path, Header]], used: int, size:
     )
 
 
+def _decodable(paths: Sequence[Path]) -> tuple[list[tuple[Path, Header | None]], list[Path]]:
+    """The images with their headers, None for a damaged one; and those of cameras' formats that cannot be decoded, or
+    that are there as JPEG too."""
+    others = {path.stem.lower() for path in paths if path.suffix.lower() not in HEIF_SUFFIXES}
+    images, unreadable = list[tuple[Path, Header | None]](), list[Path]()
+    for path in paths:
+        of_camera = path.suffix.lower() in HEIF_SUFFIXES
+        header = None if of_camera and path.stem.lower() in others else read_header(path)
+        if header is None and of_camera:
+            unreadable.append(path)
+        else:
+            images.append((path, header))
+    files = [paths[0].parent / name for name in list_folder(paths[0].parent)] if paths else []
+    stems = {path.stem.lower() for path in paths}  # many cameras write a raw image beside each JPEG
+    unreadable += [file for file in files if file.suffix.lower() in UNREADABLE and file.stem.lower() not in stems]
+    return images, unreadable
+
+
+def _tell_unreadable(folder: Path, files: Sequence[Path], used: int) -> list[Notice]:
+    """A warning for each suffix of files that are left out."""
+    by_suffix: dict[str, list[Path]] = {}
+    for file in files:
+        by_suffix.setdefault(file.suffix.lower(), []).append(file)
+    total = used + len(files)
+    return [
+        Notice(
+            "images-left-out",
+            f"{len(of_suffix)} {suffix} ({suffix[1:].upper()}) of {total} images of {folder} "
+            f"{'is' if len(of_suffix) == 1 else 'are'} left out, first {of_suffix[0].name}: they cannot be decoded, or "
+            "there is a JPEG of the same name. Convert them to JPEG.",
+        )
+        for suffix, of_suffix in sorted(by_suffix.items())
+    ]
+
+
 def _too_few(path: Path, found: Sequence[Path]) -> str:
     if found:
         return f"{path} holds only one image, {found[0].name}: a scan needs many images of one place, from all sides."
-    if raw := _unreadable(path):
+    if raw := [*_unreadable(path), *list_images(path)]:
         return f"{path} holds {raw[0].name} and similar files, which cannot be decoded: convert them to JPEG."
-    return f"{path} holds no images (jpg, png, tif, bmp, webp)."
+    return f"{path} holds no images (jpg, heic, png, tif, bmp, webp)."
 
 
 def _unreadable(path: Path) -> list[Path]:
