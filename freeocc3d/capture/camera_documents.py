@@ -97,7 +97,7 @@ def read_cameras(path: Path) -> CameraDocument | None:
             found.depth = found.depth or camera
         else:
             found.color = found.color or camera
-    found.T_color_depth = _extrinsics(content)
+    found.T_color_depth = _extrinsics(content, path)
     if "depth" in path.stem.lower():
         found.color, found.depth = None, found.color or found.depth
     return found if found.color or found.depth or found.units_per_meter else None
@@ -294,7 +294,7 @@ def _units(content: Any, depth: int = 0) -> float | None:
     return next((found for value in content.values() if (found := _units(value, depth + 1))), None)
 
 
-def _extrinsics(content: Any) -> NDArray[np.float64] | None:
+def _extrinsics(content: Any, path: Path) -> NDArray[np.float64] | None:
     """(4, 4) depth to color camera frame of an info file, where each extrinsic maps a camera to the rig."""
     if not isinstance(content, Mapping):
         return None
@@ -304,7 +304,7 @@ def _extrinsics(content: Any) -> NDArray[np.float64] | None:
         values = _list(keys.get(f"m_calibration{kind}extrinsic"))
         T = np.eye(4) if values is None or len(values) != 16 else np.array(values).reshape(4, 4)
         if not is_rigid(T):
-            raise CaptureError(f"m_calibration{kind.title()}Extrinsic is no rigid transform of 4 x 4 numbers.")
+            raise CaptureError(f"{path}: m_calibration{kind.title()}Extrinsic is no rigid transform of 4 x 4 numbers.")
         found.append(T)
     T_color_depth: NDArray[np.float64] = invert(found[0]) @ found[1]
     return None if np.allclose(T_color_depth, np.eye(4)) else T_color_depth

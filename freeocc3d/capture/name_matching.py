@@ -30,6 +30,9 @@ FRAME_INTERVALS_S = 0.004, 2.0
 FEWEST_PAIRED = 0.5
 """Files match if this share of the smaller folder does."""
 
+USUAL_FORM = 0.8
+"""Names of other forms than this share of a folder has are no frames."""
+
 _EPOCH_S = 1e9, 1e10
 """Seconds since 1970 of the years 2001 to 2286."""
 
@@ -174,10 +177,13 @@ def _longest(found: Sequence[_Pairs]) -> _Pairs:
 
 
 def _alike(names: Sequence[str]) -> list[int]:
-    """Rows of the names that hold as many numbers as most do."""
-    counts = [len(_numbers(PurePath(name).stem)) for name in names]
-    usual = Counter(counts).most_common(1)[0][0] if counts else 0
-    return [row for row, count in enumerate(counts) if count == usual]
+    """Rows of the names that have the form of most or, if forms vary, hold as many numbers as most do."""
+    stems = [PurePath(name).stem for name in names]
+    forms = [_DIGITS.sub("#", stem) for stem in stems]
+    if forms and Counter(forms).most_common(1)[0][1] < USUAL_FORM * len(forms):
+        forms = [str(form.count("#")) for form in forms]
+    usual = Counter(forms).most_common(1)[0][0] if forms else ""
+    return [row for row, form in enumerate(forms) if form == usual]
 
 
 def _numbers(stem: str) -> list[str]:

@@ -76,9 +76,8 @@ def assign_poses(poses: PoseFile, frames: PairList) -> NDArray[np.float64]:
         if own and (poses.numbers is None or len(own) == len(numbers)):
             return _taken(T_world_cam, own, len(frames.pairs))
     if poses.numbers is not None and (largest := int(poses.numbers.max())) < _MOST_POSES and poses.numbers.min() >= 0:
-        T_world_cam = _taken(
-            T_world_cam, dict(zip(poses.numbers.tolist(), range(largest + 1), strict=False)), largest + 1
-        )
+        by_number = {number: row for row, number in enumerate(poses.numbers.tolist())}
+        T_world_cam = _taken(T_world_cam, by_number, largest + 1)
     rows_by_order = _rows_in_order(len(T_world_cam), frames)
     if rows_by_order is None:
         raise CaptureError(

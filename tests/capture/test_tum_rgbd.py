@@ -1,0 +1,219 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_captures import color_image, data_folder, depth_image, pose_matrix, write_image
+
+from freeocc3d.capture import open_capture
+from freeocc3d.capture.base import Options
+from freeocc3d.capture.readers.tum_rgbd import Reader
+from freeocc3d.core.errors import CaptureError
+from freeocc3d.core.transforms import back_project, invert, project, rotations_to_quats, transform
+from freeocc3d.core.types import Intrinsics
+
+START = 1305031102.175304
+LATE = 0.0134
+"""How much later depth is, seconds."""
+
+HEADER = "# color images\n# file: 'rgbd_dataset_{}.bag'\n# timestamp filename\n"
+
+
+def pose_line(time: float, T: np.ndarray) -> str:
+    w, x, y, z = rotations_to_quats(T[:3, :3])
+    return " ".join(repr(float(number)) for number in (time, *T[:3, 3], x, y, z, w)) + "\n"
+
+
+def write_tum(
+    folder: Path, n: int, lists: bool = True, recording: str = "room", size: tuple[int, int] = (32, 24)
+) -> list[float]:
+    """n frames at 30 Hz with poses; the times of color. lists: write rgb.txt and depth.txt."""
+    times = [round(START + i / 30, 6) for i in range(n)]
+    texts = {"rgb": HEADER.format(recording), "depth": HEADER.format(recording)}
+    for i, time in enumerate(times):
+        for kind, at, image in (
+            ("rgb", time, color_image(i, size)),
+            ("depth", time + LATE, depth_image(i, 5000.0, size)),
+        ):
+            name = f"{kind}/{at:.6f}.png"
+            write_image(folder / name, image)
+            texts[kind] += f"{at:.6f} {name}\n"
+    if lists:
+        for kind, text in texts.items():
+            (folder / f"{kind}.txt").write_text(text)
+    (folder / "groundtruth.txt").write_text("".join(pose_line(t, pose_matrix(i)) for i, t in enumerate(times)))
+    return times
+
+
+@pytest.mark.parametrize("lists", [True, False])
+def test_a_round_trip(tmp_path: Path, lists: bool) -> None:
+    times = write_tum(tmp_path, 5, lists)
+    capture = open_capture(tmp_path, Options(depth_scale=5000.0))
+    assert isinstance(capture, Reader)
+    assert len(capture) == 5
+    assert not capture.intrinsics_known
+    for i in range(5):
+        frame = capture[i]
+        assert frame.timestamp == times[i]
+        np.testing.assert_array_equal(frame.color, color_image(i))
+        np.testing.assert_allclose(frame.depth_m[:, 1:], 2.0 + 0.01 * i, atol=1e-4)
+        np.testing.assert_allclose(capture.pose(i), pose_matrix(i), atol=1e-6)
+
+
+def test_the_unit_and_the_lens_are_those_of_the_recording_that_comments_name(tmp_path: Path) -> None:
+    write_tum(tmp_path, 1, recording="freiburg1_desk", size=(640, 480))
+    capture = open_capture(tmp_path)
+    assert isinstance(capture, Reader)
+    assert (capture.units_per_meter, capture.intrinsics_known) == (5000.0, True)
+    lens = capture.rig(0).color
+    assert (lens.camera.fx, lens.distortion[0]) == (517.3, 0.2624)
+    assert capture.rig(0).depth == lens, "depth is registered to the distorted color"
+
+
+@pytest.mark.parametrize("recording", ["freiburg4_desk", "room"])
+def test_nothing_is_assumed_of_other_recordings(tmp_path: Path, recording: str) -> None:
+    write_tum(tmp_path, 1, recording=recording)
+    capture = Reader(tmp_path, Options())
+    assert (capture.units_stated, capture.intrinsics_known) == (False, False)
+
+
+@pytest.mark.parametrize("depth_first", [True, False])
+@pytest.mark.parametrize("name", ["associations.txt", "associate.txt", "fr1_association.txt"])
+def test_associations_of_either_order(tmp_path: Path, depth_first: bool, name: str) -> None:
+    times = write_tum(tmp_path, 4, lists=False)
+    lines = []
+    for i, time in enumerate(times):
+        pair = [f"{time:.6f} rgb\\{time:.6f}.png", f"{time + LATE:.6f} depth/{time + LATE:.6f}.png"]
+        lines.append(" ".join(pair[::-1] if depth_first else pair) + ("\r\n" if i % 2 else "\n"))
+    (tmp_path / name).write_text("".join(lines[::-1]))
+    capture = open_capture(tmp_path, Options(depth_scale=5000.0))
+    assert capture.format == "tum_rgbd"
+    np.testing.assert_array_equal(capture.timestamps, times)
+    np.testing.assert_array_equal(capture[3].color, color_image(3))
+    assert capture[3].depth_m.max() == pytest.approx(2.03, abs=1e-4)
+    np.testing.assert_allclose(capture.pose(3), pose_matrix(3), atol=1e-6)
+
+
+def test_names_that_do_not_say_depth_are_looked_into(tmp_path: Path) -> None:
+    for i in range(2):
+        write_image(tmp_path / "a" / f"{i}.png", depth_image(i))
+        write_image(tmp_path / "b" / f"{i}.png", color_image(i))
+    (tmp_path / "associations.txt").write_text("0.1 a/0.png 0.1 b/0.png\n0.2 a/1.png 0.2 b/1.png\n")
+    np.testing.assert_array_equal(open_capture(tmp_path)[1].color, color_image(1))
+
+
+def test_times_that_contradict_the_names_are_left_out(tmp_path: Path) -> None:
+    lines = []
+    for i, time in enumerate((0.005, 0.0118, 0.0165, 0.0305, 0.0067)):
+        write_image(tmp_path / "rgb" / f"rgb{i}.png", color_image(i))
+        write_image(tmp_path / "depths" / f"depth{i}.png", depth_image(i))
+        lines.append(f"{time} rgb/rgb{i}.png {time} depths/depth{i}.png\n")
+    (tmp_path / "associations.txt").write_text("".join(lines))
+    capture = open_capture(tmp_path)
+    np.testing.assert_array_equal(capture.timestamps, np.arange(5))
+    assert [int(capture[i].color[0, 0, 2]) for i in range(5)] == [0, 10, 20, 30, 40]
+
+
+def test_names_without_trailing_zeros_sort_as_numbers(tmp_path: Path) -> None:
+    for i, name in enumerate(("999.9", "1000", "1000.1", "1000.15", "1000.2")):
+        if i != 1:
+            write_image(tmp_path / "rgb" / f"{name}.png", color_image(i))
+            write_image(tmp_path / "depth" / f"{name}.png", depth_image(i))
+    capture = open_capture(tmp_path)
+    assert [int(capture[i].color[0, 0, 2]) for i in range(4)] == [0, 20, 30, 40]
+    np.testing.assert_allclose(capture.timestamps, [999.9, 1000.1, 1000.15, 1000.2])
+
+
+def test_poses_are_interpolated_between_denser_true_ones(tmp_path: Path) -> None:
+    times = write_tum(tmp_path, 3)
+    turn = np.eye(4)
+    dense = []
+    for step in range(-4, 12):
+        angle = np.deg2rad(3.0 * step)
+        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        turn[0, 3] = 0.1 * step
+        dense.append(pose_line(START + 0.01 * step, turn))
+    (tmp_path / "groundtruth.txt").write_text("# ground truth\n" + "".join(dense))
+    T = Reader(tmp_path, Options()).pose(1)
+    assert T is not None
+    step = (times[1] - START) / 0.01
+    assert T[0, 3] == pytest.approx(0.1 * step, abs=1e-5)
+    assert np.rad2deg(np.arctan2(T[1, 0], T[0, 0])) == pytest.approx(3.0 * step, abs=1e-3)
+
+
+def test_a_frame_far_from_all_true_poses_has_none(tmp_path: Path) -> None:
+    times = write_tum(tmp_path, 6)
+    (tmp_path / "groundtruth.txt").write_text(pose_line(times[0] + 0.019, pose_matrix(0)))
+    capture = Reader(tmp_path, Options())
+    assert [capture.pose(i) is None for i in range(6)] == [False, False, True, True, True, True]
+
+
+def test_images_without_a_partner_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    times = write_tum(tmp_path, 10)
+    (tmp_path / "depth" / f"{times[4] + LATE:.6f}.png").unlink()
+    capture = Reader(tmp_path, Options())
+    assert len(capture) == 9
+    assert {notice.code for notice in capture.warnings} == {"images-left-out"}
+    assert any(f"{times[4] + LATE:.6f}.png" in notice.text for notice in capture.warnings)
+
+
+def test_lists_of_other_times_say_so(tmp_path: Path) -> None:
+    write_tum(tmp_path, 4)
+    lines = (tmp_path / "depth.txt").read_text().replace("\n1305", "\n1405")
+    (tmp_path / "depth.txt").write_text(lines)
+    with pytest.raises(CaptureError, match=r"0 of the 4 images .*rgb\.txt and 4 .*depth\.txt have times"):
+        Reader(tmp_path, Options())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "lists no images"),
+        ("1.0 rgb/a.png 1.0\n", "lists no images"),
+        ("1.0 rgb/a.png 1.0 depth/a.png\n2.0 rgb/b.png\n", "Line 2 of .*time path time path"),
+        ("1.0 rgb/a.png 1.0 depth/a.png\nnan x 1 y\n", "Line 2"),
+        ("1.0 rgb/a.png 1.0 depth/a.png\n", "None of the 1 color images"),
+        ("1.0 ../../rgb/a.png 1.0 /etc/passwd\n", "None of the 1 color images"),
+    ],
+)
+def test_bad_associations(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "associations.txt").write_text(text)
+    with pytest.raises(CaptureError, match=message):
+        open_capture(tmp_path)
+
+
+def test_color_alone_needs_no_depth_list(tmp_path: Path) -> None:
+    write_tum(tmp_path, 3)
+    (tmp_path / "depth.txt").write_text("")
+    capture = Reader(tmp_path, Options(depth=False))
+    assert len(capture) == 3
+    assert not capture[2].depth_m.any()
+
+
+def test_icl_nuims_poses_agree_with_its_depth() -> None:
+    """Its depth, warped by the poses, meets the next image; by the poses as stored it is twice as far off."""
+    capture = open_capture(data_folder() / "wild" / "icl-nuim", Options(intrinsics=(481.2, 480.0, 319.5, 239.5)))
+    assert capture.format == "tum_rgbd"
+    mirror = np.diag((1.0, -1.0, 1.0, 1.0))
+    first, last = capture.pose(0), capture.pose(5)
+    assert first is not None
+    assert last is not None
+    T = invert(last) @ first
+    assert isinstance(capture, Reader)
+    capture.units_per_meter = 5000.0
+    right, stored = (color_difference(capture, motion) for motion in (T, mirror @ T @ mirror))
+    assert right < 0.6 * stored
+
+
+def color_difference(capture: Reader, T_last_first: np.ndarray) -> float:
+    first, last = capture[0], capture[5]
+    camera: Intrinsics = first.intrinsics
+    v, u = np.mgrid[: camera.height : 4, : camera.width : 4]
+    depth_m = first.depth_m[::4, ::4]
+    points = back_project(np.stack((u, v), axis=-1), depth_m, camera)[depth_m > 0]
+    pixels, _ = project(transform(T_last_first, points.astype(np.float64)), camera)
+    column, row = pixels.round().astype(int).T
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    seen = first.color[::4, ::4][depth_m > 0][inside].astype(float)
+    return float(np.abs(last.color[row[inside], column[inside]] - seen).mean())
