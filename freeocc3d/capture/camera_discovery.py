@@ -59,7 +59,7 @@ def _candidates(place: Path, own: bool) -> Iterator[tuple[Path, bool]]:
     names = list_folder(place)
     folders = [name for name in names if own and _FOLDERS.fullmatch(name.lower())]
     for group in (names, *([f"{name}/{inner}" for inner in list_folder(place / name)] for name in folders)):
-        files = [place / name for name in group if Path(name).suffix.lower() in _SUFFIXES]
+        files = [place / name for name in group if name.lower().endswith(tuple(_SUFFIXES))]
         likely = [(file, sure) for file in files if (sure := _is_likely(file, own)) is not None]
         if len(likely) <= _MOST_FILES:  # more are those of each frame
             yield from likely

@@ -18,6 +18,7 @@ COLOR_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".
 
 _KIND = r"(?:rgb|colou?r|image|img|frame|left|picture|photo)s?"
 _MADE = r"(?:aligned|undistorted|undist|rectified|rect|resized|raw|registered|camera|cam|kinect|realsense|main)"
+_LIKELY = re.compile(r"(?i:rgb|colou?r|ima?g|frame|left|picture|photo|depth|conf|pose)")
 _COLOR = re.compile(rf"{_MADE}?{_KIND}{_MADE}?(?:{_KIND})?{_MADE}?\d?")
 _DEPTH = re.compile(r"depth")
 _NO_DEPTH = re.compile(
@@ -26,6 +27,7 @@ _NO_DEPTH = re.compile(
 _CONFIDENCE = re.compile(r"(?:depth)?conf(?:idence)?s?(?:maps?|images?|imgs?|depth)?")
 _POSES = re.compile(r"(?:camera|cam|gt)?poses?")
 _NO_COLOR = re.compile(r"depth|disp|conf|mask|label|sem|inst|normal|thumb|_ir\b|infra")
+_ENDINGS = tuple(COLOR_SUFFIXES | DEPTH_SUFFIXES)
 _FIRST_COLOR = ("rgb", "color", "colour")
 _FIRST_DEPTH = ("depth", "depths")
 _REGISTERED = re.compile(r"align|regist|tocolou?r|torgb|undist|rect")
@@ -70,11 +72,12 @@ class PairList:
 
 def find_folders(path: Path) -> PairedFolders | None:
     """The color and depth images of ``path``; None if it has not both. Looks at names only."""
-    folders = {name: _simplify(name) for name in list_folder(path) if not name.startswith(".")}
+    names = [name for name in list_folder(path) if not name.startswith(".")]
+    folders = {name: _simplify(name) for name in names if _LIKELY.search(name)}
     color = _best(path, [name for name, simple in folders.items() if _COLOR.fullmatch(simple)], _FIRST_COLOR)
     depth_like = [name for name, simple in folders.items() if _DEPTH.search(simple) and not _NO_DEPTH.search(simple)]
     depth = _best(path, depth_like, _FIRST_DEPTH, DEPTH_SUFFIXES)
-    color_here, depth_here = _split(folders)
+    color_here, depth_here = _split(names)
     color = color or (path, color_here)
     depth = depth or (path, depth_here)
     if not color[1] or not depth[1]:
@@ -144,10 +147,13 @@ def _split(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The color and the depth images among files of one folder."""
     color, depth = list[str](), list[str]()
     for name in names:
-        stem, _, suffix = name.lower().rpartition(".")
-        if f".{suffix}" in DEPTH_SUFFIXES and _DEPTH.search(stem) and not _NO_DEPTH.search(stem):
+        lower = name.lower()
+        if not lower.endswith(_ENDINGS):
+            continue
+        stem = lower.rpartition(".")[0]
+        if lower.endswith(tuple(DEPTH_SUFFIXES)) and _DEPTH.search(stem) and not _NO_DEPTH.search(stem):
             depth.append(name)
-        elif f".{suffix}" in COLOR_SUFFIXES and not _NO_COLOR.search(stem):
+        elif lower.endswith(tuple(COLOR_SUFFIXES)) and not _NO_COLOR.search(stem):
             color.append(name)
     return tuple(color), tuple(depth)
 
