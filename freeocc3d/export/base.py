@@ -15,6 +15,7 @@ from typing import Any
 from ..core.atomic_files import write_whole
 from ..query.scan_map import Map
 from ..settings import registry
+from .file_names import check_name
 
 
 def export_map(
@@ -22,11 +23,13 @@ def export_map(
 ) -> list[str]:
     """Writes a map to ``path`` in the named format. Returns sentences for the user.
 
-    Raises ConfigError (unknown format, with the nearest name; unknown option), ExportError (the target exists or cannot
+    Raises ConfigError (unknown format, with the nearest name; unknown option; an ending of
+    another format), ExportError (the target exists or cannot
     be written, or the map has nothing to write).
     """
     exporter = registry.load("export", format_name)
     checked = registry.build_options(exporter, options or {}, f"{format_name}.")
+    check_name(format_name, Path(path))
     notes: list[str] = []
     write_whole(Path(path), lambda target: notes.extend(exporter.write(scan_map, target, checked) or []), overwrite)
     return notes

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import ConfigError, ExportError
+from ..core.errors import ExportError
 from ..core.types import BLOCK, FREE, OCCUPIED, UNKNOWN, Occupancy
 from ..query.scan_map import Map
 from .distance_transform import LONGEST, transform_signed
@@ -26,6 +26,7 @@ from .export_frames import Box, PlacedVoxels, VoxelOptions, find_world, place_vo
 from .openvdb_files import write_vdb
 
 REQUIRES: tuple[str, ...] = ()
+ENDINGS = (".npz", ".vdb")
 
 _BYTES_A_VOXEL = 6  # distance, state and the obstacle mask
 _LARGEST = 2 << 30
@@ -45,13 +46,11 @@ class Options(VoxelOptions, frozen=True):
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Writes the distances. Raises ConfigError for another ending, ExportError if the map has no obstacle, or if the
+    """Writes the distances. Raises ExportError if the map has no obstacle, or if the
     distances do not fit into 2 GiB."""
-    if path.suffix not in (".npz", ".vdb"):
-        raise ConfigError(f"Distances are written as .npz or .vdb, got '{path.name}'.")
     there = place_voxels(scan_map, options.frame, one_size=True, box=options.box)
     distance, state, origin = signed_distances(there.occupancy, options.unknown)
-    if path.suffix == ".vdb":
+    if path.suffix.lower() == ".vdb":
         _write_grid(path, there, distance)
         return
     with path.open("wb") as stream:

@@ -13,6 +13,7 @@ from ..settings.typed_options import TypedOptions
 from .export_frames import Frame, to_frame, write_description
 
 REQUIRES: tuple[str, ...] = ()
+ENDINGS = (".ply",)
 
 
 class Options(TypedOptions, frozen=True):

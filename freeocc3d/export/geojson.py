@@ -23,6 +23,7 @@ from ..settings.typed_options import TypedOptions
 from .export_frames import UprightFrame, to_frame
 
 REQUIRES: tuple[str, ...] = ()
+ENDINGS = (".geojson", ".json")
 
 _CORNERS = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1)
 

@@ -23,6 +23,7 @@ from .export_frames import PlacedVoxels, VoxelOptions, place_voxels
 from .ply import ColorBy, choose_colors
 
 REQUIRES: tuple[str, ...] = ()
+ENDINGS = (".glb",)
 
 _FLOAT, _UINT32, _UINT8 = 5126, 5125, 5121
 _VERTICES, _INDICES = 34962, 34963

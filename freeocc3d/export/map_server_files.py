@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 
@@ -56,7 +57,7 @@ def write_map(path: Path, pixels: NDArray[np.uint8], grid: CellGrid, reading: Re
     image.write_bytes(f"P5\n{rows.shape[1]} {rows.shape[0]}\n255\n".encode("ascii") + rows.tobytes())
     lines = [
         f"# freeocc3d, {grid.frame} frame; {about}",
-        f"image: {image.name}",
+        yaml.safe_dump({"image": image.name}, allow_unicode=True, width=1 << 16).strip(),
         f"mode: {reading.mode}",
         f"resolution: {grid.size:.12g}",
         f"origin: [{grid.origin[0]:.9g}, {grid.origin[1]:.9g}, 0.0]",

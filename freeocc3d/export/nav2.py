@@ -26,6 +26,7 @@ from .keepout_masks import parse_avoided, write_layers
 from .map_server_files import PLAN, CellGrid, write_map
 
 REQUIRES: tuple[str, ...] = ()
+ENDINGS = (".yaml", ".yml")
 
 _PIXEL = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
 _MOST_PIXELS = 1 << 28
@@ -76,10 +77,8 @@ class Plan:
 
 
 def write(scan_map: Map, path: Path, options: Options) -> list[str]:
-    """Writes the plan. Returns a sentence for each word to avoid that is nowhere. Raises ConfigError unless the file is
-    named .yaml, ExportError if nothing is known between the heights, or if the map does not understand a word."""
-    if path.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"The name of a map_server map must end in .yaml, got '{path.name}'.")
+    """Writes the plan. Returns a sentence for each word to avoid that is nowhere. Raises
+    ExportError if nothing is known between the heights, or if the map does not understand a word."""
     made = make_plan(scan_map, options)
     there, grid, floor = made.there, made.grid, made.floor_z
     pixels = np.zeros(256, np.uint8)

@@ -27,6 +27,7 @@ from ..query.scan_map import Map
 from .export_frames import Frame, VoxelOptions, find_world, place_voxels
 
 REQUIRES: tuple[str, ...] = ()
+ENDINGS = (".npz",)
 
 _LARGEST_DENSE = 2 << 30
 _MOST_CLASSES = 253  # 0 is free, up to 254 means "nothing known", 255 is unknown

@@ -20,6 +20,7 @@ from .export_frames import PlacedVoxels, VoxelOptions, place_voxels, write_descr
 from .octree import KEY_ORIGIN, Leaves, Octree, build_octree
 
 REQUIRES: tuple[str, ...] = ()
+ENDINGS = (".bt", ".ot")
 
 _CLAMP = np.log(0.1192 / 0.8808), np.log(0.971 / 0.029)
 """OctoMap's default range of log-odds."""
@@ -35,13 +36,9 @@ class Options(VoxelOptions, frozen=True):
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Writes the tree. Raises ConfigError for an ending other than .bt and .ot, or for colors in a .bt; ExportError if
-    nothing is known, or if the map is too large for a tree of its resolution."""
-    binary = path.suffix == ".bt"
-    if not binary and path.suffix != ".ot":
-        raise ConfigError(
-            f"The name of an OctoMap file must end in .bt (free or occupied) or .ot (log-odds), got '{path.name}'."
-        )
+    """Writes the tree. Raises ConfigError for colors in a .bt; ExportError if nothing is known, or if the map is too
+    large for a tree of its resolution."""
+    binary = path.suffix.lower() == ".bt"
     if binary and options.color:
         raise ConfigError("A .bt holds no colors: name the file .ot.")
     there, tree = make_tree(scan_map, options, log_odds=not binary, color=options.color)

@@ -20,6 +20,7 @@ from ..viewer.palette import assign_class_colors, color_by_height, color_by_valu
 from .export_frames import Frame, PlacedVoxels, VoxelOptions, place_voxels
 
 REQUIRES: tuple[str, ...] = ()
+ENDINGS = (".ply",)
 
 ColorBy = Literal["rgb", "class", "height", "probability"]
 """What the color of an occupied voxel shows."""

@@ -25,7 +25,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import ConfigError, ExportError, FreeOccError
+from ..core.errors import ExportError, FreeOccError
 from ..core.types import BLOCK, OCCUPIED, Occupancy
 from ..core.voxel_keys import pack_voxels
 from ..language.feature_codec import CodedFeatures, Features
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     import open3d as o3d
 
 REQUIRES: tuple[str, ...] = ()
+ENDINGS = (".npz",)
 
 _PER_VOXEL = {"probability": np.float32, "free": np.uint16, "hits": np.uint16, "state": np.uint8}
 _OF_OCCUPIED = {"color": np.uint8, "feature": np.float32}
@@ -56,10 +57,8 @@ class Options(VoxelOptions, frozen=True):
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
-    """Writes the grid. Raises ConfigError for an ending other than .npz, ExportError if nothing is known, or if
+    """Writes the grid. Raises ExportError if nothing is known, or if
     features take more than 2 GiB."""
-    if path.suffix != ".npz":
-        raise ConfigError(f"The name of a VoxelBlockGrid must end in .npz, got '{path.name}'.")
     there = place_voxels(scan_map, options.frame, one_size=True, box=options.box)
     described, beside = there.described(), {"T_world_map": find_world(scan_map, there.T_frame_map)}
     features: Features | None = None
