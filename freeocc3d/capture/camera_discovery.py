@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +14,15 @@ from ..core.image_files import Size
 from .camera_documents import MOST_BYTES, CameraDocument, StatedCamera, read_cameras
 from .camera_files import same_view
 from .lenses import Lens
+from .name_matching import match_names
 from .numbered_files import list_folder
 from .rgbd_frames import StatedCameras
 
 SAME_CAMERA = 0.01
 """Two statements of one camera agree if their parameters differ by less than this share of the image's width."""
+
+FEWEST_OWN = 0.5
+"""Files are those of single frames if more than this share of the color images has one."""
 
 _SUFFIXES = {".json", ".yaml", ".yml", ".txt", ".csv"}
 _SURE = re.compile(
@@ -39,30 +43,47 @@ class FoundCameras:
     units_per_meter: float | None = None
 
 
-def find_cameras(folder: Path, color_size: Size, depth_size: Size | None) -> FoundCameras:
+def find_frame_files(folder: Path, color_names: Sequence[str]) -> dict[int, Path]:
+    """The calibration files of single frames, such as ``calib/12.yaml`` of RTAB-Map: row of the color name -> file.
+    Empty if no calibration folder has one for most of the color images."""
+    for name in _calibration_folders(folder):
+        files = [inner for inner in list_folder(folder / name) if inner.lower().endswith(tuple(_SUFFIXES))]
+        found = match_names(color_names, files, by_time=False) if len(files) > 1 else None
+        if found is not None and len(found.first) > FEWEST_OWN * len(color_names):
+            return {row: folder / name / files[own] for row, own in zip(found.first, found.second, strict=True)}
+    return {}
+
+
+def find_cameras(folder: Path, color_size: Size, depth_size: Size | None, skipped: Path | None = None) -> FoundCameras:
     """The cameras of images of these sizes that files in the folder, its calibration folders or, failing that, its
-    parent state.
+    parent state. skipped: a calibration folder that holds files of single frames.
 
     Raises CaptureError: two files disagree, a file with the name of a calibration cannot be understood, or its camera
     cannot have taken the images.
     """
     for place in (folder, folder.absolute().parent):
-        found = [document for file in _candidates(place, place is folder) if (document := _read(file))]
+        found = [document for file in _candidates(place, place is folder, skipped) if (document := _read(file))]
         if found:
             return _combine(found, color_size, depth_size)
     return FoundCameras(StatedCameras())
 
 
-def _candidates(place: Path, own: bool) -> Iterator[tuple[Path, bool]]:
+def _candidates(place: Path, own: bool, skipped: Path | None) -> Iterator[tuple[Path, bool]]:
     """Files that may state a camera, and whether their names say so. own: place is the capture's folder; in another,
     only names that say so count."""
-    names = list_folder(place)
-    folders = [name for name in names if own and _FOLDERS.fullmatch(name.lower())]
-    for group in (names, *([f"{name}/{inner}" for inner in list_folder(place / name)] for name in folders)):
+    groups = [list_folder(place)]
+    if own:
+        folders = [name for name in _calibration_folders(place) if place / name != skipped]
+        groups += [[f"{name}/{inner}" for inner in list_folder(place / name)] for name in folders]
+    for group in groups:
         files = [place / name for name in group if name.lower().endswith(tuple(_SUFFIXES))]
         likely = [(file, sure) for file in files if (sure := _is_likely(file, own)) is not None]
         if len(likely) <= _MOST_FILES:  # more are those of each frame
             yield from likely
+
+
+def _calibration_folders(folder: Path) -> list[str]:
+    return [name for name in list_folder(folder) if _FOLDERS.fullmatch(name.lower())]
 
 
 def _is_likely(file: Path, own: bool) -> bool | None:

@@ -12,7 +12,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import PurePath
 from typing import Literal
 
 import numpy as np
@@ -122,7 +121,7 @@ def are_seconds(names: Sequence[str]) -> bool:
 def find_columns(names: Sequence[str]) -> list[Column]:
     """The numbers that differ from name to name, those with a decimal point first; last the whole names. All names
     hold equally many numbers. Empty if names say nothing."""
-    stems = [PurePath(name).stem.lower() for name in names]
+    stems = [_stem(name).lower() for name in names]
     if not stems:
         return []
     digits = [_numbers(stem) for stem in stems]
@@ -178,12 +177,17 @@ def _longest(found: Sequence[_Pairs]) -> _Pairs:
 
 def _alike(names: Sequence[str]) -> list[int]:
     """Rows of the names that have the form of most or, if forms vary, hold as many numbers as most do."""
-    stems = [PurePath(name).stem for name in names]
+    stems = [_stem(name) for name in names]
     forms = [_DIGITS.sub("#", stem) for stem in stems]
     if forms and Counter(forms).most_common(1)[0][1] < USUAL_FORM * len(forms):
         forms = [str(form.count("#")) for form in forms]
     usual = Counter(forms).most_common(1)[0][0] if forms else ""
     return [row for row, form in enumerate(forms) if form == usual]
+
+
+def _stem(name: str) -> str:
+    """The name without its suffix. Names are those of files, without folders."""
+    return name.rpartition(".")[0] or name
 
 
 def _numbers(stem: str) -> list[str]:

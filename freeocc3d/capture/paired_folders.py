@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import re
 from collections import Counter
 from collections.abc import Iterable
@@ -28,6 +29,7 @@ _CONFIDENCE = re.compile(r"(?:depth)?conf(?:idence)?s?(?:maps?|images?|imgs?|dep
 _POSES = re.compile(r"(?:camera|cam|gt)?poses?")
 _NO_COLOR = re.compile(r"depth|disp|conf|mask|label|sem|inst|normal|thumb|_ir\b|infra")
 _ENDINGS = tuple(COLOR_SUFFIXES | DEPTH_SUFFIXES)
+_MOST_FOLDERS = 50
 _FIRST_COLOR = ("rgb", "color", "colour")
 _FIRST_DEPTH = ("depth", "depths")
 _REGISTERED = re.compile(r"align|regist|tocolou?r|torgb|undist|rect")
@@ -137,7 +139,7 @@ def _best(
         usual = first.index(simple) if simple in first else len(first)
         return not (first and _REGISTERED.search(simple)), usual, len(name), name
 
-    for name in sorted(names, key=rank):
+    for name in heapq.nsmallest(_MOST_FOLDERS, names, key=rank):
         if found := list_images(path / name, suffixes):
             return path / name, found
     return None

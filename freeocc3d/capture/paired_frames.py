@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, FrameError
+from ..core.image_files import Size
 from .base import Options
-from .camera_discovery import FoundCameras, find_cameras
+from .camera_discovery import FoundCameras, find_cameras, find_frame_files
+from .camera_documents import read_cameras
 from .depth_decoding import read_raw_depth
 from .frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
 from .lenses import Lens
 from .paired_folders import PairList
 from .paired_poses import assign_poses, find_pose_file, read_pose_folder, usable_pose
-from .rgbd_frames import Registration, StatedCameras, build_rig
+from .rgbd_frames import Registration, Rig, StatedCameras, build_rig
 from .trajectory_files import read_trajectory
 
 _MIRROR = np.diag((1.0, -1.0, 1.0, 1.0))
@@ -44,9 +46,12 @@ class PairedFrames(FileFrames):
         color_size = read_first_size(color, path)
         depth_size = read_first_depth_size(depth, path) if depth else None
         _check_depth(depth, path)
-        found = _cameras(path, options, color_size, depth_size, usual)
-        rig, self.intrinsics_known = build_rig(found.stated, options, color_size, depth_size)
-        self.focal_stated = self.intrinsics_known
+        own = find_frame_files(path, [file.name for file in color])
+        self._own_cameras, folder = _own_cameras(own, options)
+        found = _cameras(path, options, color_size, depth_size, usual, folder)
+        rig, known = build_rig(found.stated, options, color_size, depth_size)
+        self.intrinsics_known = self.focal_stated = known or bool(self._own_cameras)
+        self._sizes, self._rig = (color_size, depth_size), functools.lru_cache(maxsize=4)(self._read_rig)
         Registration(rig)  # raises CaptureError for a rig of too large images
         files = [
             FrameFiles(pair.color, pair.depth, rig, pair.time, confidence=pair.confidence) for pair in frames.pairs
@@ -54,6 +59,23 @@ class PairedFrames(FileFrames):
         super().__init__(path, options, files, found.units_per_meter or units_per_meter)
         self.warnings = frames.notices
         self._listed, self._pose_folder, self._mirrored = frames, pose_folder, mirrored
+
+    def rig(self, index: int) -> Rig:
+        """As in ``RgbdFrames``. Raises FrameError if the frame's own calibration is not usable."""
+        own = self._own_cameras.get(index)
+        return self.frames[index].rig if own is None else self._rig(own)
+
+    def _read_rig(self, file: Path) -> Rig:
+        (color_size, depth_size) = self._sizes
+        try:
+            document = read_cameras(file)
+            if document is None or document.color is None:
+                raise FrameError(f"{file} states no camera that is understood.")
+            depth = document.depth.lens(depth_size) if document.depth and depth_size else None
+            stated = StatedCameras(document.color.lens(color_size), depth, document.T_color_depth)
+            return build_rig(stated, self.options, color_size, depth_size)[0]
+        except CaptureError as error:
+            raise FrameError(str(error)) from error
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """As in ``Capture``. Raises CaptureError if the poses do not fit the frames."""
@@ -72,12 +94,18 @@ class PairedFrames(FileFrames):
         return [usable_pose(T) for T in assign_poses(read_trajectory(file), self._listed)]
 
 
+def _own_cameras(files: dict[int, Path], options: Options) -> tuple[dict[int, Path], Path | None]:
+    """The calibration files of frames, and their folder; a given camera replaces them."""
+    folder = next((file.parent for file in files.values()), None)
+    return ({} if options.intrinsics or options.focal else files), folder
+
+
 def _cameras(
-    path: Path, options: Options, color_size: tuple[int, int], depth_size: tuple[int, int] | None, usual: Lens | None
+    path: Path, options: Options, color_size: Size, depth_size: Size | None, usual: Lens | None, skipped: Path | None
 ) -> FoundCameras:
     """What files state; a given color camera replaces a file that is not usable."""
     try:
-        found = find_cameras(path, color_size, depth_size)
+        found = find_cameras(path, color_size, depth_size, skipped)
     except CaptureError:
         if not (options.intrinsics or options.focal):
             raise

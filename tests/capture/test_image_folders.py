@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -269,3 +270,51 @@ def test_color_alone_can_be_read(tmp_path: Path) -> None:
     capture = open_capture(tmp_path, Options(depth=False))
     assert [int(capture[i].color[0, 0, 2]) for i in range(4)] == [80, 90, 100, 110]
     assert not capture[0].depth_m.any()
+
+
+def test_a_calibration_of_each_frame(tmp_path: Path) -> None:
+    """As RTAB-Map exports them; a frame without one has the camera that is usual, one with a bad one is broken."""
+    write_frames(tmp_path, "rgb/{}.png", "depth/{}.png", range(20, 24))
+    (tmp_path / "calib").mkdir()
+    for i in (20, 21, 22):
+        matrix = [30.0 + i, 0.0, 16.0, 0.0, 30.0 + i, 12.0, 0.0, 0.0, 1.0]
+        (tmp_path / "calib" / f"{i}.yaml").write_text(
+            "%YAML:1.0\n---\nimage_width: 32\nimage_height: 24\ncamera_matrix:\n   rows: 3\n   cols: 3\n"
+            f"   data: {matrix}\n"
+        )
+    (tmp_path / "calib" / "22.yaml").write_text("nothing")
+    capture = open_capture(tmp_path)
+    assert capture.intrinsics_known
+    assert [capture[i].intrinsics.fx for i in (0, 1)] == [50.0, 51.0]
+    with pytest.raises(FrameError, match=r"22\.yaml states no camera"):
+        capture[2]
+    assert capture[3].depth_m.any()
+    assert open_capture(tmp_path, Options(focal=40.0))[2].intrinsics.fx == 40.0
+
+
+@pytest.mark.parametrize("name", ["trajectory.log", "K.txt", "camera_intrinsic.json", "rgb/2.png", "depth/2.png"])
+@pytest.mark.parametrize("target", ["pipe", "/dev/zero", "loop", "folder"])
+def test_a_hostile_file_ends_in_a_sentence(tmp_path: Path, name: str, target: str) -> None:
+    path = write_frames(tmp_path, "rgb/{}.png", "depth/{}.png") / name
+    path.unlink(missing_ok=True)
+    if target == "pipe":
+        os.mkfifo(path)
+    elif target == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(path if target == "loop" else target)
+    with pytest.raises((CaptureError, FrameError), match=path.stem):
+        read_frame(tmp_path, 2)
+
+
+def read_frame(folder: Path, index: int) -> None:
+    capture = open_capture(folder)
+    capture[index]
+    capture.pose(index)
+
+
+@pytest.mark.parametrize("loop", ["rgb", "depth", "pose", "calib"])
+def test_a_folder_that_is_a_loop_of_links_is_none(tmp_path: Path, loop: str) -> None:
+    write_frames(tmp_path, "color_images/{}.png", "depths/{}.png")
+    (tmp_path / loop).symlink_to(loop)
+    check_frames(tmp_path)
