@@ -26,7 +26,7 @@ from .base import Capture
 from .camera_files import FARTHEST, explain_no_pose, read_matrix
 from .colmap_models import read_colmap_model
 from .colmap_projects import colmap_folder
-from .nerfstudio_files import read_transforms
+from .nerfstudio_files import Transforms, read_transforms
 from .number_files import read_number_rows
 from .numbered_files import list_folder
 from .pose_tables import UNITS, read_pose_table
@@ -196,7 +196,11 @@ def _read_text(path: Path) -> PoseFile:
 
 
 def _read_nerfstudio(path: Path) -> PoseFile:
-    content = read_transforms(path)
+    return poses_of_transforms(read_transforms(path), path)
+
+
+def poses_of_transforms(content: Transforms, path: Path) -> PoseFile:
+    """The poses of nerfstudio's file ``path``. Raises CaptureError if one is not rigid, or there is none."""
     names = tuple(Path(frame.file_path).name for frame in content.frames)
     return _checked(PoseFile(path, content.poses(), names=names))
 

@@ -32,7 +32,7 @@ from ..nerfstudio_files import PosedFrame, Transforms, read_transforms
 from ..point_files import read_points
 from ..posed_images import PosedImage, PosedImages, compute_nominal_scale, resolve_inside
 from ..rgbd_frames import Rig, StatedCameras, build_rig
-from ..trajectory_files import read_trajectory
+from ..trajectory_files import poses_of_transforms
 from .photos import make_natural_key, read_header
 
 REQUIRES: tuple[str, ...] = ()
@@ -62,7 +62,7 @@ class Reader(FileFrames):
     def __init__(self, path: Path, options: Options):
         file = path / TRANSFORMS
         content = read_transforms(file)
-        poses = read_trajectory(file).T_world_cam  # also checks that they are rigid
+        poses = poses_of_transforms(content, file).T_world_cam
         images, left_out = _find([frame.file_path for frame in content.frames], path, "color")
         depths, without_depth = _find([frame.depth_name for frame in content.frames if options.depth], path, "depth")
         views = []
