@@ -86,8 +86,8 @@ def _latched() -> Any:
     """The quality of service of topics whose last message new subscribers get."""
     from rosbags import interfaces as of
 
-    forever = of.QosTime(2147483647, 4294967295)
+    unset = of.QosTime(0, 0)
     return of.Qos(
-        of.QosHistory.KEEP_LAST, 1, of.QosReliability.RELIABLE, of.QosDurability.TRANSIENT_LOCAL, forever, forever,
-        of.QosLiveliness.AUTOMATIC, forever, False,
+        of.QosHistory.KEEP_LAST, 1, of.QosReliability.RELIABLE, of.QosDurability.TRANSIENT_LOCAL, unset, unset,
+        of.QosLiveliness.AUTOMATIC, unset, False,
     )  # fmt: skip

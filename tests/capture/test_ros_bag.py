@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
 from numpy.typing import NDArray
 from ros_bags import COLOR, DEPTH, START_S, Kind, Messages, Sent, encode, stored_file, write_bag
 from small_captures import SIZE, color_image, data_folder, depth_image
@@ -71,6 +73,37 @@ def test_a_file_alone_is_read_as_its_folder(kind: Kind, tmp_path: Path) -> None:
     assert len(open_capture(file)) == COUNT
     (file.parent / "metadata.yaml").unlink()
     assert len(open_bag(file.parent)) == COUNT
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        {"use_chunking": False},
+        {"use_chunking": False, "index_types": IndexType.NONE, "repeat_channels": False, "use_statistics": False},
+        {"index_types": IndexType.NONE, "repeat_channels": False, "compression": CompressionType.LZ4},
+        {"index_types": IndexType.CHUNK, "compression": CompressionType.ZSTD, "chunk_size": 5000},
+        {"compression": CompressionType.NONE, "chunk_size": 5000, "repeat_channels": False},
+    ],
+)
+def test_mcap_files_of_other_writers(written: dict[str, Any], tmp_path: Path) -> None:
+    """Without chunks, index, or a summary of the channels, as fast recorders write them."""
+    messages = Messages("mcap")
+    file = stored_file(write_bag(tmp_path / "scan", messages, scan(messages)))
+    with file.open("rb") as read, (tmp_path / "again.mcap").open("wb") as stream:
+        writer = Writer(stream, **written)
+        writer.start("ros2", "test")
+        channels: dict[str, int] = {}
+        for schema, channel, message in make_reader(read).iter_messages():
+            assert schema is not None
+            if channel.topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+            writer.add_message(channels[channel.topic], message.log_time, message.data, message.log_time)
+        writer.finish()
+    capture = open_bag(tmp_path / "again.mcap")
+    assert len(capture) == COUNT
+    for index in (2, 0, 3):
+        np.testing.assert_array_equal(capture[index].color, color_image(index))
 
 
 def test_a_folder_of_several_files_is_one_scan(tmp_path: Path) -> None:
