@@ -73,7 +73,7 @@ class McapStore(MessageStore):
             source, base = (self._file, 0) if row < 0 else self._content(row)
             start = source.read(base + at, _PREFIX)
             kind, size = struct.unpack("<BQ", start)
-        except struct.error as error:
+        except (struct.error, UnicodeDecodeError) as error:
             raise DamagedFile("it is damaged: run mcap recover") from error
         if kind != _MESSAGE or size < _MESSAGE_HEAD:
             raise DamagedFile("its index is damaged: it leads to no message")
