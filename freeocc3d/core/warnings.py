@@ -12,6 +12,7 @@ Code = Literal[
     "depth-scale-doubtful",
     "poses-doubtful",
     "intrinsics-unknown",
+    "extrinsics-unknown",
     "focal-estimated",
     "color-focal-corrected",
     "models-apart",

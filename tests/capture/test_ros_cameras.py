@@ -125,3 +125,68 @@ def test_a_camera_is_found_by_its_frame(tmp_path: Path) -> None:
     capture = Reader(write_bag(tmp_path / "scan", messages, sent), Options())
     assert capture.intrinsics_known
     assert capture[0].intrinsics.fx == 40
+
+
+def two_frames(messages: Messages) -> list[Sent]:
+    sent: list[Sent] = []
+    for index in range(3):
+        at = index * 10**8
+        sent.append((COLOR, at, messages.image(color_image(index), "rgb8", 1 + index / 10, frame="color")))
+        sent.append((DEPTH, at, messages.image(depth_image(0), "16UC1", 1 + index / 10, frame="depth")))
+    return sent
+
+
+def test_cameras_apart_without_a_transform_are_told(tmp_path: Path) -> None:
+    messages = Messages("db3")
+    capture = Reader(write_bag(tmp_path / "scan", messages, two_frames(messages)), Options())
+    assert [notice.code for notice in capture.warnings] == ["extrinsics-unknown"]
+    assert "Record /tf_static" in capture.warnings[0].text
+    assert capture.pose(0) is None
+
+
+def test_extrinsics_of_realsense_ros_are_read(tmp_path: Path) -> None:
+    """A message that rosbags does not know: rotation by columns, then the translation."""
+    from rosbags.typesys import get_types_from_msg
+
+    messages = Messages("mcap")
+    kind = "realsense2_camera_msgs/msg/Extrinsics"
+    if kind not in messages.store.fielddefs:
+        messages.store.register(get_types_from_msg("float64[9] rotation\nfloat64[3] translation\n", kind))
+    T = pose_matrix(5)
+    stated = messages.store.types[kind](rotation=T[:3, :3].T.reshape(-1).copy(), translation=T[:3, 3].copy())
+    sent: list[Sent] = [("/camera/extrinsics/depth_to_color", 0, stated), *two_frames(messages)]
+    capture = Reader(write_bag(tmp_path / "scan", messages, sent), Options())
+    assert capture.warnings == ()
+    np.testing.assert_allclose(capture.rig(0).T_color_depth, T, atol=1e-12)
+
+
+def moving(messages: Messages, parent: str, child: str, seconds: float, T: Any) -> Any:
+    message = messages.transforms((parent, child, T))
+    message.transforms[0].header = messages.header(seconds, parent)
+    return message
+
+
+@pytest.mark.parametrize("kind", ["bag", "db3"])
+def test_poses_follow_the_frames_up_to_the_one_that_stands_still(kind: Any, tmp_path: Path) -> None:
+    messages = Messages(kind)
+    T_base_color = pose_matrix(4)
+    sent: list[Sent] = [("/tf_static", 0, messages.transforms(("base", "color", T_base_color)))]
+    for row in range(3):  # half a step before, and half a step after the first two images
+        at = 0.95 + row / 10
+        sent.append(("/tf", round(at * 1e9), moving(messages, "map", "base", at, pose_matrix(2 * row))))
+    capture = Reader(write_bag(tmp_path / "scan", messages, [*sent, *two_frames(messages)]), Options())
+    for index in range(2):
+        pose = capture.pose(index)
+        assert pose is not None
+        np.testing.assert_allclose(pose, pose_matrix(2 * index + 1) @ T_base_color, atol=1e-3)
+    assert capture.pose(2) is None  # after the last transform
+
+
+def test_frames_in_a_circle_have_no_pose(tmp_path: Path) -> None:
+    messages = Messages("bag")
+    sent: list[Sent] = []
+    for row in range(4):
+        sent.append(("/tf", row, moving(messages, "a", "color", 0.9 + row / 10, pose_matrix(row))))
+        sent.append(("/tf", row, moving(messages, "color", "a", 0.9 + row / 10, pose_matrix(row))))
+    capture = Reader(write_bag(tmp_path / "scan.bag", messages, [*sent, *two_frames(messages)]), Options())
+    assert capture.pose(0) is None

@@ -7,7 +7,9 @@ times in the messages' headers; without an index, and where chunks are compresse
 
 from __future__ import annotations
 
+import functools
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +20,14 @@ from ...core.errors import CaptureError, FrameError
 from ...core.warnings import Notice
 from ...settings.typed_options import TypedOptions
 from .. import base
+from ..camera_files import is_pose
 from ..depth_decoding import METERS, MILLIMETERS, RawDepth
 from ..file_bytes import DamagedFile
 from ..lenses import Lens
 from ..rgbd_frames import Registration, RgbdFrames, Rig, StatedCameras, build_rig
 from ..ros import stores
 from ..ros.camera_messages import FrameTree, lens_of_info, transform_matrix
+from ..ros.frame_paths import FramePaths
 from ..ros.image_messages import decode_color, decode_depth, describe_image
 from ..ros.message_store import Messages, Place
 from ..ros.message_types import deserialize
@@ -35,7 +39,7 @@ REQUIRES: tuple[str, ...] = ("rosbags",)
 _STAMP = np.dtype([("before", "V4"), ("seconds", "<u4"), ("nanoseconds", "<u4")])
 """First bytes of a message with a header: its number (ROS 1) or CDR's form (ROS 2), and its time."""
 _BIG_ENDIAN_FORMS = (0, 2)
-_TRIES, _MOST_TRANSFORMS = 5, 1000
+_TRIES, _MOST_TRANSFORMS, _MOST_POSES = 5, 1000, 2_000_000
 
 _REALSENSE_UNITS = re.compile(r"/device_\d+/sensor_\d+/option/Depth[ _]Units/value")
 _REALSENSE_PLACE = "/tf/0"
@@ -196,10 +200,53 @@ class Reader(RgbdFrames):
         if frames[0] == frames[1] or not all(frames):
             return None
         tree = FrameTree()
-        names = [name for name, kind in self._store.topics.items() if kind in TF_TYPES]
-        for name in sorted(names, key=lambda name: not name.endswith("static")):
+        for name in self._transform_topics():
             tree.add(self._some(name, _MOST_TRANSFORMS))
-        return tree.find(*frames)
+        T_color_depth = tree.find(*frames)
+        if T_color_depth is None:
+            T_color_depth = self._stated_extrinsics(color)
+        if T_color_depth is None:
+            text = (
+                f"{self._source} holds color of the frame {frames[0]} and depth of the frame {frames[1]}, but nothing "
+                "says where the two are: they are taken as one. Record /tf_static, or aligned_depth_to_color."
+            )
+            self.warnings = (*self.warnings, Notice("extrinsics-unknown", text))
+        return T_color_depth
+
+    def _transform_topics(self) -> list[str]:
+        """The topics of tf, those of fixed transforms first."""
+        names = [name for name, kind in self._store.topics.items() if kind in TF_TYPES]
+        return sorted(names, key=lambda name: (not name.endswith("static"), name))
+
+    def _stated_extrinsics(self, color: ImageTopic) -> NDArray[np.float64] | None:
+        """(4, 4) T_color_depth of realsense-ros's message Extrinsics, whose last fields are a rotation by columns and a
+        translation; None if there is none."""
+        names = [name for name in self._store.topics if name.endswith("extrinsics/depth_to_color")]
+        for name in (name for name in names if name.split("/")[1] == color.name.split("/")[1]):
+            found = self._find(name)
+            try:
+                values = np.frombuffer(self._store.read(found.place(0))[-96:], "<f8") if len(found) else np.zeros(0)
+            except (DamagedFile, OSError, ValueError):
+                continue
+            T = np.eye(4)
+            if len(values) == 12:
+                T[:3, :3], T[:3, 3] = values[:9].reshape(3, 3).T, values[9:]
+                if is_pose(T):
+                    return T
+        return None
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        """(4, 4) T_root_color at the time of the color image, where tf has a chain of frames that moves."""
+        return self._paths.pose(self._topics[0].kind.frame_id, float(self.timestamps[index]))
+
+    @functools.cached_property
+    def _paths(self) -> FramePaths:
+        def transforms() -> Iterator[tuple[Any, bool]]:
+            for name in self._transform_topics():
+                static = name.endswith("static")
+                yield from ((message, static) for message in self._some(name, _MOST_POSES))
+
+        return FramePaths(transforms())
 
 
 def _ascending(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
