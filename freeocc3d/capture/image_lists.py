@@ -69,11 +69,14 @@ def read_lists(lists: ListFiles, path: Path, with_depth: bool) -> tuple[PairList
     """
     if lists.associations is not None:
         return _read_associations(lists.associations, path, with_depth)
-    assert lists.color is not None
+    if lists.color is None or (lists.depth is None and with_depth):
+        raise CaptureError(
+            f"{path} holds no lists of color and depth images: it needs rgb.txt and depth.txt (lines 'time path'), or "
+            "associations.txt (lines 'time path time path')."
+        )
     color, notices = _existing(_read_list(lists.color), path, lists.color, "color")
     if not with_depth or lists.depth is None:
-        rows = range(len(color.names))
-        return _ordered(color, [(row, None) for row in rows], notices), False
+        return _ordered(color, [(row, None) for row in range(len(color.names))], notices), False
     depth, missing = _existing(_read_list(lists.depth), path, lists.depth, "depth")
     tolerance = time_tolerance(color.times, depth.times)
     own, other = associate_nearest(color.times, depth.times, tolerance)

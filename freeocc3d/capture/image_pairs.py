@@ -8,6 +8,7 @@ color files count, and no depth file is read.
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +19,11 @@ from numpy.typing import NDArray
 from ..core.errors import CaptureError, FrameError
 from ..core.image_files import Size
 from .base import Options
+from .depth_decoding import SUFFIXES as DEPTH_SUFFIXES
 from .depth_decoding import read_raw_depth
 from .frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
 from .image_decoding import read_classes
+from .numbered_files import list_folder
 from .rgbd_frames import Registration, Rig
 
 
@@ -52,8 +55,8 @@ def pair_files(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Pat
         return Pairs(tuple(numbers), tuple(color[n] for n in numbers), (None,) * len(numbers), size, size)
     if not depth:
         raise CaptureError(
-            f"{folder} holds {len(color)} color images but no depth: add depth, or map color only with "
-            "capture.depth=false."
+            f"{folder} holds {len(color)} color images but no depth{_other_depth(folder)}: add depth, or map color "
+            "only with capture.depth=false."
         )
     numbers = sorted(color.keys() | depth.keys())
     incomplete = sorted(color.keys() ^ depth.keys())
@@ -103,3 +106,15 @@ def _holds_floats(depth: Sequence[Path | None]) -> bool:
         with contextlib.suppress(FrameError):
             return bool(read_raw_depth(path).dtype.kind == "f")
     return False
+
+
+def _other_depth(folder: Path) -> str:
+    """What ``depth/`` holds instead of depth files, in words that start with a comma."""
+    suffixes = Counter(Path(name).suffix.lower() for name in list_folder(folder / "depth") if name[0] != ".")
+    if not suffixes:
+        return ""
+    suffix, count = suffixes.most_common(1)[0]
+    if suffix in DEPTH_SUFFIXES:
+        return f", for the names of the files in {folder / 'depth'} have no frame numbers"
+    files = f"{count} {suffix or 'other'} files" if count > 1 else f"one {suffix or 'other'} file"
+    return f", for {folder / 'depth'} has {files}; {', '.join(sorted(DEPTH_SUFFIXES))} are read"

@@ -21,6 +21,9 @@ from .paired_poses import assign_poses, find_pose_file, read_pose_folder, usable
 from .rgbd_frames import Registration, Rig, StatedCameras, build_rig
 from .trajectory_files import read_trajectory
 
+ICL_NUIM = ".freiburg"
+"""Suffix of ICL-NUIM's poses, as in livingRoom0.gt.freiburg."""
+
 _MIRROR = np.diag((1.0, -1.0, 1.0, 1.0))
 _SAMPLES = 3
 
@@ -79,10 +82,7 @@ class PairedFrames(FileFrames):
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """As in ``Capture``. Raises CaptureError if the poses do not fit the frames."""
-        T_world_cam = self._poses[index]
-        if T_world_cam is None or not self._mirrored:
-            return T_world_cam
-        return np.asarray(_MIRROR @ T_world_cam @ _MIRROR)
+        return self._poses[index]
 
     @functools.cached_property
     def _poses(self) -> list[NDArray[np.float64] | None]:
@@ -91,7 +91,10 @@ class PairedFrames(FileFrames):
         file = find_pose_file(self.path)
         if file is None:
             return [None] * len(self)
-        return [usable_pose(T) for T in assign_poses(read_trajectory(file), self._listed)]
+        T_world_cam = assign_poses(read_trajectory(file), self._listed)
+        if self._mirrored or file.suffix.lower() == ICL_NUIM:
+            T_world_cam = _MIRROR @ T_world_cam @ _MIRROR
+        return [usable_pose(T) for T in T_world_cam]
 
 
 def _own_cameras(files: dict[int, Path], options: Options) -> tuple[dict[int, Path], Path | None]:
@@ -126,4 +129,7 @@ def _check_depth(depth: list[Path], path: Path) -> None:
         else:
             return
     if reason:
-        raise CaptureError(f"The depth of {path} cannot be used: {reason}")
+        raise CaptureError(
+            f"The depth of {path} cannot be used: {reason} Give depth of 16 bits or floats, or map color only with "
+            "capture.depth=false."
+        )

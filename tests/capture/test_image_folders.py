@@ -141,6 +141,16 @@ def test_names_that_do_not_match_are_counted(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
+def test_depth_beside_color_is_never_denied(tmp_path: Path) -> None:
+    check_frames(write_frames(tmp_path / "a", "color/{}.png", "depths/{}.png"))
+    for i in range(3):
+        write_image(tmp_path / "b" / "color" / f"{i}.png", color_image(i))
+        (tmp_path / "b" / "depth").mkdir(exist_ok=True)
+        (tmp_path / "b" / "depth" / f"{i}.raw").write_bytes(b"")
+    with pytest.raises(CaptureError, match=r"but no depth, for .*depth has 3 \.raw files; \.exr, .*\.png"):
+        open_capture(tmp_path / "b")
+
+
 def test_two_kinds_of_one_image_are_refused(tmp_path: Path) -> None:
     write_frames(tmp_path, "rgb/{}.png", "depth/{}.png")
     for i in range(4):

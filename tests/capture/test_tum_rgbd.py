@@ -183,6 +183,14 @@ def test_bad_associations(tmp_path: Path, text: str, message: str) -> None:
         open_capture(tmp_path)
 
 
+def test_a_list_alone_is_told(tmp_path: Path) -> None:
+    write_tum(tmp_path, 2)
+    (tmp_path / "depth.txt").unlink()
+    (tmp_path / "depth").rename(tmp_path / "other")
+    with pytest.raises(CaptureError, match=r"needs rgb\.txt and depth\.txt"):
+        open_capture(tmp_path, Options(format="tum_rgbd"))
+
+
 def test_color_alone_needs_no_depth_list(tmp_path: Path) -> None:
     write_tum(tmp_path, 3)
     (tmp_path / "depth.txt").write_text("")
@@ -204,6 +212,23 @@ def test_icl_nuims_poses_agree_with_its_depth() -> None:
     capture.units_per_meter = 5000.0
     right, stored = (color_difference(capture, motion) for motion in (T, mirror @ T @ mirror))
     assert right < 0.6 * stored
+
+
+def test_the_poses_of_icl_nuim_have_y_up(tmp_path: Path) -> None:
+    """Beside associations with depth first and numbers as times, or in a file of its suffix."""
+    up = np.diag((1.0, -1.0, 1.0, 1.0))
+    for i in range(3):
+        write_image(tmp_path / "rgb" / f"{i}.png", color_image(i))
+        write_image(tmp_path / "depth" / f"{i}.png", depth_image(i))
+    lines = "".join(pose_line(i, up @ pose_matrix(i) @ up) for i in range(3))
+    (tmp_path / "livingRoom0.gt.freiburg").write_text(lines)
+    np.testing.assert_allclose(open_capture(tmp_path).pose(2), pose_matrix(2), atol=1e-6)
+    (tmp_path / "livingRoom0.gt.freiburg").rename(tmp_path / "groundtruth.txt")
+    (tmp_path / "associations.txt").write_text("".join(f"{i} depth/{i}.png {i} rgb/{i}.png\n" for i in range(3)))
+    capture = open_capture(tmp_path)
+    assert capture.format == "tum_rgbd"
+    np.testing.assert_allclose(capture.pose(2), pose_matrix(2), atol=1e-6)
+    np.testing.assert_array_equal(capture.timestamps, np.arange(3))
 
 
 def color_difference(capture: Reader, T_last_first: np.ndarray) -> float:

@@ -20,6 +20,7 @@ from ..image_lists import find_lists
 from ..image_pairs import ImagePairs, Pairs, pair_files
 from ..lenses import Lens
 from ..numbered_files import has_file, list_numbered
+from ..paired_folders import find_folders
 from ..rgbd_frames import StatedCameras, build_rig
 
 REQUIRES: tuple[str, ...] = ()
@@ -82,8 +83,10 @@ class Reader(ImagePairs):
             color, depth = list_numbered(path / "color", COLOR), list_numbered(path / "depth", DEPTH)
         except CaptureError:  # two files of one frame, which the constructor tells
             return True
+        if not depth:
+            return find_folders(path) is None  # else depth lies in a folder of another name
         few = MOST_ALONE_STATED if stated else MOST_ALONE
-        return not depth or len(color.keys() ^ depth.keys()) <= few * len(color.keys() | depth.keys())
+        return len(color.keys() ^ depth.keys()) <= few * len(color.keys() | depth.keys())
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         path = self._pose_files.get(self._pairs.numbers[index])
