@@ -29,8 +29,8 @@ def poses_of(positions: ArrayLike, quats_xyzw: ArrayLike, opengl: bool) -> tuple
     """
     t = np.asarray(positions, np.float64).reshape(-1, 3)
     quats = np.asarray(quats_xyzw, np.float64).reshape(-1, 4)
-    lengths = np.linalg.norm(quats, axis=1)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
+        lengths = np.linalg.norm(quats, axis=1)
         usable = np.isfinite(t).all(axis=1) & (np.abs(t).max(axis=1) <= FARTHEST) & (lengths > 1e-6) & (lengths < 1e3)
     unit = np.where(usable[:, None], quats / np.where(usable, lengths, 1.0)[:, None], (0.0, 0.0, 0.0, 1.0))
     T = np.tile(np.eye(4), (len(t), 1, 1))

@@ -119,9 +119,13 @@ def test_of_a_file_that_is_cut_off_the_whole_frames_are_used(tmp_path: Path) -> 
 def test_a_cut_off_header_is_refused(tmp_path: Path, size: int) -> None:
     path = write_sens(tmp_path / "a.sens")
     os.truncate(path, size)
-    assert not Reader.recognizes(path)
     with pytest.raises(CaptureError, match="its header is cut off"):
-        Reader(path, Options())
+        open_capture(path)
+    assert not Reader.recognizes(path.rename(tmp_path / "scan"))
+
+
+def test_a_recording_is_recognized_by_its_content(tmp_path: Path) -> None:
+    assert open_capture(write_sens(tmp_path / "scan.bin")).format == "scannet_sens"
 
 
 def test_other_versions_and_packings_are_refused(tmp_path: Path) -> None:

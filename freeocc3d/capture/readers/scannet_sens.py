@@ -103,9 +103,9 @@ class Reader(RgbdFrames):
     @classmethod
     def recognizes(cls, path: Path) -> bool:
         file = _find(path)
+        if file is None or file.suffix.lower() == ".sens":
+            return file is not None
         try:
-            if file is None:
-                return False
             with open_regular(file) as stream:
                 _read_header(stream, file)
                 return True
