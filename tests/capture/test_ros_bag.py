@@ -72,7 +72,9 @@ def test_a_file_alone_is_read_as_its_folder(kind: Kind, tmp_path: Path) -> None:
     np.testing.assert_array_equal(open_bag(file)[1].color, color_image(1))
     assert len(open_capture(file)) == COUNT
     (file.parent / "metadata.yaml").unlink()
-    assert len(open_bag(file.parent)) == COUNT
+    assert len(open_capture(file.parent)) == COUNT
+    (file.parent / "color").mkdir()
+    assert not Reader.recognizes(file.parent)  # images that were taken from it
 
 
 @pytest.mark.parametrize(

@@ -28,9 +28,12 @@ _PACKED = tuple(f"{suffix}.zstd" for suffix in SUFFIXES)
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a file starts as a bag does, or is named like one, or a folder holds the files of rosbag2."""
+    """Whether a file starts as a bag does, or is named like one, or a folder holds the files of rosbag2. Without
+    metadata.yaml, it must hold nothing else: a bag may lie next to images that were taken from it."""
     if path.is_dir():
-        return any(name.endswith((*SUFFIXES, *_PACKED)) for name in list_folder(path))
+        names = list_folder(path)
+        bags = [name.endswith((*SUFFIXES, *_PACKED)) for name in names]
+        return any(bags) and (METADATA in names or all(bags))
     if path.suffix.lower() in (".bag", *SUFFIXES):
         return True
     try:
