@@ -31,7 +31,6 @@ def export(
 ) -> None:
     """Write a map in another program's format."""
     from ..export import export_map
-    from ..export.file_names import check_name
     from ..query.scan_map import load_map
     from ..settings import registry
     from ..settings.yaml_files import named_values
@@ -39,7 +38,6 @@ def export(
     known = registry.backend("export", format_name).options
     options: dict[str, Any] = {} if frame is None else {"frame": frame}
     options |= named_values(overrides or [], {option.name: option.kind for option in known})
-    check_name(format_name, output)
     refuse_existing(output, overwrite)
     progress, loaded = ConsoleProgress(), load_map(map_path)
     for note in export_map(loaded, format_name, output, options, overwrite=overwrite):

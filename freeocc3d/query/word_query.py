@@ -22,6 +22,7 @@ from ..core.errors import FreeOccError, MapError
 from ..core.types import Occupancy
 from ..language import word_matching
 from ..language.feature_codec import Features, compute_cosines, mask_known
+from ..language.phrases import read_phrase
 from ..occupancy.connected_components import label_components
 from ..settings.option_types import Cosine, PositiveInt, PositiveShare, Share
 from ..settings.typed_options import TypedOptions, nearest
@@ -96,8 +97,8 @@ def query(
     contrast: words for other things in the scan, added to the encoder's own.  negative: words for what is not meant. A
     voxel whose plain cosine with one of them is higher than with the word does not match, even if the word includes
     it, as "table" includes a coffee table.  up: (3,) unit vector, map frame.
-    Raises FreeOccError for an empty, too long or excluded word, or a negative word that is not understood; MapError if
-    the map's features are not those of the encoder.
+    Raises FreeOccError for an empty, too long or excluded word, one that says what is not meant ("not red"), or a
+    negative word that is not understood; MapError if the map's features are not those of the encoder.
     """
     options = options or Options()
     for word in (*words, *negative):
@@ -105,14 +106,16 @@ def query(
             raise FreeOccError("A word is empty: give a word or a phrase.")
         if len(word) > _LONGEST_WORD:
             raise FreeOccError(f"'{word[:30]}…' has {len(word)} characters; a query may have up to {_LONGEST_WORD}.")
-    text = text_encoder.encode_words(words)
-    excluded = text_encoder.encode_words(list(negative))
+    names = (*text_encoder.contrast_words(), *contrast)
+    asked, denied = ([read_phrase(word, names) for word in some] for some in (words, negative))
+    text = text_encoder.encode_words(asked)
+    excluded = text_encoder.encode_words(denied)
     for word, part in zip(negative, excluded.understood, strict=True):
         if not part:
             raise FreeOccError(f"'{word}' cannot be excluded{_only_known(word, text_encoder)}")
         if part in text.understood:
             raise FreeOccError(f"'{word}' is asked for and excluded: leave one out.")
-    others = text_encoder.encode_words(list(dict.fromkeys((*text_encoder.contrast_words(), *contrast, *negative))))
+    others = text_encoder.encode_words(list(dict.fromkeys((*names, *denied))))
     features = occupancy.features
     if len(features) and features.shape[1] != text.features.shape[1]:
         raise MapError(
@@ -147,7 +150,7 @@ def query(
             allowed = meant >= compute_cosines(features[rows], excluded.features).max(axis=1)
             rows, confidence = rows[allowed], confidence[allowed]
         regions = find_regions(occupancy, rows, scores[rows], confidence, threshold, options, up, word)
-        note = _note(word, part, text_encoder, scores, threshold, bool(regions))
+        note = _note(word, asked[w], part, text_encoder, scores, threshold, bool(regions))
         results.append(QueryResult(word, part, note, regions, np.ascontiguousarray(scores)))
     return results
 
@@ -271,6 +274,7 @@ def _only_known(word: str, text_encoder: TextEncoder) -> str:
 
 def _note(
     word: str,
+    phrase: str,
     understood: str,
     text_encoder: TextEncoder,
     scores: NDArray[np.float32],
@@ -285,7 +289,7 @@ def _note(
         highest = float(scores.max())
         why = f"the best score is {highest:.2f}" + (f", below {threshold:.2f}" if highest < threshold else "")
         return f"Nothing in this map looks like '{understood}': {why}."
-    asked = [token for token in re.findall(r"\w+", word.lower()) if token not in ("a", "an", "the")]
+    asked = [token for token in re.findall(r"\w+", phrase.lower()) if token not in ("a", "an", "the")]
     if len(asked) > len(re.findall(r"\w+", understood)):
         return f"Only '{understood}' of '{word}' was understood."
     return ""

@@ -177,6 +177,19 @@ def test_notes_say_why_nothing_or_only_a_part_was_found() -> None:
     assert whole.note == ""
 
 
+def test_a_prompt_asks_for_its_thing_and_a_denial_is_refused() -> None:
+    scan = occupancy(box((0, 0, 0), (2, 2, 2), feature(CUP=1)))
+    plain, framed = query(scan, WORDS, ["cup", "A photo of a cup."])
+    assert framed.word == "A photo of a cup."
+    assert (framed.understood, framed.note) == ("cup", "")
+    assert [region.rows.tolist() for region in framed.regions] == [region.rows.tolist() for region in plain.regions]
+    assert len(framed.regions) == 1
+    with pytest.raises(FreeOccError, match=r"'not a cup' says what is not meant .*--not WORD"):
+        query(scan, WORDS, ["not a cup"])
+    with pytest.raises(FreeOccError, match=r"'no cup' says what is not meant"):
+        query(scan, WORDS, ["cup"], negative=["no cup"])
+
+
 def test_an_empty_map_answers() -> None:
     empty = occupancy({})
     (result,) = query(empty, WORDS, ["cup"])
