@@ -176,10 +176,11 @@ class RgbdFrames(Capture):
 
         if confidence.shape != depth_m.shape:
             confidence = cv2.resize(confidence, depth_m.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-        depth_m[confidence == 0] = 0
-        unsure = registration.depth(np.where(confidence == 1, depth_m, np.float32(0))) > 0
+        depth_m *= confidence != 0
+        unsure = registration.depth(depth_m * (confidence == 1)) > 0
         depth_m = registration.depth(depth_m)
-        return depth_m, np.where(unsure, UNSURE_SIGMA, 1.0).astype(np.float32) * compute_sensor_sigma(depth_m)
+        times = unsure * np.float32(UNSURE_SIGMA - 1.0) + np.float32(1.0)
+        return depth_m, times * compute_sensor_sigma(depth_m)
 
 
 def _check_size(image: NDArray[Any], camera: Intrinsics, what: str) -> None:
