@@ -242,6 +242,11 @@ def report_missing(
     )
 
 
+def last_part(name: str) -> str:
+    """The name of a file without its folders, those of any system."""
+    return (_split(name) or [name])[-1]
+
+
 def _split(name: str) -> list[str]:
     """The parts of a path of any system, without a drive, ``.`` and ``..``."""
     parts = re.split(r"[\\/]+", re.sub(r"^[A-Za-z]:", "", name))

@@ -172,7 +172,8 @@ def _read_columns(rows: NumberRows, columns: _Columns) -> PoseTable:
     numbers = rows.column(columns.places["frame"]) if "frame" in columns.places else None
     finite: NDArray[np.bool_] = np.isfinite(np.column_stack((positions, quats_wxyz)))
     lost = np.asarray(~finite.any(axis=1))
-    lengths = np.where(lost, 1.0, np.linalg.norm(quats_wxyz, axis=1))
+    with np.errstate(over="ignore"):
+        lengths = np.where(lost, 1.0, np.linalg.norm(quats_wxyz, axis=1))
     low, high = _UNIT_LENGTH
     _refuse(rows, ~lost & ~finite.all(axis=1), "holds a number that is not finite beside others that are")
     _refuse(rows, np.abs(np.where(lost[:, None], 0, positions)).max(axis=1) > FARTHEST, "is too far away")

@@ -26,6 +26,7 @@ from .base import Capture
 from .camera_files import FARTHEST, explain_no_pose, read_matrix
 from .colmap_models import read_colmap_model
 from .colmap_projects import colmap_folder
+from .file_finding import last_part
 from .nerfstudio_files import Transforms, read_transforms
 from .number_files import read_number_rows
 from .numbered_files import list_folder
@@ -201,7 +202,7 @@ def _read_nerfstudio(path: Path) -> PoseFile:
 
 def poses_of_transforms(content: Transforms, path: Path) -> PoseFile:
     """The poses of nerfstudio's file ``path``. Raises CaptureError if one is not rigid, or there is none."""
-    names = tuple(Path(frame.file_path).name for frame in content.frames)
+    names = tuple(last_part(frame.file_path) for frame in content.frames)
     return _checked(PoseFile(path, content.poses(), names=names))
 
 
@@ -211,7 +212,7 @@ def _read_colmap(folder: Path) -> PoseFile:
     if not images:
         raise CaptureError(f"The COLMAP model {folder} holds no image with a pose: check the reconstruction.")
     T_cam_world = np.stack([image.T_cam_world for image in images])
-    return _checked(PoseFile(folder, invert(T_cam_world), names=tuple(Path(image.name).name for image in images)))
+    return _checked(PoseFile(folder, invert(T_cam_world), names=tuple(last_part(image.name) for image in images)))
 
 
 def _by_name(names: tuple[str, ...], frames: list[str]) -> dict[int, int]:

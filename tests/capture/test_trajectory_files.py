@@ -109,6 +109,14 @@ def test_a_binary_model_is_read_as_the_text_one(scan, tmp_path) -> None:
     np.testing.assert_allclose(read_trajectory(tmp_path / "binary" / "images.bin").of_frames(scan), POSES, atol=1e-6)
 
 
+def test_names_of_windows_are_those_of_their_last_part(scan, tmp_path) -> None:
+    path = write_nerfstudio(tmp_path / "transforms.json")
+    path.write_text(path.read_text().replace("images/", "C:\\\\2024\\\\images\\\\"))
+    found = read_trajectory(path)
+    assert found.names[1] == "frame-000001.color.png"
+    np.testing.assert_allclose(found.of_frames(scan), POSES, atol=1e-6)
+
+
 def test_times_are_matched_to_the_nearest_within_the_tolerance(scan, tmp_path) -> None:
     times = np.array((0.01, 1.015, 2.5, 3.0, 4.0, 40.0))
     found = read_trajectory(write_tum(tmp_path / "t.txt", times=times))

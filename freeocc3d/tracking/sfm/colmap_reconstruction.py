@@ -11,6 +11,7 @@ import pycolmap
 from ...capture.base import Capture
 from ...capture.colmap_models import ColmapModel, ModelCamera, ModelImage, read_colmap_model
 from ...capture.colmap_projects import colmap_folder
+from ...capture.file_finding import last_part
 from ...capture.lenses import Lens
 from ...core.errors import CaptureError, TrackingError
 from ...core.transforms import invert
@@ -33,7 +34,7 @@ def read_model(folder: Path, capture: Capture) -> Reconstruction:
     stems = {PurePath(name).stem: index for index, name in enumerate(names) if name}
 
     def frame_of(name: str) -> int | None:
-        own = PurePath(name)
+        own = PurePath(last_part(name))
         return whole.get(own.name, stems.get(own.stem))
 
     found = convert_model(model, len(capture), frame_of, str(folder))
