@@ -150,6 +150,10 @@ def query(map_path: MapPath, asked: Asked, place: Place, ranking: Ranking, answe
     _refuse_conflicts(asked, answer, closer)
     for target in answer.files:
         refuse_existing(target, answer.overwrite)
+    if answer.ply is not None:
+        from ..export.file_names import check_ending
+
+        check_ending(answer.ply, (".ply",), "ply")
     question = _question(asked, place, ranking)
     loaded = load_map(map_path)
     if asked.interactive:

@@ -40,6 +40,8 @@ def test_query_with_conditions_on_places(room) -> None:
     assert corners("red", "--within", -99, -99, -99, 99, 99, 99, "--near", "white:99") == every
     assert "none is on 'unicorn'" in run("query", room, "red", "--on", "unicorn").stdout
     assert "excluded" in refused("query", room, "red", "--not", "red")
+    assert "exclude the rest with --not WORD" in refused("query", room, "not red")
+    assert corners("a photo of a red thing.") == every
     assert "lies outside" in refused("query", room, "red", "--within", 98, 98, 98, 99, 99, 99)
     assert "largest, highest" in refused("query", room, "red", "--pick", "nicest")
 
@@ -68,6 +70,7 @@ def test_query_text_ply_and_picture(room, tmp_path) -> None:
     assert (tmp_path / "q.png").read_bytes().startswith(b"\x89PNG")
     before = (room / "gaussians.ply").read_bytes()
     assert "--overwrite" in refused("query", room, "yellow", "--ply", room / "gaussians.ply")
+    assert "must end in .ply, got 'q.splat'" in refused("query", room, "yellow", "--ply", tmp_path / "q.splat")
     assert (room / "gaussians.ply").read_bytes() == before
     run("view", room, "--picture", tmp_path / "q.png", "--overwrite")
 
