@@ -31,6 +31,10 @@ class Capture(ABC):
     layout: ClassVar[str]
     """What ``recognizes`` looks for, in words. The message about an unknown folder shows it."""
 
+    parts: ClassVar[tuple[str, ...]] = ()
+    """Names, with wildcards, that such a folder holds; " or " divides alternatives. The message about an unknown folder
+    says which are missing."""
+
     general: ClassVar[bool] = False
     """Whether folders of other formats may match this layout too; the other formats are then tried first."""
 

@@ -11,15 +11,10 @@ from ..core.errors import CaptureError, ConfigError
 from ..core.regular_files import user_path
 from ..settings import registry
 from .base import Capture, Options
-from .numbered_files import list_folder
-
-VIDEO_SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"}
-"""Suffixes of files that may be a capture, for the hint about an unrecognized folder."""
+from .recognition import recognize
 
 BUILTIN = "builtin:"
 """Prefix of paths that name a rendered scene, not a folder."""
-
-_MOST_BELOW = 1000
 
 
 def open_capture(
@@ -40,7 +35,7 @@ def open_capture(
     if not (folder.is_dir() or folder.is_file()):
         raise CaptureError(f"{folder} is neither a folder nor a regular file: give a folder of frames, or a video.")
     try:
-        name = _recognize(folder) if options.format == "auto" else options.format
+        name = recognize(folder) if options.format == "auto" else options.format
         _check_kind(name, folder)
         return _construct(name, folder, options, backend_options or {})
     except OSError as error:
@@ -78,35 +73,3 @@ def _construct(name: str, path: Path, options: Options, own: Mapping[str, Mappin
             "leave capture.scale out, or set capture.depth=false."
         )
     return opened
-
-
-def _recognize(folder: Path) -> str:
-    """Name of the reader that recognizes the folder. Raises CaptureError if none does, or several do."""
-    readers = {name: reader for name, reader in _readers().items() if reader.reads_files or not folder.is_file()}
-    found = [name for name, reader in readers.items() if not reader.general and reader.recognizes(folder)]
-    found = found or [name for name, reader in readers.items() if reader.general and reader.recognizes(folder)]
-    if len(found) > 1:
-        raise CaptureError(f"{folder} may be of the format {' or '.join(found)}: choose one with capture.format.")
-    if found:
-        return found[0]
-    raise CaptureError(
-        f"{folder} is not a capture of a known format{_below(folder, readers)}. Looked for: "
-        + "; ".join(f"{reader.layout} ({name})" for name, reader in readers.items())
-        + "."
-    )
-
-
-def _readers() -> dict[str, type[Capture]]:
-    """Readers by name, without those that need a missing package."""
-    names = [name for name, backend in registry.backends("capture.readers").items() if not backend.missing]
-    return {name: registry.load("capture.readers", name).Reader for name in names}
-
-
-def _below(folder: Path, readers: Mapping[str, type[Capture]]) -> str:
-    """A hint at the first subfolder that is a capture, as in data sets of several, or at the first video."""
-    for child in (folder / name for name in list_folder(folder)[:_MOST_BELOW]):
-        if child.is_dir() and any(reader.recognizes(child) for reader in readers.values()):
-            return f", but {child} is: give that folder"
-        if child.is_file() and child.suffix.lower() in VIDEO_SUFFIXES:
-            return f", but {child} may be: give that file"
-    return ""

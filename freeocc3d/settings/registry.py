@@ -15,6 +15,7 @@ import ast
 import functools
 import importlib
 import importlib.util
+import re
 import types
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ FOLDERS = {
 }
 """Folder of backends -> what a message calls one of them."""
 _LONGEST_NAME = 100
+_ALL_EXTRAS = ("test", "benchmark", "docs", "export")
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,24 @@ def load(folder: str, name: str) -> types.ModuleType:
     """
     found = backend(folder, name)
     if missing := found.missing:
-        raise DependencyError(f"The {FOLDERS[folder]} '{name}' needs {', '.join(missing)}: install with pip.")
+        wanted = " ".join(f"'freeocc3d[{extra}]'" if (extra := _extra(name)) else name for name in missing)
+        raise DependencyError(f"The {FOLDERS[folder]} '{name}' needs {', '.join(missing)}: run pip install {wanted}.")
     return importlib.import_module(found.module)
+
+
+def _extra(package: str) -> str:
+    """The extra of this package that installs another one; empty if there is none, or if this one is not installed."""
+    import importlib.metadata  # takes long, and only a message needs it
+
+    try:
+        stated = importlib.metadata.requires("freeocc3d") or []
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+    for requirement in stated:
+        found = re.match(r"([\w-]+).*extra == ['\"]([\w-]+)['\"]", requirement)
+        if found and found[1].lower() == package.lower() and found[2] not in _ALL_EXTRAS:
+            return found[2]
+    return ""
 
 
 def build_options(module: types.ModuleType, values: Mapping[str, Any], where: str = "") -> Any:

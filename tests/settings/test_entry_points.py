@@ -87,7 +87,7 @@ def test_it_is_loaded_and_its_options_are_checked(site: Path, tmp_path: Path) ->
     assert lines[0] == "'count.digits' must be at least 1, got 0."
     assert lines[1] == "Unknown key 'count.digit' (did you mean 'digits'?)."
     assert lines[2].startswith("'count.box' takes a lower and an upper corner")
-    assert lines[3] == "The encoder 'other' needs no_such_package: install with pip."
+    assert lines[3] == "The encoder 'other' needs no_such_package: run pip install no_such_package."
 
 
 def test_the_command_lists_it(site: Path) -> None:

@@ -58,6 +58,7 @@ class Reader(FileFrames):
 
     format = "arkitscenes"
     layout = "lowres_wide/, lowres_depth/ and lowres_wide_intrinsics/*.pincam"
+    parts = ("lowres_wide/*", "lowres_depth/*", "lowres_wide_intrinsics/*.pincam")
 
     def __init__(self, path: Path, options: Options):
         found = _find(path)

@@ -34,6 +34,7 @@ class Reader(ImagePairs):
 
     format = "bundlefusion"
     layout = "frame-N.color.jpg with frame-N.depth.png (or .pgm) and info.txt (or _info.txt), or these in sequence/"
+    parts = ("frame-*.color.jpg", "frame-*.depth.png or frame-*.depth.pgm", "info.txt or _info.txt")
 
     def __init__(self, path: Path, options: Options):
         folder = _find_folder(path)

@@ -30,6 +30,7 @@ class Reader(PosedImages):
 
     format = "colmap_model"
     layout = "images/ with sparse/0/images.bin (or .txt)"
+    parts = ("images/*", "sparse/*")
 
     def __init__(self, path: Path, options: Options):
         project = find_colmap_project(path)

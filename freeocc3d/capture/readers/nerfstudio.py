@@ -58,6 +58,7 @@ class Reader(FileFrames):
     format = "nerfstudio"
     layout = f"{TRANSFORMS} with images"
     states_poses = True
+    parts = ("transforms.json", "images/*")
 
     def __init__(self, path: Path, options: Options):
         file = path / TRANSFORMS

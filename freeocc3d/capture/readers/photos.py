@@ -22,6 +22,7 @@ from ...core.types import Frame, Intrinsics
 from ...core.warnings import Notice
 from ..base import Capture, Options
 from ..camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
+from ..folder_contents import holds_depth_or_confidence
 from ..heif_files import HEIF_FORMATS, read_heif, register_heif
 from ..image_decoding import read_color
 from ..numbered_files import list_folder
@@ -105,8 +106,9 @@ class Reader(Capture):
     @classmethod
     def recognizes(cls, path: Path) -> bool:
         found = list_images(path)
-        with_depth = any("depth" in image.name.lower() for image in found) or find_folders(path) is not None
-        return bool(found or _unreadable(path)) and not with_depth
+        if not found:
+            return bool(_unreadable(path))
+        return find_folders(path) is None and holds_depth_or_confidence(found[0].parent) is None
 
     def __getitem__(self, index: int) -> Frame:
         if not 0 <= index < len(self):

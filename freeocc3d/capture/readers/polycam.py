@@ -79,6 +79,7 @@ class Reader(FileFrames):
 
     format = "polycam"
     layout = f"{KEYFRAMES}/ with images/, cameras/*.json and depth/"
+    parts = ("keyframes/images", "keyframes/depth", "keyframes/cameras")
 
     def __init__(self, path: Path, options: Options):
         root = _find(path) or path

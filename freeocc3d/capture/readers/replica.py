@@ -67,6 +67,7 @@ class Reader(ImagePairs):
 
     format = "replica"
     layout = "results/frameN.jpg (or .png) with results/depthN.png and cam_params.json"
+    parts = ("results/frame*.jpg or results/frame*.png", "results/depth*.png", "cam_params.json")
 
     def __init__(self, path: Path, options: Options):
         results = path / "results"

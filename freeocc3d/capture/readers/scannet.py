@@ -59,6 +59,7 @@ class Reader(ImagePairs):
 
     format = "scannet"
     layout = "color/N.jpg (or .png) with depth/N.png and intrinsic/intrinsic_color.txt"
+    parts = ("color/*.jpg or color/*.png", "depth/*.png", "intrinsic/intrinsic_color.txt")
 
     def __init__(self, path: Path, options: Options):
         pairs = pair_files(list_numbered(path / "color", COLOR), list_numbered(path / "depth", DEPTH), path, options)

@@ -43,6 +43,7 @@ class Reader(ImagePairs):
 
     format = "seven_scenes"
     layout = "frame-N.color.png (or .jpg) with frame-N.depth.png"
+    parts = ("frame-*.color.png or frame-*.color.jpg", "frame-*.depth.png")
 
     def __init__(self, path: Path, options: Options):
         pairs = pair_files(list_numbered(path, COLOR), list_numbered(path, DEPTH), path, options)

@@ -44,6 +44,7 @@ class Reader(PairedFrames):
 
     format = "tum_rgbd"
     layout = "rgb.txt with depth.txt, or associations.txt"
+    parts = ("rgb/*", "depth/*", "rgb.txt or associations.txt", "depth.txt or associations.txt")
 
     def __init__(self, path: Path, options: Options):
         lists, folders = find_lists(path), find_folders(path)

@@ -1,4 +1,4 @@
-"""Reads another system's poses from a file: TUM and such tables, KITTI, Open3D .log, COLMAP, nerfstudio, 7-Scenes."""
+"""Reads another system's poses from a file: TUM and other tables, KITTI, .log, COLMAP, nerfstudio, 7-Scenes."""
 
 from __future__ import annotations
 
