@@ -11,6 +11,7 @@ Code = Literal[
     "images-left-out",
     "depth-scale-doubtful",
     "poses-doubtful",
+    "registration-doubtful",
     "intrinsics-unknown",
     "extrinsics-unknown",
     "focal-estimated",

@@ -11,6 +11,7 @@ from typing import Any
 from .. import __version__
 from ..capture import Capture, open_capture, select_frames, settle_depth_unit
 from ..capture.focal_correction import Reregistered
+from ..capture.registration_check import check_registration
 from ..capture.rgbd_frames import RgbdFrames
 from ..core.errors import CaptureError, Interrupted, MapError, TrackingError, is_interrupt
 from ..core.progress import Progress
@@ -135,4 +136,7 @@ def _calibrate(
         ratio = focal_calibration.estimate_color_focal(pairs)
         if ratio != 1:
             work.warn(progress, warn_of_color_focal(capture, ratio))
-    return (capture if ratio == 1 else Reregistered(capture, ratio)), pairs if given else ()
+    registered = capture if ratio == 1 else Reregistered(capture, ratio)
+    if settings.capture.color_focal is None and (notice := check_registration(registered, select_frames(capture))):
+        work.warn(progress, notice)
+    return registered, pairs if given else ()
