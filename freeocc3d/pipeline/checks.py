@@ -89,8 +89,9 @@ def warn_of_scale() -> Notice:
     )
 
 
-def warn_of_trajectory(trajectory: Trajectory) -> Iterator[Notice]:
-    """Warns that the map shows only part of the scan: frames are unreadable, lost, or in other submaps."""
+def warn_of_trajectory(trajectory: Trajectory, why_lost: str = "") -> Iterator[Notice]:
+    """Warns that the map shows only part of the scan: frames are unreadable, lost, or in other submaps. why_lost: what
+    was measured in lost frames, a sentence."""
     used = max(int(np.count_nonzero(trajectory.status != "unused")), 1)
     if broken := int(np.count_nonzero(trajectory.status == "broken")):
         text = (
@@ -104,8 +105,8 @@ def warn_of_trajectory(trajectory: Trajectory) -> Iterator[Notice]:
             "show is not in the map."
         )
         if share > _FEW_TRACKED:
-            text += " Most of the scan is missing: was it captured slowly, with depth in most of each image?"
-        yield Notice("frames-lost", text)
+            text += " Most of the scan is missing."
+        yield Notice("frames-lost", f"{text} {why_lost}".strip())
     if len(apart := np.flatnonzero(trajectory.status == "apart")):
         yield Notice(
             "submaps-apart",

@@ -22,8 +22,10 @@ from ..storage.work_folder import WorkFolder
 from ..tracking.pose_check import check_poses
 from ..tracking.rgbd.measured_pairs import MeasuredPair
 from .checks import warn_of_camera, warn_of_scale, warn_of_trajectory
+from .frame_losses import explain_losses
 from .mapper import Mapper
 from .saving import evenly, save
+from .tracking_choice import GIVEN
 
 _CHECKPOINT_FRAMES = 50
 
@@ -72,8 +74,7 @@ def track(run: Run) -> None:
         _track_frames(run, frames, first)
     if len(mapper.keyframes) == 0:
         raise TrackingError(
-            f"No frame of {capture.path} has depth to start from: is it in other units (capture.depth_scale), or all "
-            "beyond capture.max_depth?"
+            f"No frame of {capture.path} could be used as a start. {explain_losses(capture, mapper.trajectory())}"
         )
 
 
@@ -177,7 +178,7 @@ def build_occupancy(run: Run) -> None:
 
 def save_map(run: Run) -> None:
     """Write the map, and warn of what it lacks."""
-    run.warn(*warn_of_trajectory(run.trajectory))
+    run.warn(*warn_of_trajectory(run.trajectory, _explain_losses(run)))
     if not run.mapper.tracker.metric:
         run.warn(warn_of_scale())
     run.progress.stage("saving")
@@ -192,6 +193,13 @@ def save_map(run: Run) -> None:
         run.vocabulary,
         run.tracking_reason,
     )
+
+
+def _explain_losses(run: Run) -> str:
+    """Why frames were lost, a sentence; empty if none were."""
+    if run.mapper.settings.tracking.backend in GIVEN:
+        return "They have no pose." if (run.trajectory.status == "lost").any() else ""
+    return explain_losses(run.mapper.capture, run.trajectory)
 
 
 STAGES: dict[str, Callable[[Run], None]] = {
