@@ -1,7 +1,6 @@
 """INPUT: captures. ``open_capture`` finds the reader of a folder; ``read_ahead`` decodes frames on a second thread."""
 
 from .base import Capture, Options
-from .depth_units import settle_depth_unit
 from .opening import open_capture, select_frames
 from .read_ahead import read_ahead
 from .trajectory_files import PoseFile, associate, read_trajectory
@@ -15,5 +14,4 @@ __all__ = [
     "read_ahead",
     "read_trajectory",
     "select_frames",
-    "settle_depth_unit",
 ]

@@ -11,7 +11,6 @@ from ..core.errors import CaptureError, ConfigError
 from ..core.regular_files import user_path
 from ..settings import registry
 from .base import Capture, Options
-from .recognition import recognize
 
 BUILTIN = "builtin:"
 """Prefix of paths that name a rendered scene, not a folder."""
@@ -35,6 +34,8 @@ def open_capture(
     if not (folder.is_dir() or folder.is_file()):
         raise CaptureError(f"{folder} is neither a folder nor a regular file: give a folder of frames, or a video.")
     try:
+        from .recognition import recognize  # imports OpenCV
+
         name = recognize(folder) if options.format == "auto" else options.format
         _check_kind(name, folder)
         return _construct(name, folder, options, backend_options or {})

@@ -1,6 +1,6 @@
 """The one rule for names of exported files: an ending is one of those that programs expect of the format.
 
-An exporter states them as ``ENDINGS``; one without, which writes a folder, takes any name.
+An exporter states them as ``ENDINGS``; "" is the name of a folder. One without takes any name.
 """
 
 from __future__ import annotations
@@ -18,7 +18,12 @@ def check_name(format_name: str, path: Path) -> None:
     endings = _endings(format_name)
     if endings:
         others = [name for name in registry.backends("export") if name != format_name]
-        check_ending(path, endings, format_name, [name for name in others if path.suffix.lower() in _stated(name)])
+        check_ending(
+            path,
+            endings,
+            format_name,
+            [name for name in others if path.suffix and path.suffix.lower() in _stated(name)],
+        )
 
 
 def check_ending(path: Path, endings: Sequence[str], format_name: str, others: Sequence[str] = ()) -> None:
@@ -26,9 +31,13 @@ def check_ending(path: Path, endings: Sequence[str], format_name: str, others: S
     if path.suffix.lower() not in endings:
         instead = f"; {path.suffix} is of the format {' or '.join(others)}" if others else ""
         raise ConfigError(
-            f"The name of a file of the format {format_name} must end in {' or '.join(endings)}, got '{path.name}'"
+            f"The name of a file of the format {format_name} must end in {_listed(endings)}, got '{path.name}'"
             f"{instead}."
         )
+
+
+def _listed(endings: Sequence[str]) -> str:
+    return " or ".join(ending or "nothing, for a folder" for ending in endings)
 
 
 def _endings(format_name: str) -> tuple[str, ...]:

@@ -27,6 +27,8 @@ from .ros_messages import load_types, make_cloud, make_grid, make_octomap, make_
 
 REQUIRES: tuple[str, ...] = ("rosbags",)
 
+ENDINGS = (".mcap", "")
+
 SCAN_FRAME = "scan"
 """Name of the map's own frame."""
 

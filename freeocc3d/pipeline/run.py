@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..capture import Capture, open_capture, select_frames, settle_depth_unit
+from ..capture import Capture, open_capture, select_frames
+from ..capture.depth_units import settle_depth_unit
 from ..capture.focal_correction import Reregistered
 from ..capture.registration_check import check_registration
 from ..capture.rgbd_frames import RgbdFrames

@@ -19,7 +19,7 @@ from freeocc3d.storage.manifest import EncoderRecord
 FILES = {
     "ply": ("map.ply",), "npz": ("map.npz",), "octomap": ("map.bt", "map.ot"), "nav2": ("map.yaml",),
     "esdf": ("map.npz", "map.vdb"), "glb": ("map.glb",), "geojson": ("map.geojson",), "gaussians": ("map.ply",),
-    "poses": ("poses",), "voxel_block_grid": ("grid.npz",),
+    "poses": ("poses",), "voxel_block_grid": ("grid.npz",), "ros2bag": ("map.mcap", "bag"),
 }  # fmt: skip
 CASES = [(kind, name) for kind, names in FILES.items() for name in names]
 OF_VOXELS = [case for case in CASES if case[0] not in ("gaussians", "poses", "geojson")]
@@ -144,7 +144,7 @@ def test_maps_of_several_sizes_go_through_every_exporter(tmp_path, keyframes, ki
 def test_a_voxel_larger_than_the_room_is_written_or_reported(tmp_path, keyframes, kind, name) -> None:
     huge = occupancy_of([(0, 0, 0)], free=[(0, 0, 1)]).replace(voxel_size=20.0)
     scan_map = whole(huge, keyframes)
-    if kind == "nav2":
+    if kind in ("nav2", "ros2bag"):
         assert "no plan to write" in refused(scan_map, kind, tmp_path / name)
     else:
         export_map(scan_map, kind, tmp_path / name)

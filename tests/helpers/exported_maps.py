@@ -32,7 +32,7 @@ def map_of(occupancy: Occupancy, T_gravity_map=CAMERA_TO_UP):
         labels=lambda: (np.arange(len(occupancy.colors)) % 3).astype(np.uint8),
         up=np.array((0.0, -1.0, 0.0)),
         T_gravity_map=T_gravity_map,
-        trajectory=SimpleNamespace(has_pose=np.array((False, True)), T_world_cam=poses),
+        trajectory=SimpleNamespace(has_pose=np.array((False, True)), T_world_cam=poses, timestamps=np.arange(2.0)),
     )
 
 
