@@ -20,6 +20,7 @@ from .evaluate import evaluate
 from .export import export
 from .ground_truth_command import ground_truth
 from .info import info
+from .inspect import inspect
 from .list import list_backends
 from .query import query
 from .reconstruct import reconstruct
@@ -63,7 +64,7 @@ def _options(
         raise typer.Exit
 
 
-for _command in (demo, reconstruct, query, view, info, export, refine, scale, evaluate, ground_truth):
+for _command in (demo, inspect, reconstruct, query, view, info, export, refine, scale, evaluate, ground_truth):
     app.command()(_command)
 app.command("list")(list_backends)
 app.add_typer(models.app, name="models")

@@ -25,15 +25,17 @@ BLURRED = 0.3
 FEW_DEPTH = 0.15
 """A frame has little depth if fewer of its pixels have any."""
 
-FEW_MATCHES = 25
-"""Frames with fewer matched features share little of their view."""
+FEW_MATCHES = 40
+"""Frames with fewer matched features that agree on one motion share little of their view."""
+
+_LEAST_FOR_MOTION, _MOTION_PX = 12, 1.5
 
 
 @dataclass(frozen=True)
 class FrameQuality:
     """What a frame is worth for tracking. brightness: 95th percentile, 0…255.  sharpness: variance of the Laplacian
-    over that of the brightness.  depth: share of the pixels with depth.  matches: with the used frame before; None if
-    that is unreadable."""
+    over that of the brightness.  depth: share of the pixels with depth.  matches: with the used frame before (after the
+    first); None if that is unreadable."""
 
     brightness: float
     sharpness: float
@@ -89,15 +91,23 @@ def _measure(capture: Capture, used: NDArray[np.int64], index: int) -> FrameQual
         return None
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     row = int(np.searchsorted(used, index))
-    before = _read(capture, int(used[row - 1])) if row else None
-    matches = None if before is None else len(_match(frame, before))
+    other = _read(capture, int(used[row - 1 if row else min(1, len(used) - 1)]))
+    matches = None if other is None else _count_matches(frame, other)
     spread = max(float(gray.var()), 1.0)
     sharpness = float(cv2.Laplacian(gray, cv2.CV_32F).var()) / spread
     return FrameQuality(float(np.percentile(gray, 95)), sharpness, float((frame.depth_m > 0).mean()), matches)
 
 
-def _match(frame: Frame, before: Frame) -> NDArray[np.int64]:
-    return orb_features.match_binary(*(orb_features.detect_features(one) for one in (frame, before)))
+def _count_matches(a: Frame, b: Frame) -> int:
+    """How many features of two frames match and agree on one motion of the camera."""
+    seen = [orb_features.detect_features(one) for one in (a, b)]
+    rows = orb_features.match_binary(*seen)
+    if len(rows) < _LEAST_FOR_MOTION:
+        return len(rows)
+    cv2.setRNGSeed(1)
+    points = [one.pixels[rows[:, side]] for side, one in enumerate(seen)]
+    _, agreeing = cv2.findFundamentalMat(*points, cv2.USAC_MAGSAC, _MOTION_PX, 0.999, 1000)
+    return 0 if agreeing is None else int(np.count_nonzero(agreeing))
 
 
 def _read(capture: Capture, index: int) -> Frame | None:
