@@ -12,7 +12,7 @@ import OpenEXR
 import pytest
 from numpy.typing import NDArray
 from posed_captures import write_nerfstudio
-from small_captures import SIZE, color_image, depth_image, pose_matrix, write_image
+from small_captures import SIZE, color_image, depth_image, write_image
 
 from freeocc3d.capture import Options, open_capture
 from freeocc3d.capture.rgbd_frames import RgbdFrames
@@ -31,25 +31,6 @@ def write_depths(folder: Path, units: float, size: tuple[int, int] = SIZE) -> Pa
     for path in (folder / "depth").iterdir():
         write_image(path, depth_image(int(path.stem.split("_")[1]), units, size))
     return folder
-
-
-def rename_to_depth_path(content: dict[str, Any]) -> None:
-    for frame in content["frames"]:
-        frame["depth_path"] = frame.pop("depth_file_path")
-
-
-def test_nerfcaptures_keys(tmp_path: Path) -> None:
-    units = 65535 / 10
-    write_depths(write_nerfstudio(tmp_path, 3, integer_depth_scale=10 / 65535), units)
-    capture = open_capture(change(tmp_path, rename_to_depth_path))
-    assert (capture.has_depth, capture.metric_poses, capture.intrinsics_known) == (True, True, True)
-    assert isinstance(capture, RgbdFrames)
-    assert capture.units_stated
-    for index in range(3):
-        frame = capture[index]
-        np.testing.assert_array_equal(frame.color, color_image(index))
-        np.testing.assert_allclose(frame.depth_m, depth_image(index, units) / units, atol=1e-6)
-        np.testing.assert_allclose(capture.pose(index), pose_matrix(index), atol=1e-9)
 
 
 def test_nerfstudios_unit_is_that_of_the_file_or_of_the_frame(tmp_path: Path) -> None:

@@ -6,73 +6,57 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scans import plane_scan
 from small_captures import color_image, depth_image, pose_matrix, write_image
+from written_phones import polycam_camera, polycam_stamps, write_polycam
 
 from freeocc3d.capture import Options, open_capture
 from freeocc3d.capture.readers.polycam import Reader
 from freeocc3d.core.errors import CaptureError, FrameError
 
 SIZE, DEPTH_SIZE = (64, 48), (32, 24)
-STAMPS = [9_876_543_210_123 + 400_000 * index + 1000 * (index % 2) for index in range(4)]
-"""Microseconds since the device was started."""
+SCAN = plane_scan(4, SIZE, DEPTH_SIZE, unsure=True)
+STAMPS = polycam_stamps(SCAN)
+SINCE_S = [0, 0.035333, 0.070667, 0.1]
 
 
 def camera(index: int, **changes: Any) -> dict[str, Any]:
-    T = pose_matrix(index) @ np.diag([1.0, -1.0, -1.0, 1.0])  # a camera of ARKit looks along -z
-    stated = {"fx": 70.0 + index, "fy": 70.0 + index, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48}
-    places = {f"t_{row}{column}": T[row, column] for row in range(3) for column in range(4)}
-    return {**stated, **places, "blur_score": 80.0, "manual_keyframe": False, **changes}
+    return polycam_camera(SCAN, index, **changes)
 
 
-def write_polycam(root: Path, prefix: str = "", depth_size: tuple[int, int] = DEPTH_SIZE) -> Path:
-    for index, stamp in enumerate(STAMPS):
-        write_image(root / f"{prefix}images" / f"{stamp}.png", color_image(index, SIZE))
-        write_image(root / "depth" / f"{stamp}.png", depth_image(index, size=depth_size))
-        confidence = np.full(depth_size[::-1], 255, np.uint8)
-        confidence[:, -8:], confidence[:, -2:] = 127, 0
-        write_image(root / "confidence" / f"{stamp}.png", confidence)
-        cameras = root / f"{prefix}cameras"
-        cameras.mkdir(exist_ok=True)
-        (cameras / f"{stamp}.json").write_text(json.dumps(camera(index)))
-    return root
+def write_planes(root: Path, prefix: str = "") -> Path:
+    return write_polycam(root, SCAN, prefix)
 
 
-@pytest.mark.parametrize("given", ["keyframes", ""])
-def test_raw_data_come_back(tmp_path: Path, given: str) -> None:
-    write_polycam(tmp_path / "keyframes", depth_size=SIZE)
-    capture = open_capture(tmp_path / given)
-    assert capture.format == "polycam"
-    assert (len(capture), capture.metric_poses, capture.intrinsics_known, capture.warnings) == (4, True, True, ())
-    np.testing.assert_allclose(capture.timestamps, [0, 0.401, 0.8, 1.201], atol=1e-9)
-    for index in range(4):
-        frame = capture[index]
-        np.testing.assert_array_equal(frame.color, color_image(index, SIZE))
-        wanted = depth_image(index, size=SIZE) / 1000
-        wanted[:, -2:] = 0
-        np.testing.assert_allclose(frame.depth_m, wanted, atol=1e-6)
-        np.testing.assert_allclose(capture.pose(index), pose_matrix(index), atol=1e-6)
-        assert frame.intrinsics.fx == 70.0 + index
-        assert frame.depth_sigma_m is not None
-        assert frame.depth_sigma_m[1, -5] == pytest.approx(2 * frame.depth_sigma_m[1, 5])
+def test_the_folder_above_and_confidence(tmp_path: Path) -> None:
+    write_polycam(tmp_path / "keyframes", plane_scan(4, SIZE, SIZE, unsure=True))
+    capture = open_capture(tmp_path)
+    assert (capture.format, len(capture), capture.warnings) == ("polycam", 4, ())
+    frame = capture[2]
+    wanted = depth_image(2, size=SIZE) / 1000
+    wanted[:, -2:] = 0
+    np.testing.assert_allclose(frame.depth_m, wanted, atol=1e-6)
+    assert frame.depth_sigma_m is not None
+    assert frame.depth_sigma_m[1, -5] == pytest.approx(2 * frame.depth_sigma_m[1, 5])
 
 
 def test_color_comes_on_the_pixels_of_the_depth(tmp_path: Path) -> None:
-    frame = open_capture(write_polycam(tmp_path))[1]
+    frame = open_capture(write_planes(tmp_path))[1]
     assert (frame.color.shape, frame.depth_m.shape) == ((24, 32, 3), (24, 32))
-    assert (frame.intrinsics.fx, frame.intrinsics.cx) == (35.5, 15.5)
+    assert (frame.intrinsics.fx, frame.intrinsics.cx) == (32.5, 15.5)
 
 
 def test_names_may_count_milliseconds(tmp_path: Path) -> None:
-    write_polycam(tmp_path)
+    write_planes(tmp_path)
     for folder in ("images", "depth", "confidence", "cameras"):
         for path in sorted((tmp_path / folder).iterdir()):
             path.rename(path.with_name(f"{int(path.stem) // 1000}{path.suffix}"))
-    np.testing.assert_allclose(open_capture(tmp_path).timestamps, [0, 0.401, 0.8, 1.201], atol=1e-9)
+    np.testing.assert_allclose(open_capture(tmp_path).timestamps, SINCE_S, atol=1e-3)
 
 
 def test_corrected_frames_win(tmp_path: Path) -> None:
-    write_polycam(tmp_path)
-    write_polycam(tmp_path, "corrected_")
+    write_planes(tmp_path)
+    write_planes(tmp_path, "corrected_")
     for stamp in STAMPS:
         write_image(tmp_path / "images" / f"{stamp}.png", np.zeros((48, 64, 3), np.uint8))
         (tmp_path / "cameras" / f"{stamp}.json").write_text(json.dumps(camera(3, t_03=9.0)))
@@ -90,7 +74,7 @@ def test_corrected_frames_win(tmp_path: Path) -> None:
 
 
 def test_incomplete_frames_are_left_out_with_a_warning(tmp_path: Path) -> None:
-    write_polycam(tmp_path)
+    write_planes(tmp_path)
     (tmp_path / "depth" / f"{STAMPS[1]}.png").unlink()
     (tmp_path / "cameras" / f"{STAMPS[3]}.json").unlink()
     capture = open_capture(tmp_path)
@@ -103,7 +87,7 @@ def test_incomplete_frames_are_left_out_with_a_warning(tmp_path: Path) -> None:
 
 
 def test_without_depth_the_message_says_so(tmp_path: Path) -> None:
-    write_polycam(tmp_path)
+    write_planes(tmp_path)
     for path in (tmp_path / "depth").iterdir():
         path.unlink()
     with pytest.raises(CaptureError, match=r"holds no depth: .* capture\.depth=false"):
@@ -120,7 +104,7 @@ def test_without_depth_the_message_says_so(tmp_path: Path) -> None:
     ],
 )
 def test_damaged_cameras_are_refused(tmp_path: Path, text: str, message: str) -> None:
-    write_polycam(tmp_path)
+    write_planes(tmp_path)
     file = tmp_path / "cameras" / f"{STAMPS[2]}.json"
     file.write_text(text)
     with pytest.raises(CaptureError, match=message):
@@ -132,13 +116,13 @@ def test_damaged_cameras_are_refused(tmp_path: Path, text: str, message: str) ->
 
 
 def test_a_matrix_that_is_no_pose_gives_none(tmp_path: Path) -> None:
-    write_polycam(tmp_path)
+    write_planes(tmp_path)
     (tmp_path / "cameras" / f"{STAMPS[2]}.json").write_text(json.dumps(camera(2, t_00=5.0)))
     assert [Reader(tmp_path, Options()).pose(index) is None for index in range(4)] == [False, False, True, False]
 
 
 def test_damaged_frames_are_broken(tmp_path: Path) -> None:
-    write_polycam(tmp_path)
+    write_planes(tmp_path)
     write_image(tmp_path / "images" / f"{STAMPS[1]}.png", color_image(0, (32, 24)))
     (tmp_path / "depth" / f"{STAMPS[2]}.png").write_bytes(b"")
     write_image(tmp_path / "confidence" / f"{STAMPS[3]}.png", color_image(0, DEPTH_SIZE))

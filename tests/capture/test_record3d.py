@@ -1,141 +1,82 @@
 from __future__ import annotations
 
-import json
 import os
 import struct
 import zipfile
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import lzfse
 import numpy as np
-import OpenEXR
 import pytest
 from numpy.typing import NDArray
-from small_captures import color_image, depth_image, pose_matrix
-from test_scannet_sens import pack_color
+from scans import Scan, plane_scan
+from small_captures import color_image, pose_matrix
+from written_phones import record3d_members, write_members, write_record3d_exr
 
 from freeocc3d.capture import Options, open_capture, packed_files
 from freeocc3d.capture.lzfse_blocks import lzfse_size, unpack_lzfse
 from freeocc3d.capture.readers import record3d
 from freeocc3d.capture.readers.record3d import Reader
 from freeocc3d.core.errors import CaptureError, FrameError
-from freeocc3d.core.transforms import rotations_to_quats
 
 SIZE = 48, 64
 """Width and height of the depth; phones are held upright."""
 
-FOCAL = 60.0
 
-
-def metadata(count: int, color_size: tuple[int, int] = SIZE, **changes: Any) -> dict[str, Any]:
-    width, height = color_size
-    focal = FOCAL * width / SIZE[0]
-    poses = []
-    for index in range(count):
-        T = pose_matrix(index) @ np.diag([1.0, -1.0, -1.0, 1.0])  # a camera of ARKit looks along -z
-        w, x, y, z = rotations_to_quats(T[None, :3, :3])[0].tolist()
-        poses.append([x, y, z, w, *T[:3, 3].tolist()])
-    stated = {
-        "w": width, "h": height, "dw": SIZE[0], "dh": SIZE[1], "fps": 60, "poses": poses,
-        "K": [focal, 0, 0, 0, focal, 0, (width - 1) / 2, (height - 1) / 2, 1],
-        "frameTimestamps": [100 + 0.02 * index + 0.001 * (index % 2) for index in range(count)],
-        "perFrameIntrinsicCoeffs": [[focal + index, focal + index, (width - 1) / 2, (height - 1) / 2]
-                                    for index in range(count)],
-    }  # fmt: skip
-    return {**{name: value for name, value in stated.items() if name not in changes}, **changes}
+def scan_of(count: int, color_size: tuple[int, int] = SIZE) -> Scan:
+    return plane_scan(count, color_size, SIZE, unsure=True)
 
 
 def depth_of(index: int) -> NDArray[np.float32]:
-    depth = (depth_image(index, size=SIZE) / 1000).astype(np.float32)
+    depth = scan_of(12).depth_m[index].copy()
     depth[0, :9] = np.nan
     return depth
 
 
-def confidence_of(index: int) -> NDArray[np.uint8]:
-    stored = np.full(SIZE[::-1], 2, np.uint8)
-    stored[:, -8:], stored[:, -2:] = 1, 0
-    return stored
-
-
 def members(count: int, color_size: tuple[int, int] = SIZE, **changes: Any) -> dict[str, bytes]:
-    files = {"metadata": json.dumps(metadata(count, color_size, **changes)).encode()}
-    for index in range(count):
-        files[f"rgbd/{index}.jpg"] = pack_color(color_image(index, color_size), 1)
-        files[f"rgbd/{index}.depth"] = lzfse.compress(depth_of(index).tobytes())
-        files[f"rgbd/{index}.conf"] = lzfse.compress(confidence_of(index).tobytes())
-    return files
+    scan = scan_of(count, color_size)
+    return record3d_members(replace(scan, depth_m=[depth_of(index) for index in range(count)]), **changes)
 
 
-def write_r3d(path: Path, files: Mapping[str, bytes], method: int = zipfile.ZIP_STORED) -> Path:
-    with zipfile.ZipFile(path, "w", method) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return path
-
-
-def write_folder(path: Path, files: Mapping[str, bytes]) -> Path:
-    for name, data in files.items():
-        (path / name).parent.mkdir(parents=True, exist_ok=True)
-        (path / name).write_bytes(data)
-    return path
-
-
-@pytest.mark.parametrize("packed", [True, False])
-def test_a_capture_comes_back(tmp_path: Path, packed: bool) -> None:
-    write = write_r3d if packed else write_folder
-    capture = open_capture(write(tmp_path / "scan.r3d", members(12)))
-    assert capture.format == "record3d"
-    assert (len(capture), capture.has_depth, capture.metric_poses, capture.intrinsics_known) == (12, True, True, True)
-    np.testing.assert_array_equal(capture.timestamps, metadata(12)["frameTimestamps"])
-    for index in (0, 10, 3):
-        frame = capture[index]
-        np.testing.assert_array_equal(frame.color, color_image(index, SIZE))
-        wanted = np.nan_to_num(depth_of(index))
-        wanted[:, -2:] = 0
-        np.testing.assert_array_equal(frame.depth_m, wanted)
-        np.testing.assert_allclose(capture.pose(index), pose_matrix(index), atol=1e-6)
-        assert (frame.intrinsics.fx, frame.intrinsics.cx) == (FOCAL + index, (SIZE[0] - 1) / 2)
-        assert frame.depth_sigma_m is not None
-        assert (frame.depth_sigma_m[1, -5] / frame.depth_sigma_m[1, 5]) == pytest.approx(2.0)
+def test_nan_is_no_depth_and_confidence_an_uncertainty(tmp_path: Path) -> None:
+    capture = open_capture(write_members(tmp_path / "scan.r3d", members(12)))
+    frame = capture[10]
+    np.testing.assert_array_equal(frame.color, color_image(10, SIZE))
+    wanted = np.nan_to_num(depth_of(10))
+    wanted[:, -2:] = 0
+    np.testing.assert_array_equal(frame.depth_m, wanted)
+    assert frame.depth_sigma_m is not None
+    assert (frame.depth_sigma_m[1, -5] / frame.depth_sigma_m[1, 5]) == pytest.approx(2.0)
 
 
 def test_larger_color_comes_on_the_pixels_of_the_depth(tmp_path: Path) -> None:
     files = members(2, (96, 128), perFrameIntrinsicCoeffs=None, dw=None, dh=None)
-    frame = open_capture(write_r3d(tmp_path / "scan.r3d", files, zipfile.ZIP_DEFLATED))[1]
+    frame = open_capture(write_members(tmp_path / "scan.r3d", files, zipfile.ZIP_DEFLATED))[1]
     assert (frame.color.shape, frame.depth_m.shape) == ((64, 48, 3), (64, 48))
-    assert frame.intrinsics.fx == pytest.approx(FOCAL)
+    assert frame.intrinsics.fx == pytest.approx(SIZE[0])
     assert frame.intrinsics.cx == pytest.approx((SIZE[0] - 1) / 2)
 
 
 def test_k_is_column_major_and_for_the_stated_size(tmp_path: Path) -> None:
     K = [100.0, 0, 0, 0, 110.0, 0, 40.0, 70.0, 1]
     files = members(2, w=96, h=128, K=K, perFrameIntrinsicCoeffs=[])
-    camera = open_capture(write_r3d(tmp_path / "scan.r3d", files))[0].intrinsics
+    camera = open_capture(write_members(tmp_path / "scan.r3d", files))[0].intrinsics
     np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (50, 55, 19.75, 34.75))
 
 
-def test_an_export_as_exr(tmp_path: Path) -> None:
-    root = tmp_path / "EXR_RGBD"
-    files = {"metadata.json": json.dumps(metadata(3)).encode()}
-    files |= {f"rgb/{index}.png": pack_color(color_image(index, SIZE), 1) for index in range(3)}
-    write_folder(root, files)
-    (root / "depth").mkdir()
-    for index in range(3):
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        OpenEXR.File(header, {"R": depth_of(index)}).write(str(root / "depth" / f"{index}.exr"))
-    for path in (root, tmp_path):
-        capture = open_capture(path)
-        assert (capture.format, len(capture)) == ("record3d", 3)
-        np.testing.assert_array_equal(capture[2].color, color_image(2, SIZE))
-        np.testing.assert_array_equal(capture[2].depth_m, np.nan_to_num(depth_of(2)))
+def test_an_export_as_exr_is_found_below_its_folder(tmp_path: Path) -> None:
+    write_record3d_exr(tmp_path / "EXR_RGBD", replace(scan_of(3), depth_m=[depth_of(index) for index in range(3)]))
+    capture = open_capture(tmp_path)
+    assert (capture.format, len(capture)) == ("record3d", 3)
+    np.testing.assert_array_equal(capture[2].depth_m, np.nan_to_num(depth_of(2)))
 
 
 def test_frames_without_depth_are_left_out_with_a_warning(tmp_path: Path) -> None:
     files = members(4)
     del files["rgbd/2.depth"], files["rgbd/0.conf"]
-    capture = open_capture(write_r3d(tmp_path / "scan.r3d", files))
+    capture = open_capture(write_members(tmp_path / "scan.r3d", files))
     assert len(capture) == 3
     np.testing.assert_allclose(capture.pose(2), pose_matrix(3), atol=1e-6)
     assert "the first, 2, has no depth" in capture.warnings[0].text
@@ -146,12 +87,12 @@ def test_frames_without_depth_are_left_out_with_a_warning(tmp_path: Path) -> Non
 def test_a_capture_without_depth_says_so(tmp_path: Path) -> None:
     files = {name: data for name, data in members(2).items() if not name.endswith(".depth")}
     with pytest.raises(CaptureError, match=r"holds no depth for its color: .* capture\.depth=false"):
-        open_capture(write_r3d(tmp_path / "scan.r3d", files))
+        open_capture(write_members(tmp_path / "scan.r3d", files))
 
 
 def test_times_and_poses_may_be_absent(tmp_path: Path) -> None:
     files = members(3, frameTimestamps=None, poses=[])
-    capture = open_capture(write_r3d(tmp_path / "scan.r3d", files))
+    capture = open_capture(write_members(tmp_path / "scan.r3d", files))
     np.testing.assert_allclose(capture.timestamps, np.arange(3) / 60)
     assert capture.pose(1) is None
 
@@ -167,11 +108,11 @@ def test_times_and_poses_may_be_absent(tmp_path: Path) -> None:
 )
 def test_damaged_metadata_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(CaptureError, match=message):
-        open_capture(write_r3d(tmp_path / "scan.r3d", members(1, **changes)))
+        open_capture(write_members(tmp_path / "scan.r3d", members(1, **changes)))
 
 
 def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
-    path = write_r3d(tmp_path / "scan.r3d", members(3))
+    path = write_members(tmp_path / "scan.r3d", members(3))
     os.truncate(path, path.stat().st_size // 2)
     with pytest.raises(CaptureError, match="is cut off, or no zip archive"):
         open_capture(path)
@@ -190,7 +131,7 @@ def test_damaged_frames_are_broken(tmp_path: Path) -> None:
     files["rgbd/2.depth"] = lzfse.compress(bytes(400))
     files["rgbd/3.conf"] = lzfse.compress(bytes(1 << 24))
     files["rgbd/4.jpg"] = files["rgbd/4.jpg"][:-40]
-    capture = open_capture(write_r3d(tmp_path / "scan.r3d", files))
+    capture = open_capture(write_members(tmp_path / "scan.r3d", files))
     for index, message in enumerate(("is cut off", "holds 400 bytes", "unpacks to 16777216 bytes", "is cut off"), 1):
         with pytest.raises(FrameError, match=message):
             capture[index]
@@ -200,14 +141,14 @@ def test_damaged_frames_are_broken(tmp_path: Path) -> None:
 def test_a_bomb_of_a_zip_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(record3d, "IMAGE_BYTES", 8 << 20)
     files = {**members(1), "rgbd/0.jpg": bytes(16 << 20)}
-    capture_file = write_r3d(tmp_path / "scan.r3d", files, zipfile.ZIP_DEFLATED)
+    capture_file = write_members(tmp_path / "scan.r3d", files, zipfile.ZIP_DEFLATED)
     assert capture_file.stat().st_size < 1 << 20
     with pytest.raises(CaptureError, match="unpacks to more than the 8 MB"):
         open_capture(capture_file)
 
 
 def test_too_many_members_are_refused_before_they_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_r3d(tmp_path / "scan.r3d", members(4))
+    path = write_members(tmp_path / "scan.r3d", members(4))
     monkeypatch.setattr(packed_files, "MOST_MEMBERS", 12)
     monkeypatch.setattr(zipfile, "ZipFile", None)
     with pytest.raises(CaptureError, match="holds more than 12 members"):
@@ -215,7 +156,7 @@ def test_too_many_members_are_refused_before_they_are_read(tmp_path: Path, monke
 
 
 def test_another_archive_is_no_capture(tmp_path: Path) -> None:
-    path = write_r3d(tmp_path / "other.zip", {"metadata": b"{}", "readme.txt": b"text"})
+    path = write_members(tmp_path / "other.zip", {"metadata": b"{}", "readme.txt": b"text"})
     assert not Reader.recognizes(path)
 
 

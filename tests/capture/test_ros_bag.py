@@ -46,13 +46,9 @@ def open_bag(path: Path, **options: Any) -> Reader:
     return Reader(path, Options(**options))
 
 
-@pytest.mark.parametrize(
-    ("kind", "compression"),
-    [("bag", ""), ("bag", "lz4"), ("bag", "bz2"), ("db3", ""), ("db3", "message"), ("mcap", ""), ("mcap", "zstd")],
-)
-def test_frames_are_what_was_sent(kind: Kind, compression: str, tmp_path: Path) -> None:
-    messages = Messages(kind)
-    capture = open_bag(write_bag(tmp_path / "scan", messages, scan(messages), compression))
+def test_frames_of_packed_chunks_are_what_was_sent(tmp_path: Path) -> None:
+    messages = Messages("bag")
+    capture = open_bag(write_bag(tmp_path / "scan", messages, scan(messages), "bz2"))
     assert len(capture) == COUNT
     np.testing.assert_allclose(capture.timestamps, [second(index) for index in range(COUNT)], atol=1e-6)
     assert capture.intrinsics_known

@@ -4,65 +4,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scans import plane_scan, pose_line
 from small_captures import color_image, data_folder, depth_image, pose_matrix, write_image
+from written_folders import LATE_S, write_tum
 
 from freeocc3d.capture import open_capture
 from freeocc3d.capture.base import Options
 from freeocc3d.capture.readers.tum_rgbd import Reader
 from freeocc3d.core.errors import CaptureError
-from freeocc3d.core.transforms import back_project, invert, project, rotations_to_quats, transform
+from freeocc3d.core.transforms import back_project, invert, project, transform
 from freeocc3d.core.types import Intrinsics
 
 START = 1305031102.175304
-LATE = 0.0134
-"""How much later depth is, seconds."""
-
-HEADER = "# color images\n# file: 'rgbd_dataset_{}.bag'\n# timestamp filename\n"
 
 
-def pose_line(time: float, T: np.ndarray) -> str:
-    w, x, y, z = rotations_to_quats(T[:3, :3])
-    return " ".join(repr(float(number)) for number in (time, *T[:3, 3], x, y, z, w)) + "\n"
-
-
-def write_tum(
+def write_planes(
     folder: Path, n: int, lists: bool = True, recording: str = "room", size: tuple[int, int] = (32, 24)
 ) -> list[float]:
     """n frames at 30 Hz with poses; the times of color. lists: write rgb.txt and depth.txt."""
     times = [round(START + i / 30, 6) for i in range(n)]
-    texts = {"rgb": HEADER.format(recording), "depth": HEADER.format(recording)}
-    for i, time in enumerate(times):
-        for kind, at, image in (
-            ("rgb", time, color_image(i, size)),
-            ("depth", time + LATE, depth_image(i, 5000.0, size)),
-        ):
-            name = f"{kind}/{at:.6f}.png"
-            write_image(folder / name, image)
-            texts[kind] += f"{at:.6f} {name}\n"
-    if lists:
-        for kind, text in texts.items():
-            (folder / f"{kind}.txt").write_text(text)
-    (folder / "groundtruth.txt").write_text("".join(pose_line(t, pose_matrix(i)) for i, t in enumerate(times)))
+    write_tum(folder, plane_scan(n, size, times=times), "rgb depth" if lists else "", recording)
     return times
 
 
-@pytest.mark.parametrize("lists", [True, False])
-def test_a_round_trip(tmp_path: Path, lists: bool) -> None:
-    times = write_tum(tmp_path, 5, lists)
-    capture = open_capture(tmp_path, Options(depth_scale=5000.0))
-    assert isinstance(capture, Reader)
-    assert len(capture) == 5
-    assert not capture.intrinsics_known
-    for i in range(5):
-        frame = capture[i]
-        assert frame.timestamp == times[i]
-        np.testing.assert_array_equal(frame.color, color_image(i))
-        np.testing.assert_allclose(frame.depth_m[:, 1:], 2.0 + 0.01 * i, atol=1e-4)
-        np.testing.assert_allclose(capture.pose(i), pose_matrix(i), atol=1e-6)
-
-
 def test_the_unit_and_the_lens_are_those_of_the_recording_that_comments_name(tmp_path: Path) -> None:
-    write_tum(tmp_path, 1, recording="freiburg1_desk", size=(640, 480))
+    write_planes(tmp_path, 1, recording="freiburg1_desk", size=(640, 480))
     capture = open_capture(tmp_path)
     assert isinstance(capture, Reader)
     assert (capture.units_per_meter, capture.intrinsics_known) == (5000.0, True)
@@ -73,7 +39,7 @@ def test_the_unit_and_the_lens_are_those_of_the_recording_that_comments_name(tmp
 
 @pytest.mark.parametrize("recording", ["freiburg4_desk", "room"])
 def test_nothing_is_assumed_of_other_recordings(tmp_path: Path, recording: str) -> None:
-    write_tum(tmp_path, 1, recording=recording)
+    write_planes(tmp_path, 1, recording=recording)
     capture = Reader(tmp_path, Options())
     assert (capture.units_stated, capture.intrinsics_known) == (False, False)
 
@@ -81,10 +47,10 @@ def test_nothing_is_assumed_of_other_recordings(tmp_path: Path, recording: str) 
 @pytest.mark.parametrize("depth_first", [True, False])
 @pytest.mark.parametrize("name", ["associations.txt", "associate.txt", "fr1_association.txt"])
 def test_associations_of_either_order(tmp_path: Path, depth_first: bool, name: str) -> None:
-    times = write_tum(tmp_path, 4, lists=False)
+    times = write_planes(tmp_path, 4, lists=False)
     lines = []
     for i, time in enumerate(times):
-        pair = [f"{time:.6f} rgb\\{time:.6f}.png", f"{time + LATE:.6f} depth/{time + LATE:.6f}.png"]
+        pair = [f"{time:.6f} rgb\\{time:.6f}.png", f"{time + LATE_S:.6f} depth/{time + LATE_S:.6f}.png"]
         lines.append(" ".join(pair[::-1] if depth_first else pair) + ("\r\n" if i % 2 else "\n"))
     (tmp_path / name).write_text("".join(lines[::-1]))
     capture = open_capture(tmp_path, Options(depth_scale=5000.0))
@@ -126,7 +92,7 @@ def test_names_without_trailing_zeros_sort_as_numbers(tmp_path: Path) -> None:
 
 
 def test_poses_are_interpolated_between_denser_true_ones(tmp_path: Path) -> None:
-    times = write_tum(tmp_path, 3)
+    times = write_planes(tmp_path, 3)
     turn = np.eye(4)
     dense = []
     for step in range(-4, 12):
@@ -143,23 +109,23 @@ def test_poses_are_interpolated_between_denser_true_ones(tmp_path: Path) -> None
 
 
 def test_a_frame_far_from_all_true_poses_has_none(tmp_path: Path) -> None:
-    times = write_tum(tmp_path, 6)
+    times = write_planes(tmp_path, 6)
     (tmp_path / "groundtruth.txt").write_text(pose_line(times[0] + 0.019, pose_matrix(0)))
     capture = Reader(tmp_path, Options())
     assert [capture.pose(i) is None for i in range(6)] == [False, False, True, True, True, True]
 
 
 def test_images_without_a_partner_are_left_out_with_a_warning(tmp_path: Path) -> None:
-    times = write_tum(tmp_path, 10)
-    (tmp_path / "depth" / f"{times[4] + LATE:.6f}.png").unlink()
+    times = write_planes(tmp_path, 10)
+    (tmp_path / "depth" / f"{times[4] + LATE_S:.6f}.png").unlink()
     capture = Reader(tmp_path, Options())
     assert len(capture) == 9
     assert {notice.code for notice in capture.warnings} == {"images-left-out"}
-    assert any(f"{times[4] + LATE:.6f}.png" in notice.text for notice in capture.warnings)
+    assert any(f"{times[4] + LATE_S:.6f}.png" in notice.text for notice in capture.warnings)
 
 
 def test_lists_of_other_times_say_so(tmp_path: Path) -> None:
-    write_tum(tmp_path, 4)
+    write_planes(tmp_path, 4)
     lines = (tmp_path / "depth.txt").read_text().replace("\n1305", "\n1405")
     (tmp_path / "depth.txt").write_text(lines)
     with pytest.raises(CaptureError, match=r"0 of the 4 images .*rgb\.txt and 4 .*depth\.txt have times"):
@@ -184,7 +150,7 @@ def test_bad_associations(tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_a_list_alone_is_told(tmp_path: Path) -> None:
-    write_tum(tmp_path, 2)
+    write_planes(tmp_path, 2)
     (tmp_path / "depth.txt").unlink()
     (tmp_path / "depth").rename(tmp_path / "other")
     with pytest.raises(CaptureError, match=r"needs rgb\.txt and depth\.txt"):
@@ -192,7 +158,7 @@ def test_a_list_alone_is_told(tmp_path: Path) -> None:
 
 
 def test_color_alone_needs_no_depth_list(tmp_path: Path) -> None:
-    write_tum(tmp_path, 3)
+    write_planes(tmp_path, 3)
     (tmp_path / "depth.txt").write_text("")
     capture = Reader(tmp_path, Options(depth=False))
     assert len(capture) == 3

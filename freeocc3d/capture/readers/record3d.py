@@ -47,7 +47,7 @@ _Pose = tuple[Number, Number, Number, Number, Number, Number, Number]
 
 class _Metadata(msgspec.Struct, rename={"per_frame": "perFrameIntrinsicCoeffs", "times": "frameTimestamps"}):
     """w, h: size of the color that the cameras are for.  dw, dh: of the depth.  K: column-major.  poses: qx qy qz qw
-    tx ty tz, camera to world.  per_frame: fx fy cx cy.  times: seconds.  Lists have an entry per frame number."""
+    tx ty tz, camera to world.  per_frame: fx fy cx cy.  times: seconds of any clock.  Lists have an entry per frame number."""
 
     w: PositiveNumber
     h: PositiveNumber
@@ -57,7 +57,7 @@ class _Metadata(msgspec.Struct, rename={"per_frame": "perFrameIntrinsicCoeffs", 
     fps: PositiveNumber | None = None
     poses: list[_Pose] | None = None
     per_frame: list[Annotated[list[Number], Meta(min_length=4)]] | None = None
-    times: list[Number] | None = None
+    times: list[float] | None = None
 
 
 @dataclass(frozen=True)
