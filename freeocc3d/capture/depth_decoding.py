@@ -6,8 +6,9 @@ Sources: the Netpbm format pages (PGM), P. Debevec's description of PFM, OpenEXR
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -33,6 +34,8 @@ RawDepth = NDArray[Any]
 
 _NETPBM = re.compile(rb"(P5|Pf)\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(-?[0-9.eE+]{1,20})\s")
 _LONGEST_HEADER = 4096
+_MOST_NUMBERS = 2 * MOST_PIXELS  # in all channels of an EXR image: 0.8 GB
+_Read = TypeVar("_Read")
 
 
 def read_raw_depth(path: Path, size: Size | None = None) -> RawDepth:
@@ -56,7 +59,7 @@ def read_depth_size(path: Path) -> Size:
     raises."""
     suffix = path.suffix.lower()
     if suffix == ".exr":
-        return _exr_size(_open_exr(path, header_only=True), path)
+        return _exr_size(path)
     if suffix in SUFFIXES - {".png", ".tif", ".tiff"}:
         height, width = read_raw_depth(path).shape
         return width, height
@@ -133,34 +136,41 @@ def _read_netpbm(path: Path) -> NDArray[Any]:
     return image[::-1].astype(np.float32) if floats else image.astype(image.dtype.newbyteorder("="))
 
 
-def _open_exr(path: Path, header_only: bool = False) -> Any:
+def _read_exr(path: Path) -> NDArray[Any]:
+    """The channel Z or Y, or the first of equal ones, such as R of a gray image."""
+    _exr_size(path)
+    channels = _load_exr(path, lambda file: {name: channel.pixels for name, channel in file.channels().items()})
+    name = next((name for name in ("Z", "Y", "V", "depth", "R", "RGB", "RGBA") if name in channels), None)
+    if name is None:
+        raise FrameError(f"{path} has no channel Z, Y or R: it has {', '.join(channels) or 'none'}.")
+    pixels = channels[name]
+    return np.asarray(pixels if pixels.ndim == 2 else pixels[..., 0])
+
+
+def _exr_size(path: Path) -> Size:
+    """Width and height by the header. Raises FrameError, also if the channels together would be too large."""
+
+    def read(file: Any) -> tuple[int, int, int]:
+        header = file.header()
+        low, high = header["dataWindow"]
+        return int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1, len(header["channels"])
+
+    width, height, channels = _load_exr(path, read, header_only=True)
+    if min(width, height) <= 0 or width * height * max(channels, 1) > _MOST_NUMBERS:
+        raise FrameError(f"{path} states {width} x {height} pixels of {channels} channels, which is not possible.")
+    return width, height
+
+
+def _load_exr(path: Path, read: Callable[[Any], _Read], header_only: bool = False) -> _Read:
+    """What ``read`` takes from an EXR file. Raises FrameError, DependencyError."""
     try:
         import OpenEXR
     except ImportError as error:
         raise DependencyError(f"{path} needs OpenEXR: run pip install 'freeocc3d[formats]'.") from error
     try:
         check_regular(path, IMAGE_BYTES)
-        return OpenEXR.File(str(path), header_only=header_only)
+        return read(OpenEXR.File(str(path), header_only=header_only))
     except OSError as error:
         raise FrameError(f"Cannot read {path}: {error.strerror or 'it is not a readable EXR image'}.") from error
-    except Exception as error:  # OpenEXR's own errors are of several types
-        raise FrameError(f"{path} is not a readable EXR image.") from error
-
-
-def _exr_size(file: Any, path: Path) -> Size:
-    low, high = file.header()["dataWindow"]
-    width, height = int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
-    if not 0 < width * height <= MOST_PIXELS or min(width, height) <= 0:
-        raise FrameError(f"{path} states {width} x {height} pixels, which is not possible.")
-    return width, height
-
-
-def _read_exr(path: Path) -> NDArray[Any]:
-    """The channel Z or Y, or the first of equal ones, such as R of a gray image."""
-    _exr_size(_open_exr(path, header_only=True), path)
-    channels = {name: channel.pixels for name, channel in _open_exr(path).channels().items()}
-    name = next((name for name in ("Z", "Y", "V", "depth", "R", "RGB", "RGBA") if name in channels), None)
-    if name is None:
-        raise FrameError(f"{path} has no channel Z, Y or R: it has {', '.join(channels) or 'none'}.")
-    pixels = channels[name]
-    return np.asarray(pixels if pixels.ndim == 2 else pixels[..., 0])
+    except Exception as error:  # OpenEXR's own errors are of several types, also for a header without parts
+        raise FrameError(f"{path} is not a readable EXR image: it is damaged, or of an unknown kind.") from error

@@ -89,6 +89,33 @@ def test_a_file_that_states_too_many_pixels_is_refused_before_memory_is_taken(tm
             read_raw_depth(tmp_path / name)
 
 
+def test_an_exr_image_with_any_part_damaged_is_read_or_refused(tmp_path: Path) -> None:
+    """Also where OpenEXR opens the file, and fails later."""
+    write_exr(tmp_path / "a.exr", FLOATS)
+    whole = (tmp_path / "a.exr").read_bytes()
+    refused: list[str] = []
+    for start in range(4, len(whole), 3):
+        for damaged in (whole[:start] + bytes(20) + whole[start + 20 :], whole[:start] + whole[start + 20 :]):
+            (tmp_path / "a.exr").write_bytes(damaged)
+            try:
+                assert read_raw_depth(tmp_path / "a.exr").shape
+            except FrameError as error:
+                refused.append(str(error))
+    assert len(refused) > 50
+    assert all("a.exr" in said for said in refused)
+
+
+def test_an_exr_image_of_many_large_channels_is_refused_by_its_header(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(kind, {name: np.ones((4, 8), np.float32) for name in "ABCDEZ"}).write(str(path))
+    data = path.read_bytes()
+    at = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+    path.write_bytes(data[:at] + struct.pack("<4i", 0, 0, 8191, 8191) + data[at + 16 :])
+    with pytest.raises(FrameError, match="8192 x 8192 pixels of 6 channels"):
+        read_raw_depth(path)
+
+
 def test_floats_that_are_no_depth_are_no_measurement() -> None:
     raw = np.array([[np.nan, np.inf, -np.inf, -1.0, 0.0, 2.5, 7.0]], np.float32)
     assert convert_to_meters(raw, 1.0, 6.0).tolist() == [[0, 0, 0, 0, 0, 2.5, 0]]
