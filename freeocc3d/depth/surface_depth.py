@@ -13,6 +13,7 @@ from .watertight_surface import SIDE_BY_SIDE, WatertightSurface
 
 _SPANNED, _FACING = 40.0, 0.4  # longest edge, in cells, and smallest cosine of a triangle that may fill a gap
 _ALIKE = 0.2  # relative
+_LEAST_COVERED = 0.5  # of the pixels that a view measured itself
 _SUREST, _LAYOUT_SIGMA, _SPANNED_SIGMA = 0.005, 0.01, 0.04  # standard deviations over depth
 
 
@@ -40,8 +41,14 @@ def render_surface_depth(
 
 def prefer_own_depth(own: DepthImage, surface: DepthImage) -> DepthImage:
     """Use a view's own depth where the ``surface`` does not contradict it, and the surface elsewhere. The surface
-    merges details smaller than its cells, and averages the poses of all views instead of following this view's pose."""
-    use = (own.inverse > 0) & (np.abs(own.inverse - surface.inverse) < _ALIKE * surface.inverse)
+    merges details smaller than its cells, and averages the poses of all views instead of following this view's pose.
+
+    A surface that lacks most of what the view measured is no surface of the scan: few views carve too little of the
+    space before it. The view's own depth then stays where there is no surface."""
+    measured, covered = own.inverse > 0, surface.inverse > 0
+    use = measured & (np.abs(own.inverse - surface.inverse) < _ALIKE * surface.inverse)
+    if np.count_nonzero(measured & covered) < _LEAST_COVERED * np.count_nonzero(measured):
+        use |= measured & ~covered
     inverse = np.where(use, own.inverse, surface.inverse)
     sigma = np.where(use, np.maximum(own.sigma, surface.sigma), surface.sigma)
     return DepthImage(inverse, sigma, surface.camera, surface.T_world_cam)

@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 from textured import CAMERA, looking
 
 from freeocc3d.depth.building_planes import Layout, Plane
-from freeocc3d.depth.surface_depth import render_surface_depth
+from freeocc3d.depth.cross_view_check import DepthImage
+from freeocc3d.depth.surface_depth import prefer_own_depth, render_surface_depth
 from freeocc3d.depth.watertight_surface import WatertightSurface
 
 _DEEP = 2.0
@@ -68,3 +69,14 @@ def test_small_gaps_are_shown_as_guesses_unless_they_are_seen_edge_on() -> None:
 def test_no_surface_no_depth() -> None:
     empty = WatertightSurface(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.int32), 0.01)
     assert not render_surface_depth(empty, _layout(2.0), CAMERA, looking(0.3)).inverse.any()
+
+
+@pytest.mark.parametrize(("columns", "kept"), [(6, True), (16, False)])
+def test_own_depth_stays_where_a_surface_lacks_most_of_it(columns: int, kept: bool) -> None:
+    """columns: of 20 in which the surface lies where the view measured it."""
+    sigma = np.full((4, 20), 0.01, np.float32)
+    own = DepthImage(np.full((4, 20), 0.5, np.float32), sigma, CAMERA, np.eye(4))
+    lying = np.where(np.arange(20) < columns, np.float32(0.51), np.float32(0)) * np.ones((4, 1), np.float32)
+    found = prefer_own_depth(own, DepthImage(lying, sigma, CAMERA, np.eye(4)))
+    np.testing.assert_array_equal(found.inverse[:, :columns], np.float32(0.5))
+    np.testing.assert_array_equal(found.inverse[:, columns:], np.float32(0.5 if kept else 0))
