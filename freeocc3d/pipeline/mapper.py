@@ -69,7 +69,7 @@ class Mapper:
 
     def add(self, frame: Frame) -> Tracked:
         """Track the next frame, and keep it if it is a keyframe."""
-        frame = self._complete(frame)
+        frame = self.complete(frame)
         tracked = self.tracker.track(frame)
         self.refined = False
         if tracked.status == "keyframe":
@@ -122,7 +122,7 @@ class Mapper:
                 while following is not None and (row + 1 == len(own) or following[0] < own[row + 1]):
                     index, found = following
                     if not isinstance(found, FrameError):
-                        yield PosedFrame(self._complete(found), trajectory.T_world_cam[index], row)
+                        yield PosedFrame(self.complete(found), trajectory.T_world_cam[index], row)
                     following = next(stream, None)
         finally:
             stream.close()
@@ -227,8 +227,8 @@ class Mapper:
 
     def _read(self, index: int) -> Frame:
         """A frame of the capture as ``add`` tracks it."""
-        return self._complete(self.capture[index])
+        return self.complete(self.capture[index])
 
-    def _complete(self, frame: Frame) -> Frame:
+    def complete(self, frame: Frame) -> Frame:
         """The frame with the camera as the tracker knows it, and with depth."""
         return self.depth.complete(self.tracker.prepare_frame(frame))

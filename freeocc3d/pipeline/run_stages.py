@@ -74,7 +74,7 @@ def track(run: Run) -> None:
         _track_frames(run, frames, first)
     if len(mapper.keyframes) == 0:
         raise TrackingError(
-            f"No frame of {capture.path} could be used as a start. {explain_losses(capture, mapper.trajectory())}"
+            f"No frame of {capture.path} could be used as a start. {_explain_losses(run, mapper.trajectory())}"
         )
 
 
@@ -178,7 +178,7 @@ def build_occupancy(run: Run) -> None:
 
 def save_map(run: Run) -> None:
     """Write the map, and warn of what it lacks."""
-    run.warn(*warn_of_trajectory(run.trajectory, _explain_losses(run)))
+    run.warn(*warn_of_trajectory(run.trajectory, _explain_losses(run, run.trajectory)))
     if not run.mapper.tracker.metric:
         run.warn(warn_of_scale())
     run.progress.stage("saving")
@@ -195,11 +195,11 @@ def save_map(run: Run) -> None:
     )
 
 
-def _explain_losses(run: Run) -> str:
+def _explain_losses(run: Run, trajectory: Trajectory) -> str:
     """Why frames were lost, a sentence; empty if none were."""
-    if run.mapper.settings.tracking.backend in GIVEN:
-        return "They have no pose." if (run.trajectory.status == "lost").any() else ""
-    return explain_losses(run.mapper.capture, run.trajectory)
+    mapper = run.mapper
+    given = mapper.settings.tracking.backend in GIVEN
+    return explain_losses(mapper.capture, trajectory, mapper.tracker.poses_ahead(), given, mapper.complete)
 
 
 STAGES: dict[str, Callable[[Run], None]] = {

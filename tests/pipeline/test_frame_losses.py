@@ -74,3 +74,36 @@ def test_frames_that_cannot_be_read_any_more() -> None:
             raise FrameError("gone")
 
     assert explain_losses(Gone(), LOST) == "None of them can be read any more."  # type: ignore[arg-type]
+
+
+class WithoutDepth(Damaged):
+    has_depth = False
+
+
+def test_lost_frames_of_color_are_told_what_stereo_found(frames) -> None:
+    """Nothing is said of a depth sensor that is not there."""
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    flat = WithoutDepth([replace(f, depth_m=f.depth_m * 0) for f in frames], lambda f: f)
+    completed: list[int] = []
+
+    def complete(frame: Frame) -> Frame:
+        completed.append(frame.index)
+        return replace(
+            frame, depth_m=np.float32(2) * (np.arange(320) < (9 if frame.index > 3 else 300)) + 0 * frame.depth_m
+        )
+
+    said = explain_losses(flat, LOST, poses, True, complete)  # type: ignore[arg-type]
+    assert "2 got depth from stereo in 3% of their pixels" in said
+    assert set(completed) >= {4, 5}
+    said = explain_losses(flat, LOST)  # type: ignore[arg-type]
+    assert "registration" not in said
+    assert "calibration" not in said
+
+
+def test_frames_without_a_given_pose_are_counted(frames) -> None:
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[4] = np.nan
+    shallow = Damaged(frames, CHANGES["shallow"][0])
+    assert explain_losses(shallow, LOST, poses, True).startswith("Without a pose: 1. Of 1 of them")  # type: ignore[arg-type]
+    poses[5] = np.nan
+    assert explain_losses(shallow, LOST, poses, True) == "They have no pose."  # type: ignore[arg-type]
