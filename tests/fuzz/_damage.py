@@ -8,6 +8,8 @@ import random
 import re
 import socket
 import struct
+import warnings
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -25,13 +27,16 @@ WORDS = (
 NUMBERS = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
 
 
+TEXTS = (".json", ".txt", ".yaml", ".log", ".xyz", ".csv", ".traj", ".pincam")
+
+
 def damage(rng: random.Random, path: Path) -> str:
     """Damage the file in a way that suits its kind, and return what was done."""
     kinds: list[Callable[[random.Random, Path], str]] = [damage_bytes, damage_bytes, replace]
     suffix = path.suffix.lower()
-    if suffix in (".json", ".txt", ".yaml", ".log", ".xyz") and path.is_file():
+    if (suffix in TEXTS or path.name == "metadata") and path.is_file():
         kinds += [damage_text] * 4
-    if suffix == ".json":
+    if suffix == ".json" or path.name == "metadata":
         kinds += [damage_document] * 8
     if suffix in (".png", ".jpg", ".tif", ".webp", ".bmp"):
         kinds += [damage_image] * 4
@@ -141,6 +146,47 @@ def _places(content: Any) -> Any:
     for key, value in list(items):
         yield content, key
         yield from _places(value)
+
+
+def damage_archive(rng: random.Random, path: Path) -> str:
+    """A member of a ZIP that is damaged, goes, stands twice, is a bomb, or has another name."""
+    with zipfile.ZipFile(path) as archive:
+        members = [(name, archive.read(name)) for name in archive.namelist()]
+    at = 0 if rng.random() < 0.4 else rng.randrange(len(members))
+    name, data = members[at]
+    kind = rng.choice(("content", "content", "content", "drop", "twice", "bomb", "name", "many"))
+    told = kind
+    if kind == "content":
+        inner = path.with_name(Path(name).name)
+        inner.write_bytes(data)
+        told = (
+            rng.choice((damage_bytes, damage_text, damage_document))(rng, inner)
+            if at == 0
+            else damage_bytes(rng, inner)
+        )
+        members[at] = name, inner.read_bytes()
+        inner.unlink()
+    elif kind == "drop":
+        del members[at]
+    elif kind == "twice":
+        members.append((name, data[: len(data) // 2]))
+    elif kind == "bomb":
+        members[at] = name, data + bytes(rng.choice((1 << 20, 300 << 20)))
+    elif kind == "name":
+        named = rng.choice(
+            ("../outside", "/etc/passwd", "rgbd\\0.jpg", "rgbd/../../0.jpg", "é" * 200, "rgbd/", "a\x01b")
+        )
+        members[at] = named, data
+        told = f"named {named[:20]!r}"
+    else:
+        members += [(f"rgbd/{n}.jpg", b"") for n in range(5000, 25_000)]
+    method = rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a name that stands twice
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED if kind == "bomb" else method) as archive:
+            for member, content in members:
+                archive.writestr(member, content)
+    return f"{name} in {path.name}: {told}"
 
 
 def damage_image(rng: random.Random, path: Path) -> str:

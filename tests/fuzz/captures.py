@@ -11,13 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fuzz._damage import damage, damage_folder, replace
+from fuzz._damage import damage, damage_archive, damage_folder, replace
+from fuzz._scans import write_scans
 from fuzz.harness import Attack, Silent
 
 SHORT = 60
 
 FRAMES = 4
 READERS = ("scannet", "replica", "seven_scenes", "nerfstudio", "lidar", "colmap_txt", "colmap_bin", "photos")
+SCANS = "scans"
+IMAGES = (".png", ".jpg", ".tif", ".tiff", ".webp", ".bmp", ".npy", ".npz", ".exr", ".pgm", ".pfm", ".depth", ".conf")
 VIDEOS = ("scan.mp4", "scan.avi", "scan.mkv")
 
 
@@ -45,6 +48,8 @@ def prepare(folder: Path) -> None:
     for name in VIDEOS:
         videos.write_video(folder / name, 12, codec="mpeg4" if name.endswith("avi") else "libx264")
     _write_files(folder / "files")
+    (folder / SCANS).mkdir()
+    write_scans(folder / SCANS)
     shutil.copy(folder / "files" / "points.ply", folder / "nerfstudio" / "points.ply")
     shutil.copytree(folder / "replica" / "semantic_class", folder / "labels")
     (folder / "labels" / "classes.txt").write_text("nothing\nsofa\nlamp\n")
@@ -92,29 +97,36 @@ def _write_files(folder: Path) -> None:
 def attack(rng: random.Random, originals: Path, folder: Path) -> Attack:
     """One damaged input of a random kind."""
     kind = rng.random()
-    if kind < 0.62:
-        return _capture_attack(rng, originals, folder)
-    if kind < 0.76:
+    if kind < 0.25:
+        return _capture_attack(rng, originals / rng.choice(READERS), folder)
+    if kind < 0.72:
+        return _capture_attack(rng, rng.choice(sorted((originals / SCANS).iterdir())), folder)
+    if kind < 0.81:
         return _video_attack(rng, originals, folder)
     return _file_attack(rng, originals, folder)
 
 
-def _capture_attack(rng: random.Random, originals: Path, folder: Path) -> Attack:
-    name = rng.choice(READERS)
+def _capture_attack(rng: random.Random, original: Path, folder: Path) -> Attack:
+    """A damaged copy of a sound capture; of one that is a file, the file is given."""
+    name = original.name
     scan = folder / name
-    shutil.copytree(originals / name, scan)
+    shutil.copytree(original, scan)
     files = sorted(path for path in scan.rglob("*") if path.is_file())
-    documents = [path for path in files if path.suffix in (".json", ".txt", ".bin", ".ply")]
-    if rng.random() < 0.1:
+    documents = [path for path in files if path.suffix not in IMAGES]
+    given = files[0] if len(files) == 1 and rng.random() < 0.7 else scan
+    if files[0].suffix == ".r3d" and rng.random() < 0.5:
+        told = damage_archive(rng, files[0])
+    elif rng.random() < 0.1:
         places = [scan, *sorted(path for path in scan.iterdir() if path.is_dir())]
         told = damage_folder(rng, rng.choice(places))
     else:
         told = damage(rng, rng.choice(documents if documents and rng.random() < 0.6 else files))
-    if rng.random() < 0.1:
-        told += "; " + damage(rng, rng.choice(sorted(path for path in scan.rglob("*") if path.is_file())))
+    left = sorted(path for path in scan.rglob("*") if path.is_file() and not path.is_symlink())
+    if left and rng.random() < 0.1:
+        told += "; " + damage(rng, rng.choice(left))
     depth = rng.random() > 0.1
     whole = rng.random() < 0.02
-    run = (lambda: _reconstruct(scan, folder / "map")) if whole else (lambda: _read(scan, depth))
+    run = (lambda: _reconstruct(given, folder / "map")) if whole else (lambda: _read(given, depth))
     return Attack(f"{name}: {told}{' (reconstruct)' if whole else ''}", run)
 
 
