@@ -113,7 +113,8 @@ def _capture_attack(rng: random.Random, original: Path, folder: Path) -> Attack:
     shutil.copytree(original, scan)
     files = sorted(path for path in scan.rglob("*") if path.is_file())
     documents = [path for path in files if path.suffix not in IMAGES]
-    given = files[0] if len(files) == 1 and rng.random() < 0.7 else scan
+    inner = sorted(scan.iterdir())
+    given = inner[0] if len(inner) == 1 and rng.random() < 0.8 else scan
     if files[0].suffix == ".r3d" and rng.random() < 0.5:
         told = damage_archive(rng, files[0])
     elif rng.random() < 0.1:
