@@ -85,6 +85,10 @@ class Capture(ABC):
         """File name of the frame's color image, "" if it has none. Pose files of other systems may refer to it."""
         return ""
 
+    def files(self, index: int) -> tuple[Path, ...]:
+        """The image files of the frame; empty if it has none of its own. Only ``file_heads`` looks at them."""
+        return ()
+
     def turned(self, index: int) -> int:
         """Counter-clockwise quarter turns of the frame's image, relative to how the camera was held. The turns give all
         images of a scan one size. Poses, pixels and pictures refer to the turned image."""

@@ -60,6 +60,11 @@ class FileFrames(RgbdFrames):
         color = self.frames[index].color
         return color.name if color else ""
 
+    def files(self, index: int) -> tuple[Path, ...]:
+        frame = self.frames[index]
+        depth = (frame.depth, frame.confidence) if self.has_depth else ()
+        return tuple(path for path in (frame.color, *depth) if path is not None)
+
     def pose(self, index: int) -> NDArray[np.float64] | None:
         return self.frames[index].T_world_cam
 

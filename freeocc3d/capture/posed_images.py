@@ -92,6 +92,10 @@ class PosedImages(Capture):
     def name(self, index: int) -> str:
         return self._posed[index].image.name
 
+    def files(self, index: int) -> tuple[Path, ...]:
+        view = self._posed[index]
+        return (view.image,) if view.depth is None or not self.has_depth else (view.image, view.depth)
+
     def pose(self, index: int) -> NDArray[np.float64]:
         return self._posed[index].T_world_cam
 

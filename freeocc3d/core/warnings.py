@@ -9,6 +9,7 @@ Code = Literal[
     "option-renamed",
     "option-removed",
     "images-left-out",
+    "images-unreadable",
     "depth-scale-doubtful",
     "poses-doubtful",
     "registration-doubtful",

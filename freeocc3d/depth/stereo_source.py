@@ -48,6 +48,6 @@ class StereoSource(DepthSource):
         if T_world_cam is None:
             raise TrackingError(
                 f"{self._capture.path} has no depth, and this tracker estimates poses frame by frame, but stereo needs "
-                "all poses first: set tracking.backend=colmap, known or file."
+                "all poses first: leave tracking.backend at auto, or give them (known, file)."
             )
         return triangulate(self._capture, T_world_cam, frames, progress)

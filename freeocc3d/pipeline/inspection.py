@@ -11,10 +11,11 @@ import numpy as np
 
 from ..capture import Capture, open_capture
 from ..capture.depth_units import UNITS, DepthSample, sample_depth, settle_depth_unit
+from ..capture.file_heads import check_heads
 from ..capture.focal_correction import Reregistered
 from ..capture.registration_check import check_registration
 from ..capture.rgbd_frames import RgbdFrames
-from ..core.errors import FreeOccError
+from ..core.errors import CaptureError, FreeOccError
 from ..core.types import Frame
 from ..core.warnings import Notice
 from ..settings import config
@@ -89,6 +90,10 @@ def inspect(path: str | Path, settings: Settings | None = None) -> Inspection:
     settings = settings or config.resolve({})
     capture = open_capture(path, settings.capture, settings.backends.get("capture"))
     notices = list(capture.warnings)
+    try:
+        notices += [broken] if (broken := check_heads(capture, range(len(capture)))) else []
+    except CaptureError as error:
+        notices.append(Notice("images-unreadable", str(error)))
     if unit := settle_depth_unit(capture):
         notices.append(unit)
     _, tracking = choose_tracker(settings, capture)

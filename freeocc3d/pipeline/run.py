@@ -11,6 +11,7 @@ from typing import Any
 from .. import __version__
 from ..capture import Capture, open_capture, select_frames
 from ..capture.depth_units import settle_depth_unit
+from ..capture.file_heads import check_heads
 from ..capture.focal_correction import Reregistered
 from ..capture.registration_check import check_registration
 from ..capture.rgbd_frames import RgbdFrames
@@ -95,6 +96,8 @@ def _prepare(capture: Capture, settings: Settings, work: WorkFolder, progress: P
 def _open(capture: str | Path, settings: Settings, progress: Progress, work: WorkFolder) -> Capture:
     opened = open_capture(capture, settings.capture, settings.backends.get("capture"))
     select_frames(opened)
+    broken = check_heads(opened, select_frames(opened))
+    work.warn(progress, *([broken] if broken else []))
     warning = settle_depth_unit(opened)
     work.warn(progress, *opened.warnings, *([warning] if warning else []))
     return opened

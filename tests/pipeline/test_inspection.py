@@ -45,8 +45,8 @@ def test_what_is_wrong_is_told_frame_by_frame(tmp_path: Path) -> None:
         write_image(tmp_path / "color" / f"{index}.png", color_image(index) // 16)
     found = inspect(tmp_path)
     assert found.camera == "not stated"
-    assert [notice.code for notice in found.notices] == ["intrinsics-unknown"]
-    assert "give --focal" in found.notices[0].text
+    assert [notice.code for notice in found.notices] == ["images-unreadable", "intrinsics-unknown"]
+    assert "give --focal" in found.notices[1].text
     broken, dark = found.problems
     assert "color/2.png" in broken
     assert dark == "3 of 3 frames that were looked at are nearly black."

@@ -186,8 +186,7 @@ def test_frames_that_cannot_be_read_are_skipped_and_counted(tmp_path) -> None:
     assert len(made.report["broken"]) == 2
     assert "frame-000007.color.jpg" in made.report["broken"]["7"]
     assert made.trajectory.status[7] == made.trajectory.status[11] == "broken"
-    (warning,) = notices(made)
-    assert warning.code == "broken-frames"
+    (warning,) = (notice for notice in notices(made) if notice.code == "broken-frames")
     assert "2 frames could not be read" in warning.text
     for i in (3, 4, 5):
         truncate(scan / f"frame-{i:06d}.color.jpg")

@@ -129,6 +129,9 @@ class Reader(Capture):
     def name(self, index: int) -> str:
         return self._paths[index].name
 
+    def files(self, index: int) -> tuple[Path, ...]:
+        return (self._paths[index],)
+
     def turned(self, index: int) -> int:
         header = self._headers[index]
         if header is None or header.size == self._size:

@@ -22,7 +22,7 @@ def load(options: Options, capture: Capture) -> KnownTracker:
     """Load the tracker, which reads ``capture.pose``. Raises TrackingError if the capture has no poses."""
     stated = [capture.pose(index) for index in range(len(capture))]
     if all(pose is None for pose in stated):
-        raise TrackingError(f"{capture.path} has no poses: use tracking.backend=rgbd, which estimates them.")
+        raise TrackingError(f"{capture.path} has no poses: leave tracking.backend at auto, which estimates them.")
     none = np.full((4, 4), np.nan)
     given = np.stack([none if pose is None else pose for pose in stated])
     tracker = KnownTracker(given, options.keyframe_overlap)
