@@ -36,7 +36,7 @@ def test_known_takes_the_captures_poses_and_says_when_there_are_none(tmp_path) -
     for i in (0, 5, 10):
         np.testing.assert_allclose(trajectory.T_world_cam[i], kitchen.pose(i), atol=2e-4)
     poseless = open_capture(write_seven_scenes(tmp_path / "poseless", 3, poses=False))
-    with pytest.raises(TrackingError, match=r"tracking\.backend=rgbd"):
+    with pytest.raises(TrackingError, match=r"leave tracking\.backend at auto"):
         known.load(known.Options(), poseless)
 
 
