@@ -47,9 +47,16 @@ class Run:
     occupancy: Occupancy = field(init=False)
 
     def check_poses(self, pairs: Sequence[MeasuredPair]) -> None:
-        """Compare poses that are taken as they are with measured pairs of frames. Raises TrackingError."""
-        poses = self.mapper.tracker.poses_ahead() if pairs else None
-        if poses is not None and (notice := check_poses(poses, pairs, str(self.mapper.capture.path))):
+        """Say how many frames have a pose that is taken as it is, and compare these poses with measured pairs of
+        frames. Raises TrackingError."""
+        capture, settings = self.mapper.capture, self.mapper.settings
+        poses = self.mapper.tracker.poses_ahead() if settings.tracking.backend in GIVEN else None
+        if poses is None:
+            return
+        used = select_frames(capture)
+        posed = int(np.isfinite(poses[list(used)]).all(axis=(1, 2)).sum())
+        self.progress.note(f"{posed} of {len(used)} frames have a given pose.")
+        if pairs and (notice := check_poses(poses, pairs, str(capture.path))):
             self.warn(notice)
 
     def warn(self, *notices: Notice) -> None:

@@ -47,7 +47,8 @@ _Pose = tuple[Number, Number, Number, Number, Number, Number, Number]
 
 class _Metadata(msgspec.Struct, rename={"per_frame": "perFrameIntrinsicCoeffs", "times": "frameTimestamps"}):
     """w, h: size of the color that the cameras are for.  dw, dh: of the depth.  K: column-major.  poses: qx qy qz qw
-    tx ty tz, camera to world.  per_frame: fx fy cx cy.  times: seconds of any clock.  Lists have an entry per frame number."""
+    tx ty tz, camera to world.  per_frame: fx fy cx cy.  times: seconds of any clock.  Lists have an entry
+    per frame number."""
 
     w: PositiveNumber
     h: PositiveNumber
