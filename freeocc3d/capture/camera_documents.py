@@ -11,6 +11,7 @@ settings files; the info files of BundleFusion and 3RScan.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -266,19 +267,28 @@ def _list(value: Any) -> list[float] | None:
         value = value.get("data")
     if not isinstance(value, list | tuple) or len(value) > 20:
         return None
-    flat = [item for row in value for item in (row if isinstance(row, list | tuple) else [row])]
-    if not all(isinstance(item, int | float) and not isinstance(item, bool) for item in flat):
-        return None
-    return [float(item) for item in flat] if np.isfinite(np.array(flat, np.float64)).all() else None
+    flat = [_finite(item) for row in value for item in (row if isinstance(row, list | tuple) else [row])]
+    numbers = [item for item in flat if item is not None]
+    return numbers if len(numbers) == len(flat) else None
 
 
 def _number(node: Mapping[str, Any], keys: tuple[str, ...]) -> float | None:
     """The first of these keys that holds a finite number."""
     for key in keys:
-        value = node.get(key)
-        if isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(float(value)):
-            return float(value)
+        if (number := _finite(node.get(key))) is not None:
+            return number
     return None
+
+
+def _finite(value: Any) -> float | None:
+    """A number that fits a float; None for anything else. Whole numbers of documents may have any length."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
 
 
 def _units(content: Any, depth: int = 0) -> float | None:
@@ -288,7 +298,7 @@ def _units(content: Any, depth: int = 0) -> float | None:
     simple = {str(key).lower().rpartition(".")[2].removeprefix("m_"): value for key, value in content.items()}
     stated = _number(simple, _UNITS)
     if stated is None and _number(simple, _FX) and (_number(simple, ("scale",)) or 0.0) >= 100:
-        stated = simple["scale"]
+        stated = _number(simple, ("scale",))
     if stated is not None and 1e-6 <= stated <= 1e6 and stated != 1:
         return round(stated if stated > 1 else 1 / stated, 3)
     return next((found for value in content.values() if (found := _units(value, depth + 1))), None)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..core import arrays
 from ..core.errors import DependencyError, FrameError, MapError
 from ..core.image_files import MOST_PIXELS, Size
-from ..core.regular_files import IMAGE_BYTES, check_regular, read_bytes
+from ..core.regular_files import IMAGE_BYTES, check_content, read_bytes
 from .image_decoding import decode_image, describe, image_size
 
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".npy", ".npz"})
@@ -168,7 +168,7 @@ def _load_exr(path: Path, read: Callable[[Any], _Read], header_only: bool = Fals
     except ImportError as error:
         raise DependencyError(f"{path} needs OpenEXR: run pip install 'freeocc3d[formats]'.") from error
     try:
-        check_regular(path, IMAGE_BYTES)
+        check_content(path, IMAGE_BYTES)
         return read(OpenEXR.File(str(path), header_only=header_only))
     except OSError as error:
         raise FrameError(f"Cannot read {path}: {error.strerror or 'it is not a readable EXR image'}.") from error

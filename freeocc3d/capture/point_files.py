@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, FreeOccError
 from ..core.ply_files import PlyHeader, read_ply_header, read_ply_vertices
-from ..core.regular_files import check_regular, open_regular, read_bytes
+from ..core.regular_files import check_content, open_regular, read_bytes
 from .camera_files import FARTHEST
 
 _MOST_BYTES = 1 << 30
@@ -26,7 +26,7 @@ _LONGEST_HEADER = 1 << 12
 def read_points(path: Path) -> NDArray[np.float64]:
     """Read (P, 3) finite points, in the file's unit. Raises CaptureError: no such file, no points, or damaged."""
     try:
-        check_regular(path, _MOST_BYTES)
+        check_content(path, _MOST_BYTES)
         suffix = path.suffix.lower()
         points = _ply_points(path) if suffix == ".ply" else _pcd_points(path) if suffix == ".pcd" else _xyz_points(path)
     except OSError as error:

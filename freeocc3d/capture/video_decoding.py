@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, FrameError, FreeOccError
 from ..core.image_files import Size
-from ..core.regular_files import check_regular, open_regular
+from ..core.regular_files import check_content, open_regular
 
 FOCAL_35MM = "focal_length.35mm_equivalent"
 """End of the tag in which phones state the lens (com.apple.quicktime.camera.…)."""
@@ -233,7 +233,7 @@ def _key(timed: Any) -> int:
 def _refuse_text(path: Path) -> None:
     """Raise CaptureError for a file that is not regular, or holds text; FFmpeg would draw the text."""
     try:
-        check_regular(path)
+        check_content(path)
         with open_regular(path) as stream:
             head = stream.read(4096)
     except OSError as error:

@@ -45,6 +45,15 @@ def check_regular(path: Path, limit: int | None = None) -> os.stat_result:
     return found
 
 
+def check_content(path: Path, limit: int | None = None) -> os.stat_result:
+    """``check_regular`` for a file that a library opens by its path: an empty one raises UnusableFile, too. Files of
+    /proc state no size, and reading them may block."""
+    found = check_regular(path, limit)
+    if not found.st_size:
+        raise UnusableFile(errno.ENODATA, "it is empty", str(path))
+    return found
+
+
 @contextlib.contextmanager
 def open_regular(path: Path, limit: int | None = None) -> Iterator[BinaryIO]:
     """Open a regular file to read bytes. Raises what ``check_regular`` raises, also if the file is replaced

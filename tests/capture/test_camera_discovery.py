@@ -223,6 +223,21 @@ def test_a_calibration_that_is_not_usable_is_told(tmp_path: Path, name: str, tex
         find_cameras(tmp_path, SIZE, SIZE)
 
 
+@pytest.mark.parametrize("key", ["fx", "fy", "cx", "k1", "depth_scale", "scale", "width", "K"])
+@pytest.mark.parametrize("form", ["json", "yaml"])
+def test_numbers_that_no_float_holds(tmp_path: Path, key: str, form: str) -> None:
+    """JSON and YAML write whole numbers of any length."""
+    stated = {"fx": FX, "fy": FY, "cx": CX, "cy": CY, key: [10**400] * 9 if key == "K" else 10**400}
+    text = json.dumps(stated) if form == "json" else "".join(f"{name}: {value}\n" for name, value in stated.items())
+    (tmp_path / f"camera.{form}").write_text(text)
+    try:
+        found = find_cameras(tmp_path, SIZE, SIZE)
+    except CaptureError as error:
+        assert "camera." in str(error)  # noqa: PT017, most keys are left out without a word
+    else:
+        assert found.units_per_meter is None
+
+
 def test_a_camera_of_the_depths_size_is_the_depths(tmp_path: Path) -> None:
     (tmp_path / "camera.json").write_text(json.dumps({**NESTED, "width": 640, "height": 480}))
     stated = find_cameras(tmp_path, (1920, 1080), (640, 480)).stated

@@ -39,7 +39,12 @@ def test_a_cut_file_or_a_wrong_count_is_refused(tmp_path: Path, name: str, optio
 def test_points_that_are_not_finite_are_left_out_and_impossible_ones_refused(tmp_path: Path) -> None:
     (tmp_path / "cloud.xyz").write_text("1 2 3\nnan 0 0\n0 inf 0\n")
     np.testing.assert_array_equal(read_points(tmp_path / "cloud.xyz"), [[1, 2, 3]])
-    for text, told in (("1e300 0 0\n", "farther away than is possible"), ("1 2\n", "too few"), ("", "holds no points")):
+    for text, told in (
+        ("1e300 0 0\n", "farther away than is possible"),
+        ("1 2\n", "too few"),
+        ("", "it is empty"),
+        ("# none\n", "holds no points"),
+    ):
         (tmp_path / "cloud.xyz").write_text(text)
         with pytest.raises(CaptureError, match=told):
             read_points(tmp_path / "cloud.xyz")

@@ -143,7 +143,7 @@ def test_what_is_no_video_is_reported_in_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"notes\.mp4 is a text file, not a readable video"):
         open_capture(notes)
     (tmp_path / "empty.mp4").touch()
-    with pytest.raises(CaptureError, match=r"empty\.mp4 is not a readable video"):
+    with pytest.raises(CaptureError, match=r"empty\.mp4: it is empty"):
         open_capture(tmp_path / "empty.mp4")
     cut = write_video(tmp_path / "cut.mp4")  # its list of frames, which mp4 has at the end, is lost
     truncate(cut)

@@ -6,7 +6,15 @@ import pytest
 
 from freeocc3d.core import regular_files
 from freeocc3d.core.checksums import hash_bytes, hash_file
-from freeocc3d.core.regular_files import UnusableFile, check_regular, list_names, read_bytes, read_text, user_path
+from freeocc3d.core.regular_files import (
+    UnusableFile,
+    check_content,
+    check_regular,
+    list_names,
+    read_bytes,
+    read_text,
+    user_path,
+)
 
 
 def special(kind: str, folder: Path) -> Path:
@@ -82,3 +90,16 @@ def test_files_that_state_no_size_are_empty(tmp_path: Path) -> None:
         (tmp_path / "link").unlink(missing_ok=True)
         (tmp_path / "link").symlink_to(name)
         assert read_bytes(tmp_path / "link", 1 << 20) == b""
+
+
+def test_a_file_that_a_library_opens_states_its_size(tmp_path: Path) -> None:
+    """Reading those of /proc may block."""
+    (tmp_path / "empty").touch()
+    (tmp_path / "log").symlink_to("/proc/kmsg")
+    for name in ("empty", "log"):
+        with pytest.raises(UnusableFile, match="it is empty"):
+            check_content(tmp_path / name)
+    (tmp_path / "empty").write_bytes(b"1")
+    assert check_content(tmp_path / "empty").st_size == 1
+    with pytest.raises(UnusableFile, match="it is a folder"):
+        check_content(tmp_path)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import CaptureError
-from ...core.regular_files import check_regular, open_regular, read_text
+from ...core.regular_files import check_content, open_regular, read_text
 from ...core.yaml_documents import InvalidYaml, parse_yaml
 from ..file_bytes import DamagedFile
 from ..numbered_files import list_folder
@@ -85,7 +85,7 @@ def _open_folder(folder: Path) -> MessageStore:
         raise DamagedFile("the folder holds no .mcap or .db3 file")
     compressed = str(stated.get("compression_mode") or "").lower() == "message"
     for name in found:
-        check_regular(folder / name)
+        check_content(folder / name)
     return JoinedStore([_open_file(folder / name) for name in found], compressed)
 
 
