@@ -34,11 +34,14 @@ def open_capture(
     if not (folder.is_dir() or folder.is_file()):
         raise CaptureError(f"{folder} is neither a folder nor a regular file: give a folder of frames, or a video.")
     try:
-        from .recognition import recognize  # imports OpenCV
+        from .recognition import find_unread_depth, recognize  # imports OpenCV
 
         name = recognize(folder) if options.format == "auto" else options.format
         _check_kind(name, folder)
-        return _construct(name, folder, options, backend_options or {})
+        opened = _construct(name, folder, options, backend_options or {})
+        if options.format == "auto" and options.depth and not opened.has_depth and folder.is_dir():
+            opened.warnings = (*opened.warnings, *find_unread_depth(folder, name))
+        return opened
     except OSError as error:
         raise CaptureError(f"Cannot read {error.filename or folder}: {error.strerror}.") from error
 

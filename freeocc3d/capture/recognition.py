@@ -9,10 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ..core.errors import CaptureError
+from ..core.warnings import Notice
 from ..settings import registry
 from .base import Capture
 from .folder_contents import ImageFolder, find_image_folders, holds_depth_or_confidence
 from .numbered_files import list_folder
+from .paired_folders import find_folders
 
 RECORDINGS = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".r3d", ".sens", ".bag", ".mcap", ".db3"}
 """Suffixes of files that may be a capture."""
@@ -133,3 +135,17 @@ def _is_there(part: str, names: list[str]) -> bool:
 
 def _listed(readers: Readers) -> str:
     return "; ".join(f"{reader.layout} ({name})" for name, reader in readers.items())
+
+
+def find_unread_depth(path: Path, name: str) -> list[Notice]:
+    """A warning if depth images lie beside the color of a capture that was read without any, as format ``name``."""
+    folders = find_folders(path)
+    if folders is None or holds_depth_or_confidence(folders.depth) != "depth":
+        return []
+    return [
+        Notice(
+            "depth-not-read",
+            f"{folders.depth} holds {len(folders.depth_names)} depth images, which the format {name} does not name, so "
+            "they are not read: set capture.format=image_folders to use them in place of the poses that it states.",
+        )
+    ]

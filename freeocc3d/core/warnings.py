@@ -11,6 +11,7 @@ Code = Literal[
     "images-left-out",
     "images-unreadable",
     "depth-scale-doubtful",
+    "depth-not-read",
     "poses-doubtful",
     "registration-doubtful",
     "intrinsics-unknown",

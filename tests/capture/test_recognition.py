@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from posed_captures import write_colmap, write_nerfstudio
 from small_captures import color_image, depth_image, write_image, write_scannet, write_seven_scenes
 
 from freeocc3d.capture import Options, open_capture
@@ -81,6 +82,17 @@ def test_the_folder_above_several_captures_names_the_first_and_counts_them(tmp_p
     for name in ("seq-01", "seq-02"):
         write_seven_scenes(tmp_path / name, 2)
     assert f"but {tmp_path / 'seq-01'} is (and 1 more): give that folder" in said_of(tmp_path)
+
+
+@pytest.mark.parametrize("write", [write_colmap, lambda folder, count: write_nerfstudio(folder, count, depth=False)])
+def test_depth_beside_a_reconstruction_is_not_left_out_in_silence(tmp_path: Path, write) -> None:
+    write(tmp_path, 3)
+    assert not [notice for notice in open_capture(tmp_path).warnings if notice.code == "depth-not-read"]
+    write_images(tmp_path / "depth", "depth")
+    capture = open_capture(tmp_path)
+    (notice,) = (notice for notice in capture.warnings if notice.code == "depth-not-read")
+    assert f"{tmp_path / 'depth'} holds 3 depth images" in notice.text
+    assert open_capture(tmp_path, Options(format="image_folders")).has_depth
 
 
 def test_an_empty_folder_says_what_was_looked_for(tmp_path: Path) -> None:
