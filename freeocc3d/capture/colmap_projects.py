@@ -42,7 +42,8 @@ class ColmapProject:
             Notice(
                 "models-apart",
                 f"{taken.parent} holds {len(self.counts)} models: {taken.name} with {most} images is taken; "
-                f"{rest}{more} {'is' if len(others) == 1 else 'are'} left out, because nothing says how they lie relative to it.",
+                f"{rest}{more} {'is' if len(others) == 1 else 'are'} left out, because nothing says how they lie "
+                "relative to it.",
             ),
         )
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ..core.errors import CaptureError
+from ..core.regular_files import open_regular
 from ..core.warnings import Notice
 from ..settings import registry
 from .base import Capture
@@ -19,7 +20,20 @@ from .paired_folders import find_folders
 RECORDINGS = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".r3d", ".sens", ".bag", ".mcap", ".db3"}
 """Suffixes of files that may be a capture."""
 
-_MOST_BELOW, _NEAREST = 1000, 2
+_ARCHIVE = "an archive: unpack it, and give the folder"
+_FOREIGN = {
+    b"PK\x03\x04": _ARCHIVE,
+    b"\x1f\x8b": _ARCHIVE,
+    b"7z\xbc\xaf": _ARCHIVE,
+    b"Rar!": _ARCHIVE,
+    b"ply\n": "a mesh or a point cloud, not a scan: give the images that it was made of",
+    b"ply\r": "a mesh or a point cloud, not a scan: give the images that it was made of",
+    b"\x89PNG": "a single image: give the folder with all images of the scan",
+    b"\xff\xd8\xff": "a single image: give the folder with all images of the scan",
+}
+"""First bytes of files that are no capture -> what they are, and what to do."""
+
+_MOST_BELOW, _NEAREST, _LAST = 1000, 2, 2
 
 Readers = Mapping[str, type[Capture]]
 
@@ -28,17 +42,31 @@ def recognize(path: Path) -> str:
     """Name of the reader that recognizes a folder or file. Formats with a layout of their own come first, then general
     ones with depth, then those of color alone. Raises CaptureError if none recognizes it, or several do."""
     readers = {name: reader for name, reader in list_readers().items() if reader.reads_files or not path.is_file()}
-    for rank in (0, 1, 2):
+    for rank in range(_LAST + 1):
         found = [name for name, reader in readers.items() if _rank(reader) == rank and reader.recognizes(path)]
         if len(found) > 1:
             raise CaptureError(f"{path} may be of the format {' or '.join(found)}: choose one with capture.format.")
-        if found:
+        if found and not (rank == _LAST and (kind := _foreign(path))):
             return found[0]
+        if found:
+            raise CaptureError(f"{path} is {kind}.")
     raise CaptureError(explain_unknown(path, readers))
 
 
 def _rank(reader: type[Capture]) -> int:
     return 0 if not reader.general else 1 if reader.has_depth else 2
+
+
+def _foreign(path: Path) -> str:
+    """What a file is that is often mistaken for a recording, with what to do; empty for all others."""
+    if not path.is_file():
+        return ""
+    try:
+        with open_regular(path) as stream:
+            head = stream.read(8)
+    except OSError:
+        return ""
+    return next((kind for magic, kind in _FOREIGN.items() if head.startswith(magic)), "")
 
 
 def list_readers() -> dict[str, type[Capture]]:

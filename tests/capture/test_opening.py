@@ -34,7 +34,7 @@ def test_no_folder_and_no_directory(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"There is no folder .*nowhere"):
         open_capture(tmp_path / "nowhere")
     (tmp_path / "scan.zip").write_bytes(b"")
-    with pytest.raises(CaptureError, match=r"scan\.zip is not a readable video"):
+    with pytest.raises(CaptureError, match=r"scan\.zip: it is empty"):
         open_capture(tmp_path / "scan.zip")
 
 

@@ -95,6 +95,20 @@ def test_depth_beside_a_reconstruction_is_not_left_out_in_silence(tmp_path: Path
     assert open_capture(tmp_path, Options(format="image_folders")).has_depth
 
 
+@pytest.mark.parametrize(
+    ("name", "head", "said"),
+    [
+        ("scan.zip", b"PK\x03\x04 and more", "is an archive: unpack it"),
+        ("scan.tar.gz", b"\x1f\x8b\x08 and more", "is an archive: unpack it"),
+        ("room.ply", b"ply\nformat ascii 1.0\n", "is a mesh or a point cloud"),
+        ("a.png", b"\x89PNG\r\n\x1a\n", "is a single image: give the folder"),
+    ],
+)
+def test_a_file_that_is_no_recording_is_called_what_it_is(tmp_path: Path, name: str, head: bytes, said: str) -> None:
+    (tmp_path / name).write_bytes(head)
+    assert said in said_of(tmp_path / name)
+
+
 def test_an_empty_folder_says_what_was_looked_for(tmp_path: Path) -> None:
     said = said_of(tmp_path)
     assert "holds neither images nor a video" in said
