@@ -60,5 +60,7 @@ def explain_missing_model(database: SfmDatabase, registered: int, what: str) -> 
             "depth. Walk sideways while filming, so that near objects move against far ones."
         )
     return TrackingError(
-        f"Of the {len(database.frames())} images of {what}, only {registered} got a pose, too few for a map: {_SLOWLY}."
+        f"Of the {len(database.frames())} images of {what}, only {registered} got a pose, too few for a map: "
+        f"{len(pairs)} pairs of images match, half of these with no more than {np.median([inliers for _, inliers in pairs] or [0]):.0f} points. "
+        f"{_SLOWLY.capitalize()}."
     )
