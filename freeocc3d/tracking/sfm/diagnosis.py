@@ -59,8 +59,9 @@ def explain_missing_model(database: SfmDatabase, registered: int, what: str) -> 
             f"The camera of {what} seems only to turn, or to see one flat wall: {flat:.0%} of its image pairs give no "
             "depth. Walk sideways while filming, so that near objects move against far ones."
         )
+    middle = np.median([inliers for _, inliers in pairs] or [0])
     return TrackingError(
         f"Of the {len(database.frames())} images of {what}, only {registered} got a pose, too few for a map: "
-        f"{len(pairs)} pairs of images match, half of these with no more than {np.median([inliers for _, inliers in pairs] or [0]):.0f} points. "
+        f"{len(pairs)} pairs of images match, half of these with no more than {middle:.0f} points. "
         f"{_SLOWLY.capitalize()}."
     )
