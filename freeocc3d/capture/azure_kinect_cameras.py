@@ -21,7 +21,7 @@ from ..core.typed_documents import InvalidDocument, as_type, parse_json
 from ..core.types import Intrinsics
 from .camera_files import Number, check_focal
 from .lenses import Lens
-from .rgbd_frames import StatedCameras
+from .rigs import StatedCameras
 
 DEPTH, COLOR = "CALIBRATION_CameraLocationD0", "CALIBRATION_CameraLocationPV0"
 _BROWN, _RATIONAL = "CALIBRATION_LensDistortionModelBrownConrady", "CALIBRATION_LensDistortionModelRational6KT"

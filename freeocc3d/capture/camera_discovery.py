@@ -16,7 +16,7 @@ from .camera_files import same_view
 from .lenses import Lens
 from .name_matching import match_names
 from .numbered_files import list_folder
-from .rgbd_frames import StatedCameras
+from .rigs import StatedCameras
 
 SAME_CAMERA = 0.01
 """Two statements of one camera agree if their parameters differ by less than this share of the image's width."""

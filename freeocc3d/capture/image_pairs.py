@@ -24,7 +24,8 @@ from .depth_decoding import read_raw_depth
 from .frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
 from .image_decoding import read_classes
 from .numbered_files import list_folder
-from .rgbd_frames import Registration, Rig
+from .rgbd_frames import Registration
+from .rigs import Rig
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from .frame_files import FileFrames, FrameFiles, read_first_depth_size, read_fir
 from .lenses import Lens
 from .paired_folders import PairList
 from .paired_poses import assign_poses, find_pose_file, read_pose_folder, usable_pose
-from .rgbd_frames import Registration, Rig, StatedCameras, build_rig
+from .rgbd_frames import Registration
+from .rigs import Rig, StatedCameras, build_rig
 from .trajectory_files import read_trajectory
 
 ICL_NUIM = ".freiburg"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 from abc import abstractmethod
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, FrameError
-from ..core.image_files import Size
 from ..core.types import Frame, Intrinsics
 from .base import Capture, Options
-from .camera_files import guess_camera, read_given_calibration, rescale_camera
 from .depth_decoding import RawDepth, convert_to_meters, usual_units
 from .depth_registration import PixelGrid
-from .lenses import Lens
+from .rigs import Rig
 from .undistortion import Rectified
 
 MOST_FRAME_PIXELS = 1 << 25
@@ -30,51 +27,6 @@ MOST_FRAME_PIXELS = 1 << 25
 
 UNSURE_SIGMA = 2.0
 """A depth of medium confidence has this many times the sensor's standard deviation."""
-
-Transform = tuple[tuple[float, ...], ...]
-"""The rows of a (4, 4) transform; unlike an array it can be compared and hashed."""
-
-
-@dataclass(frozen=True)
-class Rig:
-    """The cameras that took the stored color and depth of a frame. T_color_depth: rows of the (4, 4) transform from the
-    depth to the color camera frame; None if the two coincide."""
-
-    color: Lens
-    depth: Lens
-    T_color_depth: Transform | None = None
-
-
-@dataclass(frozen=True)
-class StatedCameras:
-    """What a format states about a rig; None = nothing. T_color_depth: (4, 4) depth to color camera frame."""
-
-    color: Lens | None = None
-    depth: Lens | None = None
-    T_color_depth: NDArray[np.float64] | None = None
-
-
-def build_rig(stated: StatedCameras, options: Options, color_size: Size, depth_size: Size | None) -> tuple[Rig, bool]:
-    """The rig of stored images of these sizes, and whether the color camera is known.
-
-    ``capture.intrinsics`` and ``capture.focal`` replace the color camera. Cameras for other sizes of the same view are
-    rescaled. A camera that is not stated is the other one, seen with other pixels; without any, it is a guess.
-    depth_size: None = no depth. Raises CaptureError if a camera cannot have taken the images.
-    """
-    given = read_given_calibration(options)
-    color = Lens(given.camera(color_size)) if given else stated.color or stated.depth
-    known = color is not None
-    color = _resized(color or Lens(guess_camera(color_size)), color_size)
-    if depth_size is None:
-        return Rig(color, color), known
-    rows = None if stated.T_color_depth is None else tuple(map(tuple, stated.T_color_depth.tolist()))
-    return Rig(color, _resized(stated.depth or color, depth_size), rows), known
-
-
-def _resized(lens: Lens, size: Size) -> Lens:
-    if (lens.camera.width, lens.camera.height) == size:
-        return lens
-    return replace(lens, camera=rescale_camera(lens.camera, size))
 
 
 class Registration:

@@ -26,7 +26,8 @@ from ..frame_poses import ascending_times
 from ..lenses import Lens
 from ..number_files import read_number_rows
 from ..numbered_files import has_file, list_folder
-from ..rgbd_frames import Registration, Rig, StatedCameras, build_rig
+from ..rgbd_frames import Registration
+from ..rigs import Rig, StatedCameras, build_rig
 from ..time_pairs import pair_nearest
 
 REQUIRES: tuple[str, ...] = ()

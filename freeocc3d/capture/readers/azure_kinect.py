@@ -24,7 +24,8 @@ from ..depth_decoding import MILLIMETERS, RawDepth
 from ..file_bytes import DamagedFile
 from ..image_decoding import decode_color_bytes
 from ..matroska_files import START, MatroskaFile, Track, read_tracks
-from ..rgbd_frames import Registration, RgbdFrames, Rig, StatedCameras, build_rig
+from ..rgbd_frames import Registration, RgbdFrames
+from ..rigs import Rig, StatedCameras, build_rig
 from ..time_pairs import pair_streams
 
 REQUIRES: tuple[str, ...] = ()

@@ -14,7 +14,7 @@ from ..camera_documents import CameraDocument, read_cameras
 from ..camera_files import check_pose_files, read_pose
 from ..image_pairs import ImagePairs, pair_files
 from ..numbered_files import has_file, list_numbered
-from ..rgbd_frames import StatedCameras, build_rig
+from ..rigs import StatedCameras, build_rig
 from .seven_scenes import COLOR, DEPTH, POSE
 
 REQUIRES: tuple[str, ...] = ()

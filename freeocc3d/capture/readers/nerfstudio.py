@@ -31,7 +31,7 @@ from ..lenses import BROWN_MODELS, PINHOLE_MODELS, Lens, lens_of
 from ..nerfstudio_files import PosedFrame, Transforms, read_transforms
 from ..point_files import read_points
 from ..posed_images import PosedImage, PosedImages, compute_nominal_scale, resolve_inside
-from ..rgbd_frames import Rig, StatedCameras, build_rig
+from ..rigs import Rig, StatedCameras, build_rig
 from ..trajectory_files import poses_of_transforms
 from .photos import make_natural_key, read_header
 

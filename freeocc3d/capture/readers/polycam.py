@@ -24,7 +24,8 @@ from ..frame_files import FileFrames, FrameFiles, notice_left_out, read_first_de
 from ..frame_poses import ascending_times
 from ..lenses import Lens
 from ..numbered_files import has_file, list_numbered
-from ..rgbd_frames import Registration, StatedCameras, build_rig
+from ..rgbd_frames import Registration
+from ..rigs import StatedCameras, build_rig
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -35,7 +35,8 @@ from ..lzfse_blocks import lzfse_size, unpack_lzfse
 from ..number_files import JSON_BYTES
 from ..numbered_files import list_folder
 from ..packed_files import FolderFiles, PackedFiles, ZipFiles, is_zip
-from ..rgbd_frames import Registration, RgbdFrames, Rig, StatedCameras, build_rig, normalize_confidence
+from ..rgbd_frames import Registration, RgbdFrames, normalize_confidence
+from ..rigs import Rig, StatedCameras, build_rig
 
 REQUIRES: tuple[str, ...] = ()
 

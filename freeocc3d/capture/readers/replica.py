@@ -28,7 +28,7 @@ from ..image_pairs import ImagePairs, pair_files
 from ..lenses import Lens
 from ..number_files import read_number_rows
 from ..numbered_files import has_file, list_numbered
-from ..rgbd_frames import Rig
+from ..rigs import Rig
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -24,7 +24,8 @@ from ..camera_files import is_pose
 from ..depth_decoding import METERS, MILLIMETERS, RawDepth
 from ..file_bytes import DamagedFile
 from ..lenses import Lens
-from ..rgbd_frames import Registration, RgbdFrames, Rig, StatedCameras, build_rig
+from ..rgbd_frames import Registration, RgbdFrames
+from ..rigs import Rig, StatedCameras, build_rig
 from ..ros import stores
 from ..ros.camera_messages import FrameTree, lens_of_info, transform_matrix
 from ..ros.frame_paths import FramePaths

@@ -21,7 +21,7 @@ from ..image_pairs import ImagePairs, Pairs, pair_files
 from ..lenses import Lens
 from ..numbered_files import has_file, list_numbered
 from ..paired_folders import find_folders
-from ..rgbd_frames import StatedCameras, build_rig
+from ..rigs import StatedCameras, build_rig
 
 REQUIRES: tuple[str, ...] = ()
 

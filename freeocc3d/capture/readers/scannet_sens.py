@@ -28,7 +28,8 @@ from ..frame_poses import ascending_times
 from ..image_decoding import decode_color_bytes
 from ..lenses import Lens
 from ..numbered_files import list_folder
-from ..rgbd_frames import Registration, RgbdFrames, Rig, StatedCameras, build_rig
+from ..rgbd_frames import Registration, RgbdFrames
+from ..rigs import Rig, StatedCameras, build_rig
 
 REQUIRES: tuple[str, ...] = ()
 

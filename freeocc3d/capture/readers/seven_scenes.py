@@ -21,7 +21,7 @@ from ..camera_files import (
 from ..image_pairs import ImagePairs, pair_files
 from ..lenses import Lens
 from ..numbered_files import has_file, list_numbered
-from ..rgbd_frames import Rig
+from ..rigs import Rig
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -29,7 +29,8 @@ from ..image_decoding import read_color
 from ..lenses import Lens
 from ..number_files import POSES_BYTES, read_text
 from ..numbered_files import has_file, list_folder, list_numbered
-from ..rgbd_frames import Registration, RgbdFrames, Rig, StatedCameras, build_rig
+from ..rgbd_frames import Registration, RgbdFrames
+from ..rigs import Rig, StatedCameras, build_rig
 from ..video_process import VideoProcess
 
 REQUIRES: tuple[str, ...] = ("av",)
