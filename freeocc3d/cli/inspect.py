@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..core.errors import printable
 from .console import Json, Set
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def _lines(found: Inspection) -> list[str]:
     rows += [("to fix", notice.text) for notice in found.notices]
     if not found.problems and not found.notices:
         rows.append(("to fix", "nothing that shows"))
-    return [f"{name:<10} {text}" for name, text in rows]
+    return [f"{name:<10} {printable(text)}" for name, text in rows]
 
 
 def _frames(found: Inspection) -> str:

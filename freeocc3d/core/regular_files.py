@@ -7,6 +7,7 @@ import contextlib
 import errno
 import io
 import os
+import re
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +26,9 @@ _KINDS = (
     (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )  # fmt: skip
+
+
+_ESCAPED = re.compile(r"\\u(dc[89a-f][0-9a-f])")
 
 
 class UnusableFile(OSError):
@@ -91,6 +95,13 @@ def user_path(path: str | Path) -> Path:
         return Path(path).expanduser()
     except RuntimeError:  # there is no such user, or no home
         return Path(path)
+
+
+def stored_path(text: str) -> Path:
+    """The path that a document states, in which ``dump_yaml`` has written bytes that are not text as escapes."""
+    if os.path.lexists(text):
+        return Path(text)
+    return Path(_ESCAPED.sub(lambda found: chr(int(found[1], 16)), text))
 
 
 def list_names(folder: Path) -> list[str]:

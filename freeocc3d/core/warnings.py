@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple
 
+from .errors import printable
+
 Code = Literal[
     "option-renamed",
     "option-removed",
@@ -40,7 +42,7 @@ class Notice(NamedTuple):
 
     def to_dict(self) -> dict[str, str]:
         """The form in report.json."""
-        return {"code": self.code, "text": self.text}
+        return {"code": self.code, "text": printable(self.text)}
 
 
 def read_notices(stored: Iterable[Any]) -> list[Notice]:

@@ -24,6 +24,20 @@ class InvalidYaml(ValueError):
     """A text is not YAML, or more than plain values. The message says where and what, as part of a sentence."""
 
 
+def dump_yaml(content: Any) -> str:
+    """The YAML text of plain values, which ``parse_yaml`` reads. Bytes that are not text, as names of files may hold
+    them, become escapes such as ``\\udce9`` in words."""
+    return yaml.safe_dump(_writable(content), sort_keys=False)
+
+
+def _writable(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, dict):
+        return {_writable(key): _writable(inner) for key, inner in value.items()}
+    return [_writable(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
 def parse_yaml(text: str, is_float: Callable[[str], object] = lambda word: False) -> Any:
     """The value of a YAML text: None, bool, int of 64 bits, float, str, lists, and dicts by text.
 

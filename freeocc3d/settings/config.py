@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import yaml
 
 from ..core.errors import ConfigError
 from ..core.warnings import Notice
+from ..core.yaml_documents import dump_yaml
 from . import registry, renamed, stages
 from .option_types import converted, shown
 from .presets import find_preset
@@ -191,7 +191,7 @@ def resolve(values: Mapping[str, Any] | Settings) -> Settings:
 def dump(settings: Settings) -> str:
     """Resolved YAML; ``load`` reads the same configuration back."""
     plain = json.loads(json.dumps(settings.to_dict()))  # tuples become lists
-    return yaml.safe_dump(plain, sort_keys=False)
+    return dump_yaml(plain)
 
 
 def fingerprint(settings: Settings, sections: Iterable[str], *identity: Any) -> str:

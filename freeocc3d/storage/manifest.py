@@ -13,7 +13,6 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import msgspec
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from ..core.checksums import hash_bytes
@@ -21,7 +20,7 @@ from ..core.errors import MapError
 from ..core.regular_files import read_bytes
 from ..core.transforms import is_rigid
 from ..core.typed_documents import InvalidDocument, as_type
-from ..core.yaml_documents import InvalidYaml, parse_yaml
+from ..core.yaml_documents import InvalidYaml, dump_yaml, parse_yaml
 from .map_files import MANIFEST
 
 FORMAT_VERSION = 3
@@ -199,7 +198,7 @@ the line; earlier maps have none."""
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write map.yaml. Raises OSError."""
     content = {name: value for name, value in msgspec.to_builtins(manifest).items() if value is not None}
-    text = yaml.safe_dump({"format_version": manifest.format_version, **content}, sort_keys=False)
+    text = dump_yaml({"format_version": manifest.format_version, **content})
     data = text.encode().rstrip(b"\n")
     (folder / MANIFEST).write_bytes(data + _SEAL + hash_bytes(data).encode() + b"\n")
 

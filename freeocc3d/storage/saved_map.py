@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError, MapError
+from ..core.regular_files import stored_path
 from ..core.tum_files import read_tum
 from ..core.types import Gaussians, Occupancy, Trajectory
 from ..settings import registry
@@ -84,8 +85,10 @@ class SavedMap:
         from ..capture import open_capture
         from ..capture.focal_correction import Reregistered
 
-        path = self.manifest.capture.path
-        if not path.startswith("builtin:") and not Path(path).exists():
+        path: str | Path = self.manifest.capture.path
+        if not str(path).startswith("builtin:"):
+            path = stored_path(str(path))
+        if isinstance(path, Path) and not path.exists():
             raise FreeOccError(f"The capture {path}, from which {self.path} was made, no longer exists.")
         opened = open_capture(path, self.settings.capture, self.settings.backends.get("capture"))
         color_focal = float(self.report.get("color_focal", 1.0))
