@@ -29,7 +29,7 @@ class Capture(ABC):
     format: ClassVar[str]
     """The reader's name, equal to the name of its file."""
     layout: ClassVar[str]
-    """What ``recognizes`` looks for, in words. The message about an unknown folder shows it."""
+    """What ``recognizes`` looks for, in words."""
 
     parts: ClassVar[tuple[str, ...]] = ()
     """Names, with wildcards, that such a folder holds; " or " divides alternatives. The message about an unknown folder

@@ -115,7 +115,9 @@ def rescale_camera(camera: Intrinsics, size: Size) -> Intrinsics:
     if not same_view((camera.width, camera.height), size):
         raise CaptureError(
             f"One camera cannot have taken images of {camera.width} x {camera.height} and of {size[0]} x {size[1]} "
-            "pixels: give color and depth a calibration each, as the scannet layout allows."
+            "pixels, for their shapes differ: record depth aligned to color, or add a calibration of each camera, in "
+            "intrinsic/intrinsic_color.txt and intrinsic/intrinsic_depth.txt, and where the two lie relative to each "
+            "other, in intrinsic/extrinsic_depth.txt; or map color alone with capture.depth=false."
         )
     return camera.resized(*size)
 

@@ -111,14 +111,31 @@ def _measured(raw: RawDepth) -> NDArray[np.generic]:
 def settle_depth_unit(capture: Capture) -> Notice | None:
     """Estimate the unit of the depth from the scene if nothing states it, and set it. Returns a warning if the unit is
     estimated and unusual, or if the depth that results does not look like a room; else None."""
-    if not capture.has_depth or (sample := sample_depth(capture)) is None:
+    if not capture.has_depth:
         return None
+    if (sample := sample_depth(capture)) is None:
+        return _empty(capture) if _is_stored(capture) else None
     if isinstance(capture, RgbdFrames) and not capture.units_stated:
         found = sample.fitting()
         if found and found[0] != sample.units_per_meter:
             capture.units_per_meter = found[0]
             return _estimated(capture, sample, found)
     return _doubtful(capture, sample)
+
+
+def _is_stored(capture: Capture) -> bool:
+    try:
+        return capture.raw_depth(0) is not None
+    except FrameError:
+        return False
+
+
+def _empty(capture: Capture) -> Notice:
+    return Notice(
+        "depth-empty",
+        f"The depth images of {capture.path} that were looked at hold no measurement: all values are 0 or 65535. "
+        "Record depth, or map color alone with capture.depth=false.",
+    )
 
 
 def _estimated(capture: Capture, sample: DepthSample, found: list[float]) -> Notice:

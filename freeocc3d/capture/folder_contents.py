@@ -19,6 +19,8 @@ Kind = Literal["color", "depth", "confidence"]
 COLOR_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif"})
 FLOAT_SUFFIXES = frozenset({".exr", ".npy", ".npz", ".pfm"})
 
+_SUFFIXES = (*COLOR_SUFFIXES, *FLOAT_SUFFIXES, ".pgm")
+
 _CONFIDENCE = re.compile(r"conf", re.IGNORECASE)
 _DEPTH = re.compile(r"depth|disp", re.IGNORECASE)
 _MOST_FOLDERS = 200
@@ -70,7 +72,7 @@ def _describe(folder: Path, names: list[str]) -> list[ImageFolder]:
     """The images of one folder, by kind: files with "depth" in their names are apart from the others."""
     groups: dict[bool, list[str]] = {}
     for name in names:
-        if Path(name).suffix.lower() in COLOR_SUFFIXES | FLOAT_SUFFIXES | {".pgm"}:
+        if name.lower().endswith(_SUFFIXES):
             groups.setdefault(bool(_DEPTH.search(name)), []).append(name)
     return [_group(folder, group) for group in groups.values() if len(group) >= _FEWEST]
 

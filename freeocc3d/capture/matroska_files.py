@@ -17,6 +17,7 @@ from .file_bytes import Bytes, DamagedFile, FileBytes, HeldBytes
 
 START = b"\x1a\x45\xdf\xa3"
 
+_SEGMENT_NAME = 4  # bytes
 _SEGMENT, _INFO, _TRACKS, _CLUSTER, _ATTACHMENTS, _TAGS = (
     0x18538067, 0x1549A966, 0x1654AE6B, 0x1F43B675, 0x1941A469, 0x1254C367,
 )  # fmt: skip
@@ -66,6 +67,7 @@ class _Found:
     blocks: list[tuple[int, int, int, int]] = field(default_factory=list)
     nanoseconds: int = 1_000_000
     visited: int = 0
+    cut_off: bool = False
 
     def visit(self) -> None:
         """Count an element. Raises DamagedFile if there are too many."""
@@ -77,8 +79,8 @@ class _Found:
 class MatroskaFile:
     """A file. Thread-safe. The constructor raises DamagedFile, OSError.
 
-    tracks, tags: as the file states them.  times_s, places: of each track's blocks, by its number: (N,) seconds,
-    ascending, and (N, 2) offset and size.
+    tracks, tags: as the file states them.  cut_off: whether it is shorter than it states.  times_s, places: of each
+    track's blocks, by its number: (N,) seconds, ascending, and (N, 2) offset and size.
     """
 
     def __init__(self, path: Path):
@@ -89,6 +91,7 @@ class MatroskaFile:
         except (struct.error, UnicodeDecodeError, IndexError) as error:
             raise DamagedFile("it is damaged or cut off") from error
         self.tracks, self.tags, self._attachments = found.tracks, found.tags, found.attachments
+        self.cut_off = found.cut_off
         table = np.array(found.blocks, np.int64).reshape(-1, 4)
         self.times_s: dict[int, NDArray[np.float64]] = {}
         self.places: dict[int, NDArray[np.int64]] = {}
@@ -123,9 +126,13 @@ def _walk(source: Bytes, found: _Found, tracks_only: bool) -> None:
     """Note what the segments hold. A file that is cut off is read up to there."""
     if source.size < len(START) or source.read(0, len(START)) != START:
         raise DamagedFile("it is no Matroska file")
+    begin = 0
     for name, at, end in _elements(source, 0, source.size):
+        begin, head = end, source.read(begin, at - begin)
         if name != _SEGMENT:
             continue
+        stated = _size(head, _SEGMENT_NAME)[0]
+        found.cut_off |= stated is not None and at + stated > source.size
         for child, start, stop in _elements(source, at, end):
             found.visit()
             if child == _TRACKS:

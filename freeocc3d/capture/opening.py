@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import CaptureError, ConfigError
+from ..core.errors import CaptureError, ConfigError, printable
 from ..core.regular_files import user_path
 from ..settings import registry
 from .base import Capture, Options
@@ -30,7 +30,7 @@ def open_capture(
         return _construct("synthetic", Path(path), options, backend_options or {})
     folder = user_path(path)
     if not os.path.exists(folder):
-        raise CaptureError(f"There is no folder or video {folder}: check the path of the capture.")
+        raise CaptureError(_explain_missing(folder))
     if not (folder.is_dir() or folder.is_file()):
         raise CaptureError(f"{folder} is neither a folder nor a regular file: give a folder of frames, or a video.")
     try:
@@ -42,8 +42,19 @@ def open_capture(
         if options.format == "auto" and options.depth and not opened.has_depth and folder.is_dir():
             opened.warnings = (*opened.warnings, *find_unread_depth(folder, name))
         return opened
+    except CaptureError as error:
+        said = str(error)
+        raise error if printable(str(folder)) in said else CaptureError(f"{folder}: {said}") from error
     except OSError as error:
         raise CaptureError(f"Cannot read {error.filename or folder}: {error.strerror}.") from error
+
+
+def _explain_missing(path: Path) -> str:
+    try:
+        target = os.readlink(path)
+    except (OSError, ValueError):
+        return f"There is no folder or video {path}: check the path of the capture."
+    return f"{path} is a link to {target}, which does not exist, or leads back to the link: correct the link."
 
 
 def _check_kind(name: str, path: Path) -> None:

@@ -47,7 +47,7 @@ class PosedImages(Capture):
         """units_in_meters: meters per unit of the poses; None = unknown, and the poses stay unchanged."""
         super().__init__(path, options)
         if len(posed) < 2:
-            raise CaptureError(f"{path} holds {len(posed)} images with poses: a scan needs many.")
+            raise CaptureError(f"{path} holds {len(posed)} image{'s' * (not posed)} with a pose: a scan needs many.")
         self.has_depth = options.depth and any(view.depth is not None for view in posed)
         self.timestamps = np.arange(len(posed), dtype=np.float64)
         scale = 1.0 if units_in_meters is None else units_in_meters

@@ -33,6 +33,11 @@ _FOREIGN = {
 }
 """First bytes of files that are no capture -> what they are, and what to do."""
 
+_WANTED = (
+    "A capture is a folder with images, such as color/ and depth/ with equal numbers in their names, a recording or a "
+    "video; freeocc3d list names all formats."
+)
+
 _MOST_BELOW, _NEAREST, _LAST = 1000, 2, 2
 
 Readers = Mapping[str, type[Capture]]
@@ -93,7 +98,7 @@ def explain_unknown(path: Path, readers: Readers) -> str:
     if near := _near(path, readers, any(folder.kind == "depth" for folder in images)):
         return f"{said}, but {near}."
     if not images:
-        return f"{said}: it holds neither images nor a video. Looked for: {_listed(readers)}."
+        return f"{said}: it {_contents(path)}. {_WANTED}"
     return f"{said}. It holds {', '.join(folder.describe(path) for folder in images[:6])}{_reading(path, images)}."
 
 
@@ -126,7 +131,7 @@ def _is_color_alone(folder: Path, readers: Readers) -> bool:
 def _reading(path: Path, images: list[ImageFolder]) -> str:
     """A likely reading of the images, and what the nearest formats lack."""
     color, depth = ([folder for folder in images if folder.kind == kind] for kind in ("color", "depth"))
-    text = ""
+    text = "" if color else ", and no color images: give the folder that holds these, too"
     if color and depth:
         text = (
             f". These are probably the color and the depth of one scan: link them as {path / 'color'} and "
@@ -148,6 +153,14 @@ def _parts_of(path: Path) -> list[tuple[str, float, list[str]]]:
     return found
 
 
+def _contents(path: Path) -> str:
+    names = list_folder(path)
+    if not names:
+        return "is empty"
+    others = f" and {len(names) - 1:,} other{'s' * (len(names) > 2)}" if len(names) > 1 else ""
+    return f"holds {names[0]}{others}, but neither images nor a video"
+
+
 def _names(path: Path) -> list[str]:
     """Names in the folder and, with the folder before them, in its subfolders."""
     names = []
@@ -159,10 +172,6 @@ def _names(path: Path) -> list[str]:
 
 def _is_there(part: str, names: list[str]) -> bool:
     return any(fnmatch.filter(names, pattern.strip()) for pattern in part.split(" or "))
-
-
-def _listed(readers: Readers) -> str:
-    return "; ".join(f"{reader.layout} ({name})" for name, reader in readers.items())
 
 
 def find_unread_depth(path: Path, name: str) -> list[Notice]:

@@ -13,6 +13,8 @@ Code = Literal[
     "images-left-out",
     "images-unreadable",
     "depth-scale-doubtful",
+    "depth-empty",
+    "images-dark",
     "depth-not-read",
     "poses-doubtful",
     "registration-doubtful",

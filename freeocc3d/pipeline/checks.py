@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from ..capture import Capture
 from ..core.image_files import Size
-from ..core.types import Trajectory
+from ..core.types import Frame, Trajectory
 from ..core.warnings import Notice
 from ..editing import adaptive_voxels
 from ..language import scene_vocabulary
 from ..occupancy import splat
 from ..settings.config import Settings
+from .frame_losses import DARK
 from .tracking_choice import AUTO
 
 _FEW_TRACKED = 0.5
@@ -39,6 +42,19 @@ def check(settings: Settings) -> None:
         backend, options = settings.backend(section)
         if hasattr(backend, "check"):
             backend.check(options)
+
+
+def check_brightness(frames: Sequence[Frame], path: Path) -> Notice | None:
+    """A warning if most of some frames of a capture are nearly black."""
+    bright = [float(np.percentile(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), 95)) for frame in frames]
+    dark = [one for one in bright if one < DARK]
+    if 2 * len(dark) <= len(bright):
+        return None
+    return Notice(
+        "images-dark",
+        f"{len(dark)} of {len(bright)} color images of {path} that were looked at are nearly black (95 % of their "
+        f"pixels below {np.median(dark):.0f} of 255): depth alone tells the poses, and the map has hardly any colors.",
+    )
 
 
 def warn_of_camera(capture: Capture) -> Notice:

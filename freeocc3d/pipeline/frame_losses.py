@@ -103,7 +103,11 @@ def _causes(
     dark = [one for one in found if one.brightness < DARK]
     blurred = [one for one in found if one.brightness >= DARK and one.sharpness < BLURRED * sharp]
     shallow = [one for one in found if needs_depth and one.depth < FEW_DEPTH]
-    apart = [one for one in found if one.matches is not None and one.matches < FEW_MATCHES and one not in dark]
+    apart = [
+        one
+        for one in found
+        if one.matches is not None and one.matches < FEW_MATCHES and one not in (*dark, *blurred, *shallow)
+    ]
     said = [
         (dark, "are nearly black (95 % of their pixels below {:.0f} of 255): more light, or a longer exposure",
          lambda one: one.brightness),

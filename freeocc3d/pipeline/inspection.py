@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ..capture import Capture, open_capture
@@ -22,8 +21,13 @@ from ..settings import config
 from ..settings.config import Settings
 from ..tracking.rgbd import focal_calibration, self_calibration
 from ..tracking.rgbd.measured_pairs import measure_pairs
-from .checks import explain_unknown_camera, warn_of_camera, warn_of_color_focal, warn_of_estimated_focal
-from .frame_losses import DARK
+from .checks import (
+    check_brightness,
+    explain_unknown_camera,
+    warn_of_camera,
+    warn_of_color_focal,
+    warn_of_estimated_focal,
+)
 from .tracking_choice import choose_tracker
 
 _SAMPLES = 9
@@ -102,6 +106,8 @@ def inspect(path: str | Path, settings: Settings | None = None) -> Inspection:
     notices += more
     if capture.has_depth:
         notices += _check_color(capture)
+    if dark := check_brightness(frames, capture.path):
+        notices.append(dark)
     first = frames[0] if frames else None
     frame_size = first.color.shape[1::-1] if first is not None else (0, 0)
     return Inspection(
@@ -115,7 +121,7 @@ def inspect(path: str | Path, settings: Settings | None = None) -> Inspection:
         seconds=_duration(capture),
         poses=_share_of_poses(capture),
         tracking=tracking or f"Tracking with {settings.tracking.backend}, as the options say.",
-        problems=(*problems, *_dark(frames)),
+        problems=tuple(problems),
         notices=tuple(notices),
     )
 
@@ -203,11 +209,6 @@ def _share_of_poses(capture: Capture) -> float:
         return float(np.mean([capture.pose(row) is not None for row in rows]))
     except FreeOccError:
         return 0.0
-
-
-def _dark(frames: list[Frame]) -> list[str]:
-    dark = [frame for frame in frames if np.percentile(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), 95) < DARK]
-    return [f"{len(dark)} of {len(frames)} frames that were looked at are nearly black."] if dark else []
 
 
 def unit_name(units_per_meter: float) -> str:

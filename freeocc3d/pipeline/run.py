@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from .. import __version__
 from ..capture import Capture, open_capture, select_frames
@@ -15,8 +18,9 @@ from ..capture.file_heads import check_heads
 from ..capture.focal_correction import Reregistered
 from ..capture.registration_check import check_registration
 from ..capture.rgbd_frames import RgbdFrames
-from ..core.errors import CaptureError, Interrupted, MapError, TrackingError, is_interrupt
+from ..core.errors import CaptureError, FrameError, Interrupted, MapError, TrackingError, is_interrupt
 from ..core.progress import Progress
+from ..core.types import Frame
 from ..language.encoders.base import Encoder
 from ..query.scan_map import Map, load_map
 from ..settings import config
@@ -24,11 +28,13 @@ from ..settings.config import Settings
 from ..storage.work_folder import WorkFolder
 from ..tracking.rgbd import focal_calibration, self_calibration
 from ..tracking.rgbd.measured_pairs import MeasuredPair, measure_pairs
-from .checks import check, explain_unknown_camera, warn_of_color_focal, warn_of_estimated_focal
+from .checks import check, check_brightness, explain_unknown_camera, warn_of_color_focal, warn_of_estimated_focal
 from .mapper import Mapper
 from .run_stages import STAGES, Run
 from .saving import absolute
 from .tracking_choice import GIVEN, choose_tracker
+
+_LOOKED_AT = 5  # frames
 
 
 def reconstruct(
@@ -125,6 +131,16 @@ def _know_camera(
     return known, settings
 
 
+def _look(capture: Capture) -> list[Frame]:
+    """A few of the selected frames, of those that can be read."""
+    frames = select_frames(capture)
+    found = []
+    for row in np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int)).tolist():
+        with contextlib.suppress(FrameError):
+            found.append(capture[frames[row]])
+    return found
+
+
 def _calibrate(
     capture: Capture, settings: Settings, progress: Progress, work: WorkFolder
 ) -> tuple[Capture, Sequence[MeasuredPair]]:
@@ -135,6 +151,8 @@ def _calibrate(
     if not capture.has_depth or (ratio is not None and not given):
         return (capture if ratio in (None, 1) or not capture.has_depth else Reregistered(capture, ratio)), ()
     progress.stage("calibration")
+    if dark := check_brightness(_look(capture), capture.path):
+        work.warn(progress, dark)
     pairs = measure_pairs(capture, select_frames(capture))
     if ratio is None:
         ratio = focal_calibration.estimate_color_focal(pairs)

@@ -196,6 +196,15 @@ def test_a_recording_that_was_stopped_by_force(tmp_path: Path) -> None:
     np.testing.assert_array_equal(capture.stored_depth(0), depth(0))
 
 
+def test_a_recording_that_is_cut_off_is_told(recording: Path) -> None:
+    assert open_capture(recording).warnings == ()
+    data = recording.read_bytes()
+    recording.write_bytes(data[: len(data) * 2 // 3])
+    capture = open_capture(recording)
+    assert 0 < len(capture) < COUNT
+    assert f"scan.mkv is cut off: the {len(capture)} frames" in capture.warnings[0].text
+
+
 def test_images_without_a_partner_are_counted(tmp_path: Path) -> None:
     sent = [block for block in blocks() if not (block[1] == 1 and block[0] < 0.52)]
     capture = Reader(write_recording(tmp_path / "scan.mkv", TRACKS, sent), Options())

@@ -78,7 +78,10 @@ def test_depth_without_any_measurement_is_not_about_units(tmp_path: Path) -> Non
     write_image(tmp_path / "frame-000000.depth.png", np.zeros((24, 32), np.uint16))
     capture = open_capture(tmp_path)
     assert not capture[0].depth_m.any()
-    assert settle_depth_unit(capture) is None
+    notice = settle_depth_unit(capture)
+    assert notice is not None
+    assert notice.code == "depth-empty"
+    assert str(tmp_path) in notice.text
     assert sample_depth(capture) is None
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import struct
 import subprocess
 import sys
@@ -38,12 +39,11 @@ def test_no_folder_and_no_directory(tmp_path: Path) -> None:
         open_capture(tmp_path / "scan.zip")
 
 
-def test_an_unrecognized_folder_says_what_was_looked_for(tmp_path: Path) -> None:
+def test_an_unrecognized_folder_says_what_it_holds(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("")
     with pytest.raises(CaptureError, match="not a capture of a known format") as caught:
         open_capture(tmp_path)
-    for sought in ("results/frameN.jpg", "frame-N.color.png", "color/N.jpg", "(scannet)"):
-        assert sought in str(caught.value)
+    assert "holds notes.txt, but neither images nor a video" in str(caught.value)
 
 
 def test_the_folder_above_a_capture_points_to_it(tmp_path: Path) -> None:
@@ -147,3 +147,19 @@ def test_a_hostile_document_is_told_and_not_left_out(tmp_path: Path, name: str, 
         path.symlink_to(path if target == "loop" else target)
     with pytest.raises(CaptureError, match=rf"{name}"):
         open_capture(tmp_path).pose(1)
+
+
+def test_a_link_that_leads_nowhere_is_called_one(tmp_path: Path) -> None:
+    (tmp_path / "away").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for name in ("away", "loop"):
+        with pytest.raises(CaptureError, match=f"{name} is a link to .*correct the link"):
+            open_capture(tmp_path / name)
+
+
+def test_every_refusal_names_the_capture(tmp_path: Path) -> None:
+    """Also where the reason is found by code that does not know it."""
+    write_scannet(tmp_path / "scan", 2, color_size=(64, 36))
+    shutil.rmtree(tmp_path / "scan" / "intrinsic")
+    with pytest.raises(CaptureError, match=r"scan: One camera cannot have taken .*intrinsic/intrinsic_depth\.txt"):
+        open_capture(tmp_path / "scan")

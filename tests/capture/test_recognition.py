@@ -109,10 +109,13 @@ def test_a_file_that_is_no_recording_is_called_what_it_is(tmp_path: Path, name: 
     assert said in said_of(tmp_path / name)
 
 
-def test_an_empty_folder_says_what_was_looked_for(tmp_path: Path) -> None:
+def test_a_folder_without_images_says_what_it_holds_and_what_a_capture_is(tmp_path: Path) -> None:
+    assert "it is empty. A capture is a folder with images, such as color/ and depth/" in said_of(tmp_path)
+    for index in range(3):
+        (tmp_path / f"note_{index}.md").touch()
     said = said_of(tmp_path)
-    assert "holds neither images nor a video" in said
-    assert "results/frameN.jpg" in said
+    assert "holds note_0.md and 2 others, but neither images nor a video" in said
+    assert len(said) < 400
 
 
 def test_every_layout_of_depth_images_is_read_whatever_their_suffix(tmp_path: Path) -> None:

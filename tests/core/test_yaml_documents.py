@@ -1,11 +1,14 @@
 """YAML from outside: the values that PyYAML gives, and a sentence for everything that is more than plain values."""
 
+import os
 import random
+from pathlib import Path
 
 import pytest
 import yaml
 
-from freeocc3d.core.yaml_documents import InvalidYaml, parse_yaml
+from freeocc3d.core.regular_files import stored_path
+from freeocc3d.core.yaml_documents import InvalidYaml, dump_yaml, parse_yaml
 
 SOUND = (
     "",
@@ -110,3 +113,15 @@ def test_laughs_are_counted() -> None:
     with pytest.raises(InvalidYaml, match="more than 1,000,000 values"):
         parse_yaml("\n".join(lines))
     assert len(parse_yaml("\n".join(lines[:4]))) == 4
+
+
+def test_names_that_are_not_text_are_written_as_escapes(tmp_path: Path) -> None:
+    """The path that a document states leads to the file all the same."""
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    folder.mkdir()
+    read = parse_yaml(dump_yaml({"path": str(folder), "more": [{"b": ("é", 1, None)}]}))
+    assert read == {"path": f"{tmp_path}/caf\\udce9", "more": [{"b": ["é", 1, None]}]}
+    assert stored_path(read["path"]) == folder
+    literal = tmp_path / "caf\\udce9"
+    literal.mkdir()
+    assert stored_path(read["path"]) == literal

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
 
-from freeocc3d.core.types import Trajectory
-from freeocc3d.pipeline.checks import warn_of_trajectory
+import numpy as np
+import pytest
+
+from freeocc3d.core.types import Frame, Intrinsics, Trajectory
+from freeocc3d.pipeline.checks import check_brightness, warn_of_trajectory
 
 
 def trajectory(*status: str) -> Trajectory:
@@ -25,6 +28,18 @@ def test_each_way_of_missing_frames_has_its_code() -> None:
     assert broken.startswith("1 frame could not be read and was skipped")
     assert "lost 2 frames (40%), the first is frame 2" in lost
     assert "the first is frame 4" in apart
+
+
+@pytest.mark.parametrize(("dark", "told"), [(0, False), (2, False), (3, True), (5, True)])
+def test_a_scan_that_is_mostly_dark_is_told(dark: int, told: bool) -> None:
+    """A room at night is dark in a few places; a lamp in a dark frame is bright."""
+    K = Intrinsics(20, 10, 20.0, 20.0, 10.0, 5.0)
+    colors = [np.full((10, 20, 3), 16 if row < dark else 90, np.uint8) for row in range(5)]
+    colors[4][:, :2] = 200
+    frames = [Frame(row, float(row), color, np.ones((10, 20), np.float32), K) for row, color in enumerate(colors)]
+    notice = check_brightness(frames[: max(dark, 4)], Path("scan"))
+    assert (notice is not None) == told
+    assert notice is None or f"{min(dark, 4)} of " in notice.text
 
 
 def test_a_scan_that_is_mostly_lost_gets_advice() -> None:

@@ -45,11 +45,11 @@ def test_what_is_wrong_is_told_frame_by_frame(tmp_path: Path) -> None:
         write_image(tmp_path / "color" / f"{index}.png", color_image(index) // 16)
     found = inspect(tmp_path)
     assert found.camera == "not stated"
-    assert [notice.code for notice in found.notices] == ["images-unreadable", "intrinsics-unknown"]
+    assert [notice.code for notice in found.notices] == ["images-unreadable", "intrinsics-unknown", "images-dark"]
     assert "give --focal" in found.notices[1].text
-    broken, dark = found.problems
+    (broken,) = found.problems
     assert "color/2.png" in broken
-    assert dark == "3 of 3 frames that were looked at are nearly black."
+    assert found.notices[2].text.startswith("3 of 3 color images")
 
 
 def test_a_reconstruction_without_depth_is_taken_with_its_poses(tmp_path: Path) -> None:
@@ -72,5 +72,5 @@ def test_the_command_prints_rows_or_one_document(tmp_path: Path) -> None:
 
 
 def test_an_unknown_folder_is_described(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="neither images nor a video"):
+    with pytest.raises(CaptureError, match="is empty"):
         inspect(tmp_path)

@@ -57,7 +57,8 @@ class Reader(RgbdFrames):
             raise CaptureError(f"Cannot read {error.filename or path}: {error.strerror}.") from error
         self._color = self._track(COLOR, path)
         self._depth = self._track(DEPTH, path) if options.depth else None
-        times, self._rows, self.warnings = self._pair_images(path)
+        times, self._rows, notices = self._pair_images(path)
+        self.warnings = (*self._warn_of_end(path, len(times)), *notices)
         super().__init__(path, options, times, MILLIMETERS)
         color, depth = _size(self._color, path), _size(self._depth, path) if self._depth else None
         self._rig, self.intrinsics_known = build_rig(self._stated(color, depth), options, color, depth)
@@ -131,6 +132,12 @@ class Reader(RgbdFrames):
             return color, np.repeat(np.arange(len(color))[:, None], 2, axis=1), ()
         pairs, notices = pair_streams(path, (color, self._file.times_s[self._depth.number]))
         return color[pairs[:, 0]], pairs, notices
+
+    def _warn_of_end(self, path: Path, frames: int) -> tuple[Notice, ...]:
+        if not self._file.cut_off:
+            return ()
+        text = f"{path} is cut off: the {frames} frames before its end are used. Copy the file again to have all."
+        return (Notice("images-left-out", text),)
 
     def _stated(self, color: Size, depth: Size | None) -> StatedCameras:
         name = self._file.tags.get("K4A_CALIBRATION_FILE") or "calibration.json"

@@ -35,6 +35,7 @@ REQUIRES: tuple[str, ...] = ("PIL", "pillow_heif")
 
 HEIF_SUFFIXES = {".heic", ".heif", ".hif", ".avif"}
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF_SUFFIXES}
+_ENDINGS = tuple(SUFFIXES)
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", *HEIF_FORMATS)
 UNREADABLE = {
     ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw", ".jxl", ".insp",
@@ -145,9 +146,8 @@ class Reader(Capture):
 def list_images(folder: Path) -> list[Path]:
     """The images of a folder or, if it has none, of its ``images/``, in natural order: 2 before 10."""
     for place in (folder, folder / "images"):
-        paths = [place / name for name in list_folder(place) if not name.startswith(".")]
-        found = [path for path in paths if path.suffix.lower() in SUFFIXES]
-        if found:
+        names = [name for name in list_folder(place) if name.lower().endswith(_ENDINGS)]
+        if found := [place / name for name in names if not name.startswith(".")]:
             return sorted(found, key=make_natural_key)
     return []
 
@@ -315,5 +315,6 @@ def _too_few(path: Path, found: Sequence[Path]) -> str:
 
 
 def _unreadable(path: Path) -> list[Path]:
-    files = (place / name for place in (path, path / "images") for name in list_folder(place))
-    return [file for file in files if file.suffix.lower() in UNREADABLE]
+    endings = tuple(UNREADABLE)
+    places = (path, path / "images")
+    return [place / name for place in places for name in list_folder(place) if name.lower().endswith(endings)]

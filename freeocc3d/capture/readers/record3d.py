@@ -98,6 +98,8 @@ class Reader(RgbdFrames):
     def __init__(self, path: Path, options: Options):
         layout = _find(path)
         if layout is None:
+            if path.is_file() and not is_zip(path):
+                raise CaptureError(f"{path} is no capture of Record3D: it is no zip archive. Copy or export it again.")
             raise CaptureError(
                 f"{path} is no capture of Record3D: it has no metadata beside rgbd/, or rgb/ and depth/."
             )
