@@ -67,8 +67,10 @@ class DatabaseStore(MessageStore):
         rows = self._rows("SELECT length(data) FROM messages WHERE id = ?", place[2])
         if not rows or not isinstance(rows[0][0], int) or rows[0][0] > MOST_BYTES:
             raise DamagedFile("it is damaged: a message is missing or too large")
-        size = rows[0][0] if first is None else first
-        data = self._rows("SELECT substr(data, 1, ?) FROM messages WHERE id = ?", size, place[2])[0][0]
+        if first is None:
+            data = self._rows("SELECT data FROM messages WHERE id = ?", place[2])[0][0]
+        else:
+            data = self._rows("SELECT substr(data, 1, ?) FROM messages WHERE id = ?", first, place[2])[0][0]
         if not isinstance(data, bytes):
             raise DamagedFile("it is damaged: a message is not made of bytes")
         return data

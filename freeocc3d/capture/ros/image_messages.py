@@ -100,11 +100,11 @@ def decode_color(message: Any, what: str) -> NDArray[np.uint8]:
 
 
 def decode_depth(message: Any, what: str) -> RawDepth:
-    """(H, W) depth: uint16 as stored, or float32 meters. Raises FrameError."""
+    """(H, W) depth: uint16 as stored, or float32 meters; it may be a view of the message. Raises FrameError."""
     if hasattr(message, "encoding"):
         kind = np.dtype(np.float32 if message.encoding == "32FC1" else np.uint16)
         rows = np.ascontiguousarray(_rows(message, kind.itemsize, what)).reshape(int(message.height), -1)
-        return rows.view(kind.newbyteorder(">" if message.is_bigendian else "<")).astype(kind)
+        return rows.view(kind.newbyteorder(">" if message.is_bigendian else "<")).astype(kind, copy=False)
     sent, data = describe_image(message, what), _data(message)
     if sent.form == "image":
         return _decode_gray16(data, what)

@@ -4,9 +4,12 @@ read when it is asked for, and a few decompressed chunks are kept."""
 from __future__ import annotations
 
 import bz2
+import functools
+import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +21,8 @@ MOST_BYTES = 512 << 20
 
 KEPT_CHUNKS = 3
 """Decompressed chunks that are kept: color and depth of one time may lie in neighboring ones."""
+
+_LEAST_PART = 1 << 16
 
 Place = tuple[int, int, int]
 """File, chunk (-1 = none) and offset of a message."""
@@ -105,17 +110,35 @@ def decompress(kind: str, data: bytes, most: int = MOST_BYTES) -> bytes:
     return found
 
 
+@functools.cache
+def _zstd() -> Any:
+    """The module zstd of Python 3.14, or its backport; a failed import takes long."""
+    try:
+        return importlib.import_module("compression.zstd")
+    except ImportError:
+        return importlib.import_module("backports.zstd")
+
+
+def _unpack_lz4(data: bytes, most: int) -> bytes:
+    """In parts, because lz4 takes the memory of the longest possible output for each."""
+    from lz4.frame import LZ4FrameDecompressor
+
+    unpacking = LZ4FrameDecompressor()
+    parts, step = list[bytes](), max(_LEAST_PART, 4 * len(data))
+    while most > 0 and not unpacking.eof:
+        part = unpacking.decompress(b"" if parts else data, max_length=min(step, most))
+        if not part:
+            break
+        parts.append(part)
+        most -= len(part)
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
 def _decompressed(kind: str, data: bytes, most: int) -> bytes:
     if kind == "bz2":
         return bz2.BZ2Decompressor().decompress(data, most)
     if kind == "lz4":
-        from lz4.frame import LZ4FrameDecompressor
-
-        return bytes(LZ4FrameDecompressor().decompress(data, max_length=most))
+        return _unpack_lz4(data, most)
     if kind == "zstd":
-        try:
-            from compression.zstd import ZstdDecompressor
-        except ImportError:
-            from backports.zstd import ZstdDecompressor
-        return bytes(ZstdDecompressor().decompress(data, max_length=most))
+        return bytes(_zstd().ZstdDecompressor().decompress(data, max_length=most))
     raise DamagedFile(f"its compression {kind!r} is not known")

@@ -26,6 +26,7 @@ def load_types(ros1: bool) -> Any:
 
 
 def deserialize(data: bytes, kind: str, ros1: bool) -> Any:
-    """A message of its bytes and the name of its type. Raises anything for bytes that do not fit the type."""
-    types = load_types(ros1)
-    return types.deserialize_ros1(data, kind) if ros1 else types.deserialize_cdr(data, kind)
+    """A message of its bytes and the name of its type; its arrays are views of the bytes. Raises anything for bytes
+    that do not fit the type."""
+    types, view = load_types(ros1), memoryview(data)  # of bytes, rosbags would copy all but the first
+    return types.deserialize_ros1(view, kind) if ros1 else types.deserialize_cdr(view, kind)
