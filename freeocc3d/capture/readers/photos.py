@@ -188,9 +188,11 @@ def read_header(path: Path) -> Header | None:
 
 def _exif(image: Image.Image) -> tuple[Mapping[int, Any], Mapping[int, Any]]:
     """The EXIF data of an image and of its inner directory; empty if they are damaged, for which Pillow's parsers have
-    errors of every type."""
+    errors of every type. Those behind the pixels of a PNG are left out, because Pillow decodes the pixels for them."""
+    from PIL import Image
+
     try:
-        exif = image.getexif()
+        exif = Image.Image.getexif(image) if image.format == "PNG" else image.getexif()
         return dict(exif), dict(exif.get_ifd(_EXIF))
     except Exception:
         return {}, {}
