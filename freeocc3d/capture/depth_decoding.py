@@ -69,14 +69,15 @@ def read_depth_size(path: Path) -> Size:
 def convert_to_meters(raw: RawDepth, units_per_meter: float, max_depth: float) -> NDArray[np.float32]:
     """Convert stored depth to float32 meters. Saturated integers, floats that are no depth, and what lies beyond
     ``max_depth`` meters become 0."""
-    depth_m = raw.astype(np.float32)
+    depth_m, scale = raw.astype(np.float32), np.float32(1.0 / units_per_meter)
     limit = max_depth
     if raw.dtype == np.uint16:
         limit = min(max_depth, (SATURATED - 0.5) / units_per_meter)
     else:
-        np.nan_to_num(depth_m, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        np.maximum(depth_m, 0.0, out=depth_m)
-    depth_m *= np.float32(1.0 / units_per_meter)
+        cv2.patchNaNs(depth_m, 0.0)
+        cv2.threshold(depth_m, 0.0, 0.0, cv2.THRESH_TOZERO, dst=depth_m)  # what is below is no depth; infinity is far
+    if scale != 1.0:
+        depth_m *= scale
     return cv2.threshold(depth_m, limit, 0.0, cv2.THRESH_TOZERO_INV, dst=depth_m)[1]
 
 

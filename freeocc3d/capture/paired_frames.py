@@ -27,6 +27,7 @@ ICL_NUIM = ".freiburg"
 
 _MIRROR = np.diag((1.0, -1.0, 1.0, 1.0))
 _SAMPLES = 3
+_KEPT_RIGS = 1024
 
 
 class PairedFrames(FileFrames):
@@ -55,7 +56,7 @@ class PairedFrames(FileFrames):
         found = _cameras(path, options, color_size, depth_size, usual, folder)
         rig, known = build_rig(found.stated, options, color_size, depth_size)
         self.intrinsics_known = self.focal_stated = known or bool(self._own_cameras)
-        self._sizes, self._rig = (color_size, depth_size), functools.lru_cache(maxsize=4)(self._read_rig)
+        self._sizes, self._rig = (color_size, depth_size), functools.lru_cache(_KEPT_RIGS)(self._read_rig)
         Registration(rig)  # raises CaptureError for a rig of too large images
         files = [
             FrameFiles(pair.color, pair.depth, rig, pair.time, confidence=pair.confidence) for pair in frames.pairs

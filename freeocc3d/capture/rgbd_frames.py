@@ -122,7 +122,7 @@ class RgbdFrames(Capture):
         _check_size(raw, self.rig(index).depth.camera, f"The depth of frame {index} of {self.path}")
         depth_m = convert_to_meters(raw, self.units_per_meter or usual_units(raw), self.options.max_depth)
         confidence = self.stored_confidence(index)
-        if confidence is None or (confidence >= 2).all():
+        if confidence is None or confidence.min(initial=2) >= 2:
             return registration.depth(depth_m), None
         from ..core.depth_noise import compute_sensor_sigma  # imports Numba, which opening a capture must not
 
@@ -147,4 +147,4 @@ def normalize_confidence(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Confidence of 0, 1, 2 (ARKit), 0, 50, 100 (RTAB-Map) or 0, 127, 255 (Polycam) as 0, 1, 2."""
     largest = int(stored.max(initial=0))
     step = 1 if largest <= 2 else 50 if largest <= 100 else 127
-    return np.minimum((stored.astype(np.uint16) + step // 3) // step, 2).astype(np.uint8)
+    return cv2.LUT(stored, np.minimum((np.arange(256) + step // 3) // step, 2).astype(np.uint8))

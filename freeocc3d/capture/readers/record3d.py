@@ -139,7 +139,7 @@ class Reader(RgbdFrames):
             return None
         if _is_exr(name):
             return read_raw_depth(self._files.source(name), size)
-        return np.frombuffer(self._unpacked(name, size, 4), "<f4").astype(np.float32).reshape(size[::-1])
+        return np.frombuffer(self._unpacked(name, size, 4), "<f4").astype(np.float32, copy=False).reshape(size[::-1])
 
     def stored_confidence(self, index: int) -> NDArray[np.uint8] | None:
         name, size = self._entries[index].confidence, self._depth_size

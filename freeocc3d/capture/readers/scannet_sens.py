@@ -132,7 +132,7 @@ class Reader(RgbdFrames):
                 raise FrameError(f"The depth of frame {index} of {self.path} is damaged: {error}.") from error
         if len(data) != wanted:
             raise FrameError(f"The depth of frame {index} of {self.path} does not have {width} x {height} pixels.")
-        return np.frombuffer(data, "<u2").astype(np.uint16).reshape(height, width)
+        return np.frombuffer(data, "<u2").astype(np.uint16, copy=False).reshape(height, width)
 
     def rig(self, index: int) -> Rig:
         return self._rig
