@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image, ImageOps
+from PIL import Image, ImageFile, ImageOps
 from small_captures import (
     color_image,
     depth_image,
@@ -46,6 +46,17 @@ def write_photos(folder: Path, count: int = 4, **kinds: object) -> Path:
     for index in range(count):
         write_photo(folder / f"IMG_{index + 8}.jpg", index, **kinds)  # type: ignore[arg-type]
     return folder
+
+
+def test_opening_decodes_no_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow decodes a PNG to look for EXIF data behind the pixels."""
+    for index, suffix in enumerate(("png", "jpg", "tif", "webp", "png")):
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        Image.fromarray(color_image(index, SIZE)).save(tmp_path / f"{index}.{suffix}", exif=exif)
+    monkeypatch.setattr(ImageFile.ImageFile, "load", None)
+    capture = open_capture(tmp_path)
+    assert (len(capture), capture[0].color.shape) == (5, (64, 48, 3))
 
 
 def test_images_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
