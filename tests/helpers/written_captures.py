@@ -30,8 +30,8 @@ class Written:
 
     reader: that recognizes it.  unit_m: of stored depth; 0 = floats, which come back as they were; None = no depth.
     times_s: how exact times are that count from the first frame; None = frames are counted.  own_cameras: each frame
-    has its camera.  registered: frames are what was stored; otherwise only the stored images are.  color, depth: what
-    the images are packed as, for the benchmark; "" = plain.
+    has its camera.  registered: frames are what was stored; otherwise only the stored images are.  color, depth,
+    confidence: how the images are encoded and, after a space, compressed; "plain" = not at all.
     """
 
     reader: str
@@ -74,7 +74,9 @@ def _write_r3d(path: Path, scan: Scan, method: int | None) -> Path:
 def _ros(kind: Kind, compressed: bool = False, packing: str = "") -> Written:
     write: Callable[..., Path] = recordings.write_mcap if kind == "mcap" else partial(recordings.write_ros, kind=kind)
     name = "scan.bag" if kind == "bag" else "scan"
-    packed = {"color": "png", "depth": "png"} if compressed else {"color": "", "depth": ""}
+    form = "png" if compressed else f"plain {'zstd' if packing == 'message' else packing}".strip()
+    form += " sqlite" if kind == "db3" else ""
+    packed = {"color": form, "depth": form}
     return Written("ros_bag", _named(name, write, compressed=compressed, packing=packing), times_s=_EXACT_S, **packed)
 
 
@@ -83,11 +85,12 @@ def _phone(reader: str, write: Callable[[Path, Scan], Path], times_s: float = _E
 
 
 TUM = 1 / folders.TUM_UNITS
+_LZFSE = {"color": "png", "depth": "plain lzfse", "confidence": "plain lzfse"}
 
 WRITTEN: dict[str, Written] = {
     "ScanNet, exported": Written("scannet", folders.write_scannet),
     "ScanNet, .sens": Written(
-        "scannet_sens", _named("scan.sens", recordings.write_sens), times_s=_EXACT_S, depth="zlib"
+        "scannet_sens", _named("scan.sens", recordings.write_sens), times_s=_EXACT_S, depth="plain zlib"
     ),
     "7-Scenes": Written("seven_scenes", folders.write_seven_scenes),
     "Replica": Written("replica", folders.write_replica, 1 / 6553.5),
@@ -133,9 +136,13 @@ WRITTEN: dict[str, Written] = {
     "Stray Scanner, images": _phone("stray_scanner", partial(phones.write_stray, video=False)),
     **{
         f"Record3D, {name}": _phone(
-            "record3d", partial(_write_r3d, method=method), unit_m=0, depth="lzfse", confidence="lzfse"
+            "record3d", partial(_write_r3d, method=method), unit_m=0, **packing
         )
-        for name, method in ((".r3d", zipfile.ZIP_STORED), (".r3d, deflated", zipfile.ZIP_DEFLATED), ("folder", None))
+        for name, method, packing in (
+            (".r3d", zipfile.ZIP_STORED, _LZFSE),
+            (".r3d, deflated", zipfile.ZIP_DEFLATED, {kind: f"{form} zlib" for kind, form in _LZFSE.items()}),
+            ("folder", None, _LZFSE),
+        )
     },
     "Record3D, EXR": _phone("record3d", phones.write_record3d_exr, unit_m=0, depth="exr", confidence=None),
     "Polycam": _phone("polycam", phones.write_polycam),
@@ -178,7 +185,7 @@ WRITTEN: dict[str, Written] = {
     "MCAP, chunks in Zstandard": _ros("mcap", packing="zstd"),
     "Azure Kinect": Written(
         "azure_kinect", _named("scan.mkv", recordings.write_azure_kinect), times_s=_EXACT_S, poses=False,
-        registered=False, size=(640, 480), depth="raw",
+        registered=False, size=(640, 480), depth="big",
     ),
     "video": Written(
         "video", _write_video, None, 1e-4, poses=False, cameras=False, color="video", options={"max_size": None}

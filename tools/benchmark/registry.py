@@ -134,6 +134,12 @@ MEASUREMENTS = {
         "pose_mistakes:measure_pose_check",
         table="pose_mistakes:tabulate_pose_check",
     ),
+    "formats": Measurement(
+        "a piece in every format: ATE, and what opening and reading it cost (a quarter of an hour)",
+        "capture",
+        "formats:measure_formats",
+        table="formats:tabulate_formats",
+    ),
     "damaged_input": Measurement(
         "10,000 damaged inputs, runs that are killed, torn checkpoints: how they end (a quarter of an hour)",
         "nothing",
