@@ -22,16 +22,16 @@ from freeocc3d.depth.sparse_points import triangulate
 from freeocc3d.depth.stereo_source import StereoSource
 from freeocc3d.tracking.trackers import known
 
-FRAMES = range(24)
+FRAMES = range(12)
 
 
 class Color(Capture):
-    """The room in 24 frames of 320 x 240 pixels, part of a walk, without depth."""
+    """The room in frames of 320 x 240 pixels, part of a walk, without depth."""
 
     format, layout, has_depth = "color", "", False
 
     def __init__(self) -> None:
-        self.room = open_capture("builtin:room", Options(), {"synthetic": {"frames": 96, "width": 320, "height": 240}})
+        self.room = open_capture("builtin:room", Options(), {"synthetic": {"frames": 64, "width": 320, "height": 240}})
         super().__init__(self.room.path, Options())
         self.timestamps = self.room.timestamps
         self.decoded = 0
@@ -55,7 +55,7 @@ class Color(Capture):
 def _source(capture: Capture, folder: Path, frames=FRAMES, change: Callable = lambda T: T, **options) -> StereoSource:
     tracker = known.load(known.Options(), capture)
     tracker.T_world_cam = change(tracker.T_world_cam)
-    source = StereoSource(capture, multi_view_stereo.Options(size=160, **options))
+    source = StereoSource(capture, multi_view_stereo.Options(size=128, **options))
     assert source.offline
     source.prepare(tracker, folder, frames, Progress())
     return source
@@ -180,7 +180,7 @@ def test_points_are_where_surfaces_are(computed) -> None:
 def test_broken_frames_are_done_without(tmp_path: Path) -> None:
     capture = Color()
     capture.broken = {5}
-    source = _source(capture, tmp_path, range(10))
+    source = _source(capture, tmp_path, range(8))
     assert source._depth.depth(5) is None
     assert source._depth.depth(4) is not None
 
@@ -188,9 +188,9 @@ def test_broken_frames_are_done_without(tmp_path: Path) -> None:
 def test_a_network_fills_what_stereo_leaves_empty(tmp_path: Path) -> None:
     network = write_network(tmp_path / "n.onnx")
     capture = Color()
-    plain = _source(capture, tmp_path / "a", range(8))
-    fused = _source(capture, tmp_path / "b", range(8), network=str(network))
-    counts = [[np.count_nonzero(t._depth.depth(i)[0]) for i in range(2, 6)] for t in (plain, fused)]
+    plain = _source(capture, tmp_path / "a", range(6))
+    fused = _source(capture, tmp_path / "b", range(6), network=str(network))
+    counts = [[np.count_nonzero(t._depth.depth(i)[0]) for i in range(1, 5)] for t in (plain, fused)]
     assert (np.array(counts[1]) >= counts[0]).all()
 
 
