@@ -4,11 +4,13 @@ from pathlib import Path
 
 import pytest
 from command_line import SMALL, run
+from made_once import make_once
 
 
 @pytest.fixture(scope="session")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("cli") / "room"
-    done = run("reconstruct", "builtin:room", "-o", path, *SMALL)
-    assert "8 with a pose" in done.stdout
-    return path
+    def make(path: Path) -> None:
+        done = run("reconstruct", "builtin:room", "-o", path, *SMALL)
+        assert "8 with a pose" in done.stdout
+
+    return make_once(tmp_path_factory, "room-of-commands", make)
