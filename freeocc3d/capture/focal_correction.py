@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..core.types import Frame, Intrinsics
 from .base import Capture
-from .depth_registration import PixelGrid
+from .cameras.depth_registration import PixelGrid
 
 
 class Reregistered(Capture):

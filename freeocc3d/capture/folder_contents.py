@@ -11,8 +11,8 @@ from typing import Literal
 from ..core.errors import FrameError
 from ..core.image_files import PNG_START, Size
 from ..core.regular_files import IMAGE_BYTES, open_regular
-from .image_decoding import image_size
-from .numbered_files import list_folder
+from .files.numbered_files import list_folder
+from .images.image_decoding import image_size
 
 Kind = Literal["color", "depth", "confidence"]
 

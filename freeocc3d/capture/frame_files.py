@@ -14,10 +14,10 @@ from ..core.errors import CaptureError, FrameError
 from ..core.image_files import Size
 from ..core.warnings import Notice
 from .base import Options
-from .depth_decoding import RawDepth, read_depth_size, read_raw_depth
-from .image_decoding import count_color_bits, decode_image, image_size, read_color
+from .cameras.rigs import Rig
+from .images.depth_decoding import RawDepth, read_depth_size, read_raw_depth
+from .images.image_decoding import count_color_bits, decode_image, image_size, read_color
 from .rgbd_frames import RgbdFrames, normalize_confidence
-from .rigs import Rig
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, FrameError
 from ..core.warnings import Notice
-from .depth_decoding import read_raw_depth
-from .file_finding import FileFinder, report_missing
+from .files.file_finding import FileFinder, report_missing
+from .files.name_matching import FEWEST_PAIRED, Column, associate_nearest, order_names, time_tolerance
+from .files.number_files import read_text
+from .files.numbered_files import list_folder
+from .files.paired_folders import ImagePair, PairList
 from .frame_files import notice_left_out
-from .name_matching import FEWEST_PAIRED, Column, associate_nearest, order_names, time_tolerance
-from .number_files import read_text
-from .numbered_files import list_folder
-from .paired_folders import ImagePair, PairList
+from .images.depth_decoding import read_raw_depth
 
 _COLOR_LIST = re.compile(r"(?:rgb|colou?r|images?)(?:[_-]?(?:list|images?|files?))?\.txt", re.IGNORECASE)
 _DEPTH_LIST = re.compile(r"(?:aligned[_-]?)?depths?(?:[_-]?(?:list|images?|files?))?\.txt", re.IGNORECASE)

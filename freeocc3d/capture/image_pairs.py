@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from ..core.errors import CaptureError, FrameError
 from ..core.image_files import Size
 from .base import Options
-from .depth_decoding import SUFFIXES as DEPTH_SUFFIXES
-from .depth_decoding import read_raw_depth
+from .cameras.rigs import Rig
+from .files.numbered_files import list_folder
 from .frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
-from .image_decoding import read_classes
-from .numbered_files import list_folder
+from .images.depth_decoding import SUFFIXES as DEPTH_SUFFIXES
+from .images.depth_decoding import read_raw_depth
+from .images.image_decoding import read_classes
 from .rgbd_frames import Registration
-from .rigs import Rig
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from ..core.errors import CaptureError, FrameError
 from ..core.image_files import Size
 from .base import Options
-from .camera_discovery import FoundCameras, find_cameras, find_frame_files
-from .camera_documents import read_cameras
-from .depth_decoding import read_raw_depth
+from .cameras.camera_discovery import FoundCameras, find_cameras, find_frame_files
+from .cameras.camera_documents import read_cameras
+from .cameras.lenses import Lens
+from .cameras.rigs import Rig, StatedCameras, build_rig
+from .files.paired_folders import PairList
 from .frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
-from .lenses import Lens
-from .paired_folders import PairList
-from .paired_poses import assign_poses, find_pose_file, read_pose_folder, usable_pose
+from .images.depth_decoding import read_raw_depth
+from .poses.paired_poses import assign_poses, find_pose_file, read_pose_folder, usable_pose
+from .poses.trajectory_files import read_trajectory
 from .rgbd_frames import Registration
-from .rigs import Rig, StatedCameras, build_rig
-from .trajectory_files import read_trajectory
 
 ICL_NUIM = ".freiburg"
 """Suffix of ICL-NUIM's poses, as in livingRoom0.gt.freiburg."""

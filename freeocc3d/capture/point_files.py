@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.errors import CaptureError, FreeOccError
 from ..core.ply_files import PlyHeader, read_ply_header, read_ply_vertices
 from ..core.regular_files import check_content, open_regular, read_bytes
-from .camera_files import FARTHEST
+from .cameras.camera_files import FARTHEST
 
 _MOST_BYTES = 1 << 30
 _MOST_TEXT_BYTES = 256 << 20

@@ -15,11 +15,11 @@ from ..core.errors import CaptureError, FrameError
 from ..core.transforms import invert, project, transform
 from ..core.types import Frame
 from .base import NOMINAL_DEPTH, Capture, Options
-from .camera_files import read_given_calibration, rescale_camera
-from .depth_decoding import RawDepth, convert_to_meters, read_raw_depth
-from .image_decoding import read_color
-from .lenses import Lens
-from .undistortion import Rectified
+from .cameras.camera_files import read_given_calibration, rescale_camera
+from .cameras.lenses import Lens
+from .cameras.undistortion import Rectified
+from .images.depth_decoding import RawDepth, convert_to_meters, read_raw_depth
+from .images.image_decoding import read_color
 
 UNITS_PER_METER = 1000.0
 """Units per meter of stored depth, unless ``capture.depth_scale`` is set."""

@@ -13,9 +13,9 @@ from ..core.regular_files import open_regular
 from ..core.warnings import Notice
 from ..settings import registry
 from .base import Capture
+from .files.numbered_files import list_folder
+from .files.paired_folders import find_folders
 from .folder_contents import ImageFolder, find_image_folders, holds_depth_or_confidence
-from .numbered_files import list_folder
-from .paired_folders import find_folders
 
 RECORDINGS = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".r3d", ".sens", ".bag", ".mcap", ".db3"}
 """Suffixes of files that may be a capture."""

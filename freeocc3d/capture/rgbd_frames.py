@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from ..core.errors import CaptureError, FrameError
 from ..core.types import Frame, Intrinsics
 from .base import Capture, Options
-from .depth_decoding import RawDepth, convert_to_meters, usual_units
-from .depth_registration import PixelGrid
-from .rigs import Rig
-from .undistortion import Rectified
+from .cameras.depth_registration import PixelGrid
+from .cameras.rigs import Rig
+from .cameras.undistortion import Rectified
+from .images.depth_decoding import RawDepth, convert_to_meters, usual_units
 
 MOST_FRAME_PIXELS = 1 << 25
 """Largest frame: that of an 8K video. A run keeps several frames in memory, with 7 bytes per pixel."""

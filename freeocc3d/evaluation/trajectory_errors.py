@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import associate
-from ..capture.trajectory_files import SAME_TIME_S
+from ..capture.poses.trajectory_files import SAME_TIME_S
 from ..core.errors import FreeOccError
 from ..core.transforms import invert
 from ..tracking.trajectory_alignment import Poses, TrajectoryAlignment

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ..capture import Capture, open_capture
-from ..capture.depth_units import UNITS, DepthSample, sample_depth, settle_depth_unit
-from ..capture.file_heads import check_heads
+from ..capture.checks.depth_units import UNITS, DepthSample, sample_depth, settle_depth_unit
+from ..capture.checks.file_heads import check_heads
+from ..capture.checks.registration_check import check_registration
 from ..capture.focal_correction import Reregistered
-from ..capture.registration_check import check_registration
 from ..capture.rgbd_frames import RgbdFrames
 from ..core.errors import CaptureError, FreeOccError
 from ..core.types import Frame

@@ -13,10 +13,10 @@ import numpy as np
 
 from .. import __version__
 from ..capture import Capture, open_capture, select_frames
-from ..capture.depth_units import settle_depth_unit
-from ..capture.file_heads import check_heads
+from ..capture.checks.depth_units import settle_depth_unit
+from ..capture.checks.file_heads import check_heads
+from ..capture.checks.registration_check import check_registration
 from ..capture.focal_correction import Reregistered
-from ..capture.registration_check import check_registration
 from ..capture.rgbd_frames import RgbdFrames
 from ..core.errors import CaptureError, FrameError, Interrupted, MapError, TrackingError, is_interrupt
 from ..core.progress import Progress

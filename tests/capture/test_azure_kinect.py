@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ros_bags import encode
 from small_captures import color_image, truncate
 
-from freeocc3d.capture.azure_kinect_cameras import read_calibration
 from freeocc3d.capture.base import Options
+from freeocc3d.capture.cameras.azure_kinect_cameras import read_calibration
 from freeocc3d.capture.opening import open_capture
 from freeocc3d.capture.readers.azure_kinect import Reader
 from freeocc3d.core.errors import CaptureError, FrameError

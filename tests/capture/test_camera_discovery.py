@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from freeocc3d.capture.camera_discovery import find_cameras
+from freeocc3d.capture.cameras.camera_discovery import find_cameras
 from freeocc3d.core.errors import CaptureError
 from freeocc3d.core.types import Intrinsics
 

@@ -9,7 +9,7 @@ import pytest
 from small_captures import SIZE, camera_matrix, color_image, write_replica, write_scannet, write_seven_scenes
 
 from freeocc3d.capture import Options, open_capture
-from freeocc3d.capture.camera_files import USUAL_FOCAL
+from freeocc3d.capture.cameras.camera_files import USUAL_FOCAL
 from freeocc3d.core.errors import CaptureError, ConfigError, TrackingError
 from freeocc3d.pipeline import run
 

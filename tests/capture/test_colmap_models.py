@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from freeocc3d.capture.colmap_models import PARAMETERS, ColmapModel, read_colmap_model
+from freeocc3d.capture.poses.colmap_models import PARAMETERS, ColmapModel, read_colmap_model
 from freeocc3d.core.errors import CaptureError
 
 NAMES = ("cameras", "images", "points3D")

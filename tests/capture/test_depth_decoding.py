@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from small_captures import truncate
 
-from freeocc3d.capture.depth_decoding import convert_to_meters, read_depth_size, read_raw_depth, usual_units
+from freeocc3d.capture.images.depth_decoding import convert_to_meters, read_depth_size, read_raw_depth, usual_units
 from freeocc3d.core.errors import FrameError
 
 INTEGERS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5001

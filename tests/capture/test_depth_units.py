@@ -10,7 +10,7 @@ import pytest
 from small_captures import data_folder, depth_image, write_image, write_scannet, write_seven_scenes
 
 from freeocc3d.capture import Options, open_capture
-from freeocc3d.capture.depth_units import sample_depth, settle_depth_unit
+from freeocc3d.capture.checks.depth_units import sample_depth, settle_depth_unit
 
 
 def write_room(folder: Path, units_per_meter: float, median_m: float = 2.0, layout=write_scannet) -> Path:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from freeocc3d.capture.file_finding import FileFinder, report_missing
+from freeocc3d.capture.files.file_finding import FileFinder, report_missing
 from freeocc3d.core.errors import CaptureError
 
 

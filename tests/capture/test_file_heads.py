@@ -9,7 +9,7 @@ from posed_captures import write_nerfstudio
 from small_captures import write_scannet
 
 from freeocc3d.capture import Options, open_capture
-from freeocc3d.capture.file_heads import check_heads, find_problem
+from freeocc3d.capture.checks.file_heads import check_heads, find_problem
 from freeocc3d.core.errors import CaptureError
 
 

@@ -11,7 +11,7 @@ from small_captures import SIZE, color_image, depth_image, pose_matrix, truncate
 
 from freeocc3d.capture import open_capture
 from freeocc3d.capture.base import Options
-from freeocc3d.capture.depth_decoding import SUFFIXES
+from freeocc3d.capture.images.depth_decoding import SUFFIXES
 from freeocc3d.capture.readers.image_folders import Reader
 from freeocc3d.core.errors import CaptureError, FrameError
 

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from freeocc3d.capture.lenses import Lens
-from freeocc3d.capture.undistortion import Rectified
+from freeocc3d.capture.cameras.lenses import Lens
+from freeocc3d.capture.cameras.undistortion import Rectified
 from freeocc3d.core.types import Intrinsics
 
 CAMERA = Intrinsics(160, 120, 130.0, 131.0, 80.5, 58.0)

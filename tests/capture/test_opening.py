@@ -14,7 +14,7 @@ import pytest
 from small_captures import write_replica, write_scannet, write_seven_scenes
 
 from freeocc3d.capture import Options, open_capture, select_frames
-from freeocc3d.capture.depth_units import settle_depth_unit
+from freeocc3d.capture.checks.depth_units import settle_depth_unit
 from freeocc3d.core.errors import CaptureError, ConfigError, FrameError
 from freeocc3d.settings import config, registry
 

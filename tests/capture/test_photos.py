@@ -17,8 +17,8 @@ from small_captures import (
 )
 
 from freeocc3d.capture import Options, open_capture
-from freeocc3d.capture.camera_files import DIAGONAL_35MM, USUAL_FOCAL
-from freeocc3d.capture.heif_files import register_heif
+from freeocc3d.capture.cameras.camera_files import DIAGONAL_35MM, USUAL_FOCAL
+from freeocc3d.capture.images.heif_files import register_heif
 from freeocc3d.capture.readers.photos import apply_orientation, list_images
 from freeocc3d.core.errors import CaptureError, FrameError
 

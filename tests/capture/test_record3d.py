@@ -15,8 +15,9 @@ from scans import Scan, plane_scan
 from small_captures import color_image, pose_matrix
 from written_phones import record3d_members, write_members, write_record3d_exr
 
-from freeocc3d.capture import Options, open_capture, packed_files
-from freeocc3d.capture.lzfse_blocks import lzfse_size, unpack_lzfse
+from freeocc3d.capture import Options, open_capture
+from freeocc3d.capture.files import packed_files
+from freeocc3d.capture.images.lzfse_blocks import lzfse_size, unpack_lzfse
 from freeocc3d.capture.readers import record3d
 from freeocc3d.capture.readers.record3d import Reader
 from freeocc3d.core.errors import CaptureError, FrameError

@@ -12,8 +12,8 @@ from small_captures import data_folder
 
 from freeocc3d.capture import open_capture
 from freeocc3d.capture.base import Capture
+from freeocc3d.capture.checks.registration_check import check_registration, fit_edges
 from freeocc3d.capture.focal_correction import Reregistered
-from freeocc3d.capture.registration_check import check_registration, fit_edges
 from freeocc3d.core.types import Frame
 
 

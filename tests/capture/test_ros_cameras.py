@@ -11,7 +11,7 @@ from ros_bags import COLOR, DEPTH, Messages, Sent, write_bag
 from small_captures import SIZE, color_image, depth_image, pose_matrix
 
 from freeocc3d.capture.base import Options
-from freeocc3d.capture.lenses import Lens
+from freeocc3d.capture.cameras.lenses import Lens
 from freeocc3d.capture.readers.ros_bag import Reader
 from freeocc3d.capture.ros.camera_messages import FrameTree, lens_of_info
 from freeocc3d.core.errors import CaptureError

@@ -16,7 +16,7 @@ from small_captures import (
 )
 
 from freeocc3d.capture.base import Options
-from freeocc3d.capture.depth_registration import OVERLAP_PX, DepthPatches, PixelGrid
+from freeocc3d.capture.cameras.depth_registration import OVERLAP_PX, DepthPatches, PixelGrid
 from freeocc3d.capture.readers.scannet import Reader
 from freeocc3d.core.errors import CaptureError
 from freeocc3d.core.transforms import back_project, invert, project, transform

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from freeocc3d.capture import base, builtin_room, open_capture
+from freeocc3d.capture import base, open_capture
+from freeocc3d.capture.builtin import builtin_room
 from freeocc3d.capture.readers import synthetic
 from freeocc3d.core.depth_noise import compute_sensor_sigma
 from freeocc3d.core.errors import CaptureError, ConfigError

@@ -11,9 +11,10 @@ import pytest
 from small_captures import truncate
 from videos import SIZE, number_of, write_video
 
-from freeocc3d.capture import Options, open_capture, read_ahead, video_process
-from freeocc3d.capture.camera_files import DIAGONAL_35MM, USUAL_FOCAL
-from freeocc3d.capture.video_decoding import VideoDecoder
+from freeocc3d.capture import Options, open_capture, read_ahead
+from freeocc3d.capture.cameras.camera_files import DIAGONAL_35MM, USUAL_FOCAL
+from freeocc3d.capture.videos import video_process
+from freeocc3d.capture.videos.video_decoding import VideoDecoder
 from freeocc3d.core.errors import CaptureError, ConfigError, FrameError
 
 OPEN = "open-gop=1:b-pyramid=normal:bframes=3:b-adapt=0"

@@ -9,7 +9,7 @@ from command_line import refused, run
 from scenes import lifted, posed, wall_frame
 
 from freeocc3d import load_map
-from freeocc3d.capture.builtin_room import CUP_HEIGHT, CUPS
+from freeocc3d.capture.builtin.builtin_room import CUP_HEIGHT, CUPS
 from freeocc3d.core import voxel_keys
 from freeocc3d.core.errors import ConfigError, MapError
 from freeocc3d.core.types import FREE, OCCUPIED, Gaussians

@@ -8,7 +8,7 @@ import pytest
 from command_line import refused, run
 from msgspec import structs
 
-from freeocc3d.capture.builtin_room import CUP_HEIGHT, CUPS
+from freeocc3d.capture.builtin.builtin_room import CUP_HEIGHT, CUPS
 from freeocc3d.core.errors import MapError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import FREE

@@ -184,7 +184,7 @@ def _read(path: Path, depth: bool) -> None:
     """Open a capture, decode it, and read all that it states; the frames that cannot be decoded are counted."""
     from freeocc3d.capture import open_capture
     from freeocc3d.capture.base import Options
-    from freeocc3d.capture.depth_units import settle_depth_unit
+    from freeocc3d.capture.checks.depth_units import settle_depth_unit
     from freeocc3d.core.errors import CaptureError, FrameError
 
     capture = open_capture(path, Options(depth=depth))

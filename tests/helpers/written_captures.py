@@ -18,7 +18,7 @@ from scans import Scan
 from small_captures import write_image
 
 from freeocc3d.capture import Options
-from freeocc3d.capture.depth_decoding import SUFFIXES
+from freeocc3d.capture.images.depth_decoding import SUFFIXES
 
 MILLIMETER = 0.001
 _EXACT_S, _FLOATS = 1e-6, (".exr", ".npy", ".npz", ".pfm", ".tiff")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from freeocc3d.capture.lenses import Lens
+from freeocc3d.capture.cameras.lenses import Lens
 from freeocc3d.core.errors import MapError
 from freeocc3d.core.types import Intrinsics
 from freeocc3d.core.warnings import Notice

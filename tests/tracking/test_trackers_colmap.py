@@ -11,7 +11,7 @@ import pytest
 from photographs import Photographs, turning, walk
 
 from freeocc3d.capture import Options as CaptureOptions
-from freeocc3d.capture.lenses import Lens
+from freeocc3d.capture.cameras.lenses import Lens
 from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, TrackingError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.transforms import umeyama

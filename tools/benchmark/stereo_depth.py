@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from freeocc3d.capture import open_capture, select_frames
 from freeocc3d.capture.base import Capture, Options
-from freeocc3d.capture.depth_registration import PixelGrid
+from freeocc3d.capture.cameras.depth_registration import PixelGrid
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.types import Frame
 from freeocc3d.depth import multi_view_stereo

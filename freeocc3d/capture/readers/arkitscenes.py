@@ -19,16 +19,16 @@ from ...core.image_files import Size
 from ...core.transforms import invert
 from ...core.warnings import Notice
 from ..base import Options
-from ..camera_files import Calibration, is_pose, read_matrix
-from ..depth_decoding import MILLIMETERS
+from ..cameras.camera_files import Calibration, is_pose, read_matrix
+from ..cameras.lenses import Lens
+from ..cameras.rigs import Rig, StatedCameras, build_rig
+from ..files.number_files import read_number_rows
+from ..files.numbered_files import has_file, list_folder
+from ..files.time_pairs import pair_nearest
 from ..frame_files import FileFrames, FrameFiles, notice_left_out, read_first_depth_size, read_first_size
-from ..frame_poses import ascending_times
-from ..lenses import Lens
-from ..number_files import read_number_rows
-from ..numbered_files import has_file, list_folder
+from ..images.depth_decoding import MILLIMETERS
+from ..poses.frame_poses import ascending_times
 from ..rgbd_frames import Registration
-from ..rigs import Rig, StatedCameras, build_rig
-from ..time_pairs import pair_nearest
 
 REQUIRES: tuple[str, ...] = ()
 

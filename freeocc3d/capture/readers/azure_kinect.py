@@ -18,15 +18,15 @@ from ...core.errors import CaptureError, FrameError
 from ...core.image_files import Size
 from ...core.regular_files import open_regular
 from ...core.warnings import Notice
-from ..azure_kinect_cameras import read_calibration
 from ..base import Options
-from ..depth_decoding import MILLIMETERS, RawDepth
-from ..file_bytes import DamagedFile
-from ..image_decoding import decode_color_bytes
-from ..matroska_files import START, MatroskaFile, Track, read_tracks
+from ..cameras.azure_kinect_cameras import read_calibration
+from ..cameras.rigs import Rig, StatedCameras, build_rig
+from ..files.file_bytes import DamagedFile
+from ..files.time_pairs import pair_streams
+from ..images.depth_decoding import MILLIMETERS, RawDepth
+from ..images.image_decoding import decode_color_bytes
 from ..rgbd_frames import Registration, RgbdFrames
-from ..rigs import Rig, StatedCameras, build_rig
-from ..time_pairs import pair_streams
+from ..videos.matroska_files import START, MatroskaFile, Track, read_tracks
 
 REQUIRES: tuple[str, ...] = ()
 

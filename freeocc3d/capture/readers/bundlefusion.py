@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ...core.errors import CaptureError
 from ..base import Options
-from ..camera_documents import CameraDocument, read_cameras
-from ..camera_files import check_pose_files, read_pose
+from ..cameras.camera_documents import CameraDocument, read_cameras
+from ..cameras.camera_files import check_pose_files, read_pose
+from ..cameras.rigs import StatedCameras, build_rig
+from ..files.numbered_files import has_file, list_numbered
 from ..image_pairs import ImagePairs, pair_files
-from ..numbered_files import has_file, list_numbered
-from ..rigs import StatedCameras, build_rig
 from .seven_scenes import COLOR, DEPTH, POSE
 
 REQUIRES: tuple[str, ...] = ()

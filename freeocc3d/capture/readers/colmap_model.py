@@ -10,10 +10,10 @@ from pathlib import Path
 from ...core.errors import CaptureError
 from ...core.transforms import invert
 from ..base import Options
-from ..colmap_models import read_colmap_model
-from ..colmap_projects import IMAGES, find_colmap_project
-from ..file_finding import FileFinder, report_missing
+from ..files.file_finding import FileFinder, report_missing
 from ..posed_images import PosedImage, PosedImages, compute_nominal_scale
+from ..poses.colmap_models import read_colmap_model
+from ..poses.colmap_projects import IMAGES, find_colmap_project
 from .photos import make_natural_key
 
 REQUIRES: tuple[str, ...] = ()

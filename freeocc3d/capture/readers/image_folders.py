@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ...core.errors import CaptureError
 from ..base import Options
-from ..paired_folders import find_folders, pair_images
+from ..files.paired_folders import find_folders, pair_images
 from ..paired_frames import PairedFrames
 
 REQUIRES: tuple[str, ...] = ()

@@ -22,17 +22,17 @@ from ...core.image_files import Size
 from ...core.types import Frame, Intrinsics
 from ...core.warnings import Notice
 from ..base import Options
-from ..camera_files import Calibration, guess_camera, reduce_camera
-from ..depth_decoding import SATURATED, RawDepth, read_raw_depth
-from ..file_finding import FileFinder, report_missing
+from ..cameras.camera_files import Calibration, guess_camera, reduce_camera
+from ..cameras.lenses import BROWN_MODELS, PINHOLE_MODELS, Lens, lens_of
+from ..cameras.rigs import Rig, StatedCameras, build_rig
+from ..files.file_finding import FileFinder, report_missing
 from ..frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
-from ..image_decoding import read_color
-from ..lenses import BROWN_MODELS, PINHOLE_MODELS, Lens, lens_of
-from ..nerfstudio_files import PosedFrame, Transforms, read_transforms
+from ..images.depth_decoding import SATURATED, RawDepth, read_raw_depth
+from ..images.image_decoding import read_color
 from ..point_files import read_points
 from ..posed_images import PosedImage, PosedImages, compute_nominal_scale, resolve_inside
-from ..rigs import Rig, StatedCameras, build_rig
-from ..trajectory_files import poses_of_transforms
+from ..poses.nerfstudio_files import PosedFrame, Transforms, read_transforms
+from ..poses.trajectory_files import poses_of_transforms
 from .photos import make_natural_key, read_header
 
 REQUIRES: tuple[str, ...] = ()

@@ -21,12 +21,12 @@ from ...core.regular_files import IMAGE_BYTES, open_regular
 from ...core.types import Frame, Intrinsics
 from ...core.warnings import Notice
 from ..base import Capture, Options
-from ..camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
+from ..cameras.camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
+from ..files.numbered_files import list_folder
+from ..files.paired_folders import find_folders
 from ..folder_contents import holds_depth_or_confidence
-from ..heif_files import HEIF_FORMATS, read_heif, register_heif
-from ..image_decoding import read_color
-from ..numbered_files import list_folder
-from ..paired_folders import find_folders
+from ..images.heif_files import HEIF_FORMATS, read_heif, register_heif
+from ..images.image_decoding import read_color
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -18,14 +18,14 @@ from ...core.errors import CaptureError
 from ...core.image_files import Size
 from ...core.warnings import Notice
 from ..base import Options
-from ..camera_files import Calibration, Number, PositiveNumber, is_pose, read_json
-from ..depth_decoding import MILLIMETERS
+from ..cameras.camera_files import Calibration, Number, PositiveNumber, is_pose, read_json
+from ..cameras.lenses import Lens
+from ..cameras.rigs import StatedCameras, build_rig
+from ..files.numbered_files import has_file, list_numbered
 from ..frame_files import FileFrames, FrameFiles, notice_left_out, read_first_depth_size, read_first_size
-from ..frame_poses import ascending_times
-from ..lenses import Lens
-from ..numbered_files import has_file, list_numbered
+from ..images.depth_decoding import MILLIMETERS
+from ..poses.frame_poses import ascending_times
 from ..rgbd_frames import Registration
-from ..rigs import StatedCameras, build_rig
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -25,18 +25,18 @@ from ...core.regular_files import IMAGE_BYTES
 from ...core.typed_documents import InvalidDocument, as_type, parse_json
 from ...core.warnings import Notice
 from ..base import Options
-from ..camera_files import Calibration, Number, PositiveNumber
-from ..depth_decoding import METERS, RawDepth, read_depth_size, read_raw_depth
+from ..cameras.camera_files import Calibration, Number, PositiveNumber
+from ..cameras.lenses import Lens
+from ..cameras.rigs import Rig, StatedCameras, build_rig
+from ..files.number_files import JSON_BYTES
+from ..files.numbered_files import list_folder
+from ..files.packed_files import FolderFiles, PackedFiles, ZipFiles, is_zip
 from ..frame_files import notice_left_out
-from ..frame_poses import ascending_times, poses_of
-from ..image_decoding import decode_color_bytes, encoded_size
-from ..lenses import Lens
-from ..lzfse_blocks import lzfse_size, unpack_lzfse
-from ..number_files import JSON_BYTES
-from ..numbered_files import list_folder
-from ..packed_files import FolderFiles, PackedFiles, ZipFiles, is_zip
+from ..images.depth_decoding import METERS, RawDepth, read_depth_size, read_raw_depth
+from ..images.image_decoding import decode_color_bytes, encoded_size
+from ..images.lzfse_blocks import lzfse_size, unpack_lzfse
+from ..poses.frame_poses import ascending_times, poses_of
 from ..rgbd_frames import Registration, RgbdFrames, normalize_confidence
-from ..rigs import Rig, StatedCameras, build_rig
 
 REQUIRES: tuple[str, ...] = ()
 

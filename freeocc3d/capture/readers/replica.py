@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import CaptureError
 from ..base import Options
-from ..camera_files import (
+from ..cameras.camera_files import (
     Calibration,
     Number,
     PositiveNumber,
@@ -23,12 +23,12 @@ from ..camera_files import (
     read_json,
     rescale_camera,
 )
+from ..cameras.lenses import Lens
+from ..cameras.rigs import Rig
 from ..class_files import capture_class_names
+from ..files.number_files import read_number_rows
+from ..files.numbered_files import has_file, list_numbered
 from ..image_pairs import ImagePairs, pair_files
-from ..lenses import Lens
-from ..number_files import read_number_rows
-from ..numbered_files import has_file, list_numbered
-from ..rigs import Rig
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -20,12 +20,13 @@ from ...core.errors import CaptureError, FrameError
 from ...core.warnings import Notice
 from ...settings.typed_options import TypedOptions
 from .. import base
-from ..camera_files import is_pose
-from ..depth_decoding import METERS, MILLIMETERS, RawDepth
-from ..file_bytes import DamagedFile
-from ..lenses import Lens
+from ..cameras.camera_files import is_pose
+from ..cameras.lenses import Lens
+from ..cameras.rigs import Rig, StatedCameras, build_rig
+from ..files.file_bytes import DamagedFile
+from ..files.time_pairs import pair_streams
+from ..images.depth_decoding import METERS, MILLIMETERS, RawDepth
 from ..rgbd_frames import Registration, RgbdFrames
-from ..rigs import Rig, StatedCameras, build_rig
 from ..ros import stores
 from ..ros.camera_messages import FrameTree, lens_of_info, transform_matrix
 from ..ros.frame_paths import FramePaths
@@ -33,7 +34,6 @@ from ..ros.image_messages import decode_color, decode_depth, describe_image
 from ..ros.message_store import Messages, Place
 from ..ros.message_types import deserialize
 from ..ros.topics import IMAGE_TYPES, INFO_TYPE, TF_TYPES, ImageTopic, choose_color, choose_depth, find_info
-from ..time_pairs import pair_streams
 
 REQUIRES: tuple[str, ...] = ("rosbags",)
 

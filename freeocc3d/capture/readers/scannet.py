@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from ...core.errors import CaptureError
 from ...core.transforms import invert
 from ..base import Options
-from ..camera_discovery import find_cameras
-from ..camera_files import check_pose_files, read_intrinsics, read_pose, read_rigid
+from ..cameras.camera_discovery import find_cameras
+from ..cameras.camera_files import check_pose_files, read_intrinsics, read_pose, read_rigid
+from ..cameras.lenses import Lens
+from ..cameras.rigs import StatedCameras, build_rig
 from ..class_files import capture_class_names
+from ..files.numbered_files import has_file, list_numbered
+from ..files.paired_folders import find_folders
 from ..image_lists import find_lists
 from ..image_pairs import ImagePairs, Pairs, pair_files
-from ..lenses import Lens
-from ..numbered_files import has_file, list_numbered
-from ..paired_folders import find_folders
-from ..rigs import StatedCameras, build_rig
 
 REQUIRES: tuple[str, ...] = ()
 

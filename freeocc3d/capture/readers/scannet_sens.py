@@ -22,14 +22,14 @@ from ...core.regular_files import IMAGE_BYTES, open_regular
 from ...core.transforms import invert
 from ...core.warnings import Notice
 from ..base import Options
-from ..camera_files import Calibration, is_pose
-from ..depth_decoding import RawDepth
-from ..frame_poses import ascending_times
-from ..image_decoding import decode_color_bytes
-from ..lenses import Lens
-from ..numbered_files import list_folder
+from ..cameras.camera_files import Calibration, is_pose
+from ..cameras.lenses import Lens
+from ..cameras.rigs import Rig, StatedCameras, build_rig
+from ..files.numbered_files import list_folder
+from ..images.depth_decoding import RawDepth
+from ..images.image_decoding import decode_color_bytes
+from ..poses.frame_poses import ascending_times
 from ..rgbd_frames import Registration, RgbdFrames
-from ..rigs import Rig, StatedCameras, build_rig
 
 REQUIRES: tuple[str, ...] = ()
 

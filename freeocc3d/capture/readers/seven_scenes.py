@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base import Options
-from ..camera_files import (
+from ..cameras.camera_files import (
     Calibration,
     check_pose_files,
     read_given_calibration,
@@ -18,10 +18,10 @@ from ..camera_files import (
     read_pose,
     rescale_camera,
 )
+from ..cameras.lenses import Lens
+from ..cameras.rigs import Rig
+from ..files.numbered_files import has_file, list_numbered
 from ..image_pairs import ImagePairs, pair_files
-from ..lenses import Lens
-from ..numbered_files import has_file, list_numbered
-from ..rigs import Rig
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -21,17 +21,17 @@ from ...core.errors import CaptureError, FrameError
 from ...core.image_files import Size
 from ...core.warnings import Notice
 from ..base import Options
-from ..camera_files import Calibration, guess_camera, read_intrinsics, reduce_camera, same_view
-from ..depth_decoding import METERS, MILLIMETERS, RawDepth, read_raw_depth
+from ..cameras.camera_files import Calibration, guess_camera, read_intrinsics, reduce_camera, same_view
+from ..cameras.lenses import Lens
+from ..cameras.rigs import Rig, StatedCameras, build_rig
+from ..files.number_files import POSES_BYTES, read_text
+from ..files.numbered_files import has_file, list_folder, list_numbered
 from ..frame_files import notice_left_out, read_confidence, read_first_depth_size, read_first_size
-from ..frame_poses import ascending_times, poses_of
-from ..image_decoding import read_color
-from ..lenses import Lens
-from ..number_files import POSES_BYTES, read_text
-from ..numbered_files import has_file, list_folder, list_numbered
+from ..images.depth_decoding import METERS, MILLIMETERS, RawDepth, read_raw_depth
+from ..images.image_decoding import read_color
+from ..poses.frame_poses import ascending_times, poses_of
 from ..rgbd_frames import Registration, RgbdFrames
-from ..rigs import Rig, StatedCameras, build_rig
-from ..video_process import VideoProcess
+from ..videos.video_process import VideoProcess
 
 REQUIRES: tuple[str, ...] = ("av",)
 

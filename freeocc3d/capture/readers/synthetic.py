@@ -21,8 +21,9 @@ from ...core.transforms import back_project, invert
 from ...core.types import FREE, UNKNOWN, Frame, Intrinsics
 from ...settings.option_types import Seed
 from ...settings.typed_options import TypedOptions
-from .. import base, builtin_room, room_shading
-from ..camera_files import read_given_calibration
+from .. import base
+from ..builtin import builtin_room, room_shading
+from ..cameras.camera_files import read_given_calibration
 
 REQUIRES: tuple[str, ...] = ("open3d",)
 

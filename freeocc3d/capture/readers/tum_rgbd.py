@@ -7,12 +7,12 @@ from pathlib import Path
 
 from ...core.types import Intrinsics
 from ..base import Options
+from ..cameras.lenses import Lens
+from ..files.name_matching import are_seconds
+from ..files.paired_folders import find_folders, pair_images
 from ..image_lists import find_lists, read_comments, read_lists
-from ..lenses import Lens
-from ..name_matching import are_seconds
-from ..paired_folders import find_folders, pair_images
 from ..paired_frames import PairedFrames
-from ..paired_poses import find_pose_file
+from ..poses.paired_poses import find_pose_file
 
 REQUIRES: tuple[str, ...] = ()
 

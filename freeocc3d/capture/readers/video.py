@@ -15,8 +15,8 @@ import numpy as np
 
 from ...core.types import Frame, Intrinsics
 from ..base import Capture, Options
-from ..camera_files import convert_35mm, guess_camera, read_given_calibration, reduce_camera
-from ..video_process import VideoProcess
+from ..cameras.camera_files import convert_35mm, guess_camera, read_given_calibration, reduce_camera
+from ..videos.video_process import VideoProcess
 
 REQUIRES: tuple[str, ...] = ("av",)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..file_bytes import Bytes, DamagedFile, FileBytes, HeldBytes
+from ..files.file_bytes import Bytes, DamagedFile, FileBytes, HeldBytes
 from .message_store import KEPT_CHUNKS, Messages, MessageStore, Place, check_length, decompress, sort_messages
 
 START = b"#ROSBAG V"

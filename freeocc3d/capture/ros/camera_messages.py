@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from ...core.errors import CaptureError
 from ...core.image_files import Size
 from ...core.transforms import invert, is_rigid, quats_to_rotations
-from ..camera_files import Calibration
-from ..lenses import Lens
+from ..cameras.camera_files import Calibration
+from ..cameras.lenses import Lens
 
 _BROWN = ("plumb_bob", "rational_polynomial", "brown_conrady", "modified_brown_conrady", "inverse_brown_conrady")
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt4")

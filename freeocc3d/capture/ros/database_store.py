@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.regular_files import open_regular
-from ..file_bytes import DamagedFile
+from ..files.file_bytes import DamagedFile
 from .message_store import MOST_BYTES, Messages, MessageStore, Place, sort_messages
 
 START = b"SQLite format 3\0"

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ...core.errors import FrameError
 from ...core.image_files import MOST_PIXELS, Size
-from ..depth_decoding import RawDepth
-from ..image_decoding import decode_color_bytes, decode_image_bytes, describe, encoded_size
+from ..images.depth_decoding import RawDepth
+from ..images.image_decoding import decode_color_bytes, decode_image_bytes, describe, encoded_size
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1")
 """Encodings that are depth: integers of a millimeter, floats of a meter."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..file_bytes import DamagedFile
+from ..files.file_bytes import DamagedFile
 
 MOST_BYTES = 512 << 20
 """Largest message, and largest chunk after decompression."""

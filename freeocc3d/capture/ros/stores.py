@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ...core.errors import CaptureError
 from ...core.regular_files import check_content, open_regular, read_text
 from ...core.yaml_documents import InvalidYaml, parse_yaml
-from ..file_bytes import DamagedFile
-from ..numbered_files import list_folder
+from ..files.file_bytes import DamagedFile
+from ..files.numbered_files import list_folder
 from . import bag1_store, database_store, mcap_store
 from .bag1_store import Bag1Store
 from .database_store import DatabaseStore, is_bag_database

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...capture.base import Capture
 from ...capture.class_files import read_class_names
-from ...capture.numbered_files import list_folder
+from ...capture.files.numbered_files import list_folder
 from ...core.errors import CaptureError
 from ...core.image_files import ImageFileError, read_image
 from ...core.typed_documents import as_type

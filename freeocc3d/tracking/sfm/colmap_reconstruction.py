@@ -9,10 +9,10 @@ import numpy as np
 import pycolmap
 
 from ...capture.base import Capture
-from ...capture.colmap_models import ColmapModel, ModelCamera, ModelImage, read_colmap_model
-from ...capture.colmap_projects import colmap_folder
-from ...capture.file_finding import last_part
-from ...capture.lenses import Lens
+from ...capture.cameras.lenses import Lens
+from ...capture.files.file_finding import last_part
+from ...capture.poses.colmap_models import ColmapModel, ModelCamera, ModelImage, read_colmap_model
+from ...capture.poses.colmap_projects import colmap_folder
 from ...core.errors import CaptureError, TrackingError
 from ...core.transforms import invert
 from ...core.types import Intrinsics

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import NOMINAL_DEPTH
-from ...capture.lenses import Lens
-from ...capture.undistortion import Rectified
+from ...capture.cameras.lenses import Lens
+from ...capture.cameras.undistortion import Rectified
 from ...core.arrays import read_arrays, write_arrays
 from ...core.types import Intrinsics
 from ...core.warnings import Notice

@@ -1,0 +1,1 @@
+"""Cameras of captures: calibration files, lenses, undistortion, rigs of color and depth."""

@@ -1,0 +1,1 @@
+"""Files of a capture by their names: listed, numbered, matched, unpacked."""

@@ -1,0 +1,1 @@
+"""Decodes stored images: color, depth of every kind, HEIC, LZFSE."""

@@ -1,0 +1,1 @@
+"""Poses that captures and other systems state: trajectory files, COLMAP, nerfstudio."""
