@@ -54,9 +54,11 @@ def test_opening_decodes_no_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         exif = Image.Exif()
         exif[0x0112] = 6
         Image.fromarray(color_image(index, SIZE)).save(tmp_path / f"{index}.{suffix}", exif=exif)
-    monkeypatch.setattr(ImageFile.ImageFile, "load", None)
+    write_image(tmp_path / "5.png", color_image(5, SIZE[::-1]))
+    decoded: list[ImageFile.ImageFile] = []
+    monkeypatch.setattr(ImageFile.ImageFile, "load", decoded.append)
     capture = open_capture(tmp_path)
-    assert (len(capture), capture[0].color.shape) == (5, (64, 48, 3))
+    assert (len(capture), capture[0].color.shape, decoded) == (6, (64, 48, 3), [])
 
 
 def test_images_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
