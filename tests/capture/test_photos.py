@@ -56,7 +56,7 @@ def test_opening_decodes_no_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         Image.fromarray(color_image(index, SIZE)).save(tmp_path / f"{index}.{suffix}", exif=exif)
     write_image(tmp_path / "5.png", color_image(5, SIZE[::-1]))
     decoded: list[ImageFile.ImageFile] = []
-    monkeypatch.setattr(ImageFile.ImageFile, "load", decoded.append)
+    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda image: decoded.append(image))
     capture = open_capture(tmp_path)
     assert (len(capture), capture[0].color.shape, decoded) == (6, (64, 48, 3), [])
 
