@@ -14,7 +14,8 @@ from ..core.errors import CaptureError, FrameError
 from ..core.image_files import Size
 from ..core.warnings import Notice
 from .base import Options
-from .cameras.rigs import Rig
+from .cameras.rigs import Rig, StatedCameras, build_rig
+from .image_headers import read_rough_lens
 from .images.depth_decoding import RawDepth, read_depth_size, read_raw_depth
 from .images.image_decoding import count_color_bits, decode_image, image_size, read_color
 from .rgbd_frames import RgbdFrames, normalize_confidence
@@ -78,6 +79,18 @@ class FileFrames(RgbdFrames):
             alone, missing = (color, "depth") if color else (depth, "color")
             raise FrameError(f"A frame has no {missing} image for {alone}.")
         return color, depth if self.has_depth else None
+
+
+def build_file_rig(
+    stated: StatedCameras, options: Options, color: Sequence[Path], color_size: Size, depth_size: Size | None
+) -> tuple[Rig, bool, bool]:
+    """The rig of image files of these sizes, as ``build_rig`` makes it, whether the color camera is known, and whether
+    its focal length is stated at least roughly: if nothing else states it, EXIF data may."""
+    rig, known = build_rig(stated, options, color_size, depth_size)
+    rough = None if known else read_rough_lens(color, color_size)
+    if rough is not None:
+        rig, _ = build_rig(StatedCameras(rough), options, color_size, depth_size)
+    return rig, known, known or rough is not None
 
 
 def read_confidence(path: Path) -> NDArray[np.uint8]:

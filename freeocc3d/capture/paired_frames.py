@@ -16,7 +16,7 @@ from .cameras.camera_documents import read_cameras
 from .cameras.lenses import Lens
 from .cameras.rigs import Rig, StatedCameras, build_rig
 from .files.paired_folders import PairList
-from .frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
+from .frame_files import FileFrames, FrameFiles, build_file_rig, read_first_depth_size, read_first_size
 from .images.depth_decoding import read_raw_depth
 from .poses.paired_poses import assign_poses, find_pose_file, read_pose_folder, usable_pose
 from .poses.trajectory_files import read_trajectory
@@ -54,8 +54,8 @@ class PairedFrames(FileFrames):
         own = find_frame_files(path, [file.name for file in color])
         self._own_cameras, folder = _own_cameras(own, options)
         found = _cameras(path, options, color_size, depth_size, usual, folder)
-        rig, known = build_rig(found.stated, options, color_size, depth_size)
-        self.intrinsics_known = self.focal_stated = known or bool(self._own_cameras)
+        rig, known, rough = build_file_rig(found.stated, options, color, color_size, depth_size)
+        self.intrinsics_known, self.focal_stated = (one or bool(self._own_cameras) for one in (known, rough))
         self._sizes, self._rig = (color_size, depth_size), functools.lru_cache(_KEPT_RIGS)(self._read_rig)
         Registration(rig)  # raises CaptureError for a rig of too large images
         files = [

@@ -158,6 +158,8 @@ def _describe_camera(capture: Capture, frames: list[Frame]) -> tuple[str, list[N
         return f"{how}, start {focal:.0f} px", [] if capture.focal_stated else [warn_of_camera(capture)]
     found = self_calibration.estimate_focal(capture, range(len(capture)))
     size = _stored_size(capture, (1, 1))
+    if (found is None or not found.sure) and capture.focal_stated:
+        return f"roughly stated, focal length {focal:.0f} px", [warn_of_camera(capture)]
     if found is None or not found.sure:
         return "not stated", [Notice("intrinsics-unknown", explain_unknown_camera(capture, size))]
     focal_px = focal * found.focal_px / frames[0].intrinsics.fx

@@ -120,6 +120,8 @@ def _know_camera(
     frames = select_frames(capture)
     stored, guess = capture.rig(frames[0]).color.camera, capture[frames[0]].intrinsics
     found = self_calibration.estimate_focal(capture, frames)
+    if (found is None or not found.sure) and capture.focal_stated:
+        return capture, settings
     if found is None or not found.sure:
         raise CaptureError(explain_unknown_camera(capture, (stored.width, stored.height)))
     focal_px = round(stored.fx * found.focal_px / guess.fx, 1)

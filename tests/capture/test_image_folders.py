@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scans import write_depth
 from small_captures import SIZE, color_image, depth_image, pose_matrix, truncate, write_image, write_matrix
 
@@ -281,3 +282,22 @@ def test_a_folder_that_is_a_loop_of_links_is_none(tmp_path: Path, loop: str) -> 
     write_frames(tmp_path, "color_images/{}.png", "depths/{}.png")
     (tmp_path / loop).symlink_to(loop)
     check_frames(tmp_path)
+
+
+@pytest.mark.parametrize("color", ["rgb", "color"])
+def test_the_focal_length_of_photographs_is_stated_roughly(tmp_path: Path, color: str) -> None:
+    """Each of three images states it; other readers of folders do the same."""
+    for i in range(3):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0xA405] = 26  # 35 mm equivalent
+        (tmp_path / color).mkdir(exist_ok=True)
+        Image.fromarray(color_image(i)).save(tmp_path / color / f"{i}.jpg", exif=exif)
+        write_image(tmp_path / "depth" / f"{i}.png", depth_image(i))
+    capture = open_capture(tmp_path)
+    assert (capture.intrinsics_known, capture.focal_stated) == (False, True)
+    assert capture[1].intrinsics.fx == pytest.approx(26 / 43.27 * np.hypot(*SIZE), rel=1e-3)
+    given = open_capture(tmp_path, Options(focal=40.0))
+    assert (given.intrinsics_known, given[1].intrinsics.fx) == (True, 40.0)
+    exif.get_ifd(0x8769)[0xA405] = 52  # of another lens
+    Image.fromarray(color_image(2)).save(tmp_path / color / "2.jpg", exif=exif)
+    assert not open_capture(tmp_path).focal_stated

@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import run
+from PIL import Image
+from pipeline_runs import notices
 from posed_captures import write_nerfstudio
-from small_captures import color_image, data_folder, write_image, write_scannet
+from small_captures import color_image, data_folder, depth_image, write_image, write_scannet
 
+from freeocc3d import reconstruct
 from freeocc3d.core.errors import CaptureError
 from freeocc3d.pipeline.inspection import inspect
 from freeocc3d.settings import config
@@ -50,6 +53,20 @@ def test_what_is_wrong_is_told_frame_by_frame(tmp_path: Path) -> None:
     (broken,) = found.problems
     assert "color/2.png" in broken
     assert found.notices[2].text.startswith("3 of 3 color images")
+
+
+def test_the_rough_focal_length_of_exif_data_is_used_if_the_scan_shows_none(tmp_path: Path) -> None:
+    for index in range(4):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0xA405] = 26  # 35 mm equivalent
+        (tmp_path / "rgb").mkdir(exist_ok=True)
+        Image.fromarray(color_image(index)).save(tmp_path / "rgb" / f"{index}.jpg", exif=exif)
+        write_image(tmp_path / "depth" / f"{index}.png", depth_image(index))
+    found = inspect(tmp_path)
+    assert found.camera == "roughly stated, focal length 24 px"
+    assert "the rough value of the images" in next(n.text for n in found.notices if n.code == "intrinsics-unknown")
+    made = reconstruct(tmp_path, tmp_path / "map", {"fitting": {"passes": 0}})
+    assert "intrinsics-unknown" in [notice.code for notice in notices(made)]
 
 
 def test_a_reconstruction_without_depth_is_taken_with_its_poses(tmp_path: Path) -> None:

@@ -27,13 +27,14 @@ from ..cameras.lenses import BROWN_MODELS, PINHOLE_MODELS, Lens, lens_of
 from ..cameras.rigs import Rig, StatedCameras, build_rig
 from ..files.file_finding import FileFinder, report_missing
 from ..frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
+from ..image_headers import read_header
 from ..images.depth_decoding import SATURATED, RawDepth, read_raw_depth
 from ..images.image_decoding import read_color
 from ..point_files import read_points
 from ..posed_images import PosedImage, PosedImages, compute_nominal_scale, resolve_inside
 from ..poses.nerfstudio_files import PosedFrame, Transforms, read_transforms
 from ..poses.trajectory_files import poses_of_transforms
-from .photos import make_natural_key, read_header
+from .photos import make_natural_key
 
 REQUIRES: tuple[str, ...] = ()
 

@@ -3,65 +3,36 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from datetime import datetime
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import CaptureError, FrameError
-from ...core.image_files import MOST_PIXELS, Size
-from ...core.regular_files import IMAGE_BYTES, open_regular
+from ...core.image_files import Size
 from ...core.types import Frame, Intrinsics
 from ...core.warnings import Notice
 from ..base import Capture, Options
-from ..cameras.camera_files import DIAGONAL_35MM, convert_35mm, guess_camera, read_given_calibration, reduce_camera
+from ..cameras.camera_files import guess_camera, read_given_calibration, reduce_camera
 from ..files.numbered_files import list_folder
 from ..files.paired_folders import find_folders
 from ..folder_contents import holds_depth_or_confidence
-from ..images.heif_files import HEIF_FORMATS, read_heif, register_heif
+from ..image_headers import Header, find_common_lens, read_header
+from ..images.heif_files import read_heif
 from ..images.image_decoding import read_color
-
-if TYPE_CHECKING:
-    from PIL import Image
 
 REQUIRES: tuple[str, ...] = ("PIL", "pillow_heif")
 
 HEIF_SUFFIXES = {".heic", ".heif", ".hif", ".avif"}
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF_SUFFIXES}
 _ENDINGS = tuple(SUFFIXES)
-_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", *HEIF_FORMATS)
 UNREADABLE = {
     ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw", ".jxl", ".insp",
 }  # fmt: skip
 """Image formats of phones and cameras that no decoder here reads."""
-
-SAME_LENS = 0.05
-"""Largest relative spread of the stated focal lengths of images from one lens."""
-
-_EXIF, _ORIENTATION, _FOCAL, _FOCAL_35MM = 0x8769, 0x0112, 0x920A, 0xA405
-_TIME, _SUBSECONDS, _WIDTH, _PLANE_RESOLUTION, _PLANE_UNIT = 0x9003, 0x9291, 0xA002, 0xA20E, 0xA210
-_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
-
-
-@dataclass(frozen=True)
-class Header:
-    """The header of an image. size: upright.  orientation: EXIF's, 1…8.  focal: over the diagonal, or None.
-    time: seconds, or None.  heif: whether it is HEIF or AVIF by its content.  by_decoder: whether decoding turns it
-    upright."""
-
-    size: Size
-    orientation: int
-    focal: float | None
-    time: float | None
-    heif: bool = False
-    by_decoder: bool = False
 
 
 class Reader(Capture):
@@ -97,7 +68,7 @@ class Reader(Capture):
         self._headers = headers
         stated, lens = (
             read_given_calibration(options),
-            _focal([header for header in headers if header is not None], self._size),
+            find_common_lens([header for header in headers if header is not None], self._size),
         )
         camera = stated.camera(self._size) if stated else lens or guess_camera(self._size)
         self.intrinsics_known, self.focal_stated = stated is not None, stated is not None or lens is not None
@@ -161,43 +132,6 @@ def make_natural_key(path: Path) -> list[tuple[int, str]]:
     return keys
 
 
-def read_header(path: Path) -> Header | None:
-    """Size and EXIF data of an image, without decoding it; None if the file is not an image that can be decoded."""
-    from PIL import Image
-
-    try:
-        with open_regular(path, IMAGE_BYTES) as stream, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large images and damaged EXIF data
-            register_heif()
-            with Image.open(stream, formats=_FORMATS) as image:
-                width, height = image.size
-                exif, inner = _exif(image)
-                heif, turned = image.format in HEIF_FORMATS, image.info.get("original_orientation")
-    except (OSError, ValueError, SyntaxError, RuntimeError, EOFError, Image.DecompressionBombError):
-        return None
-    if width * height > MOST_PIXELS:
-        return None
-    orientation = exif.get(_ORIENTATION, 1)
-    orientation = orientation if orientation in range(1, 9) else 1
-    size = (height, width) if orientation >= 5 else (width, height)
-    focal, time = _stated_focal(inner, width, height), _stated_time(inner)
-    if isinstance(turned, int) and 2 <= turned <= 8:
-        return Header(size, turned, focal, time, heif, by_decoder=True)
-    return Header(size, orientation, focal, time, heif)
-
-
-def _exif(image: Image.Image) -> tuple[Mapping[int, Any], Mapping[int, Any]]:
-    """The EXIF data of an image and of its inner directory; empty if they are damaged, for which Pillow's parsers have
-    errors of every type. Those behind the pixels of a PNG are left out, because Pillow decodes the pixels for them."""
-    from PIL import Image
-
-    try:
-        exif = Image.Image.getexif(image) if image.format == "PNG" else image.getexif()
-        return dict(exif), dict(exif.get_ifd(_EXIF))
-    except Exception:
-        return {}, {}
-
-
 def apply_orientation(image: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
     """Turn a stored image (H, W, 3) upright. orientation: EXIF's (CIPA DC-008, tag 274)."""
     if orientation >= 5:
@@ -206,43 +140,12 @@ def apply_orientation(image: NDArray[np.uint8], orientation: int) -> NDArray[np.
     return np.ascontiguousarray(image[::rows, ::columns])
 
 
-def _stated_focal(exif: Any, width: int, height: int) -> float | None:
-    """Stated focal length over the image diagonal, or None."""
-    try:
-        if exif.get(_FOCAL_35MM) and (camera := convert_35mm(float(exif[_FOCAL_35MM]), (width, height))):
-            return camera.fx / float(np.hypot(width, height))
-        pixels_per_mm = float(exif[_PLANE_RESOLUTION]) / _UNIT_MM[int(exif.get(_PLANE_UNIT, 2))]
-        focal = float(exif[_FOCAL]) * pixels_per_mm * width / float(exif.get(_WIDTH, width))
-    except (KeyError, TypeError, ValueError, ArithmeticError):
-        return None
-    # Wrong values are common: many programs change the image but keep the tag.
-    return focal / float(np.hypot(width, height)) if 0.3 < focal / max(width, height) < 20 else None
-
-
-def _stated_time(exif: Any) -> float | None:
-    try:
-        whole = datetime.strptime(str(exif[_TIME]).strip("\0 "), "%Y:%m:%d %H:%M:%S")
-        digits = str(exif.get(_SUBSECONDS, "")).strip("\0 ")
-        return (whole - datetime(1970, 1, 1)).total_seconds() + (float(f"0.{digits}") if digits.isdigit() else 0.0)
-    except (KeyError, ValueError):
-        return None
-
-
 def _times(headers: Sequence[Header | None]) -> NDArray[np.float64]:
     """(N,) seconds since the first image if all images state ascending times; else 0, 1, 2, …."""
     stated = np.array([np.nan if header is None or header.time is None else header.time for header in headers])
     if np.isfinite(stated).all() and (np.diff(stated) > 0).all():
         return np.asarray(stated - stated[0])
     return np.arange(len(headers), dtype=np.float64)
-
-
-def _focal(headers: Sequence[Header], size: Size) -> Intrinsics | None:
-    """The camera of the lens that most images state; None if they state no lens, or several."""
-    stated = [header.focal for header in headers if header.focal is not None]
-    if 2 * len(stated) <= len(headers):
-        return None
-    low, middle, high = np.percentile(stated, (10, 50, 90))
-    return None if high - low > SAME_LENS * middle else convert_35mm(float(middle) * DIAGONAL_35MM, size)
 
 
 def _common_size(folder: Path, headers: Sequence[Header]) -> Size:

@@ -16,10 +16,11 @@ from ..base import Options
 from ..cameras.camera_discovery import find_cameras
 from ..cameras.camera_files import check_pose_files, read_intrinsics, read_pose, read_rigid
 from ..cameras.lenses import Lens
-from ..cameras.rigs import StatedCameras, build_rig
+from ..cameras.rigs import StatedCameras
 from ..class_files import capture_class_names
 from ..files.numbered_files import has_file, list_numbered
 from ..files.paired_folders import find_folders
+from ..frame_files import build_file_rig
 from ..image_lists import find_lists
 from ..image_pairs import ImagePairs, Pairs, pair_files
 
@@ -63,13 +64,13 @@ class Reader(ImagePairs):
 
     def __init__(self, path: Path, options: Options):
         pairs = pair_files(list_numbered(path / "color", COLOR), list_numbered(path / "depth", DEPTH), path, options)
-        rig, self.intrinsics_known = build_rig(
+        rig, self.intrinsics_known, self.focal_stated = build_file_rig(
             _stated_cameras(path, pairs, options.depth),
             options,
+            [file for file in pairs.color if file is not None],
             pairs.color_size,
             pairs.depth_size if options.depth else None,
         )
-        self.focal_stated = self.intrinsics_known
         super().__init__(path, options, pairs, rig, units_per_meter=None)
         self.classes = capture_class_names(path)
 
