@@ -60,6 +60,21 @@ def test_real_captures_raise_no_doubt(name: str) -> None:
     assert check_registration(capture, range(len(capture))) is None
 
 
+@pytest.mark.parametrize(("baseline_m", "told"), [(0.025, False), (0.06, True)])
+@pytest.mark.parametrize("first", [0, 120])
+def test_cameras_that_lie_near_each_other_do_no_harm(baseline_m: float, told: bool, first: int) -> None:
+    """Wherever the scan is: near surfaces move by more pixels than far ones."""
+    capture = open_capture("builtin:room", None, {"synthetic": {"frames": 240, "width": 320, "height": 240}})
+    found = []
+    for index in range(first, first + 60, 6):
+        frame = capture[index]
+        apart = round(frame.intrinsics.fx * baseline_m / float(np.median(frame.depth_m[frame.depth_m > 0])))
+        found += moved([frame], apart)
+    fit = fit_edges(found)
+    assert fit is not None
+    assert fit.doubtful == told
+
+
 def test_images_without_edges_say_nothing(room) -> None:
     flat = [replace(frame, depth_m=np.full_like(frame.depth_m, 2.0)) for frame in room]
     assert fit_edges(flat) is None

@@ -34,9 +34,9 @@ _SAMPLES, _LEAST_FRAMES, _LEAST_EDGES, _MOST_EDGES = 10, 3, 150, 800
 _LEAST_INSIDE, _LEAST_STRENGTH = 0.5, 40.0
 """Smallest share of the depth edges within the image, and smallest gradient of a color edge, 8 bits."""
 
-_OFF = 0.015
-"""Smallest displacement, at the image's border, that is told, as a share of the width. A Kinect that is only roughly
-registered has 0.013."""
+_OFF_M, _OFF_PX = 0.04, 2.0
+"""Smallest mean displacement of the surfaces that is told, meters, half of a usual voxel, and in pixels of the reduced
+image. The two cameras of a Kinect are 25 mm apart: color lies that far off at any depth, which does little harm."""
 
 _GAIN = 0.12
 """Smallest decrease of the mean distance, as a share of it, by which another place is better."""
@@ -50,17 +50,18 @@ Place = tuple[float, int, int]
 class EdgeFit:
     """Where the edges of depth fit those of color best. shift: (2,) pixels of the frames, to the right and down.
     scale: magnification about the center.  gain: decrease of the mean distance there, as a share of it.
-    off: displacement at the border, as a share of the width."""
+    off_m, off_px: mean displacement of the edges, meters on their surfaces and pixels of the reduced image."""
 
     shift: tuple[float, float]
     scale: float
     gain: float
-    off: float
+    off_m: float
+    off_px: float
 
     @property
     def doubtful(self) -> bool:
         """Whether depth fits color clearly better elsewhere."""
-        return self.gain > _GAIN and self.off > _OFF
+        return self.gain > _GAIN and self.off_m > _OFF_M and self.off_px > _OFF_PX
 
 
 def check_registration(capture: Capture, frames: range) -> Notice | None:
@@ -72,9 +73,9 @@ def check_registration(capture: Capture, frames: range) -> Notice | None:
     return Notice(
         "registration-doubtful",
         f"Color and depth of {capture.path} do not seem to lie on each other: the edges of depth meet those of color "
-        f"better if depth moves by {right:+.0f}, {down:+.0f} pixels and grows by {fit.scale:.2f}. Poses and colors "
-        "suffer. Record depth aligned to color, or add the depth camera's intrinsics and its place: "
-        "intrinsic/intrinsic_depth.txt and intrinsic/extrinsic_depth.txt.",
+        f"better if depth moves by {right:+.0f}, {down:+.0f} pixels and grows by {fit.scale:.2f}, which is "
+        f"{100 * fit.off_m:.0f} cm on the surfaces. Poses and colors suffer. Record depth aligned to color, or add the "
+        "depth camera's intrinsics and its place: intrinsic/intrinsic_depth.txt and intrinsic/extrinsic_depth.txt.",
     )
 
 
@@ -100,18 +101,30 @@ def fit_edges(frames: Iterable[Frame]) -> EdgeFit | None:
     unchanged = _mean_distance(seen, (1.0, 0, 0))
     gain = 1 - _mean_distance(seen, best) / unchanged if unchanged > 0 else 0.0
     factor = seen[0].frame_width / _WIDTH
-    off = float(np.hypot(right, down)) / _WIDTH + abs(scale - 1) / 2
-    return EdgeFit((right * factor, down * factor), float(scale), gain, off)
+    moved = [edges.displacements(best) for edges in seen]
+    off_m = np.concatenate([pixels * edges.meters for pixels, edges in zip(moved, seen, strict=True)]).mean()
+    return EdgeFit(
+        (right * factor, down * factor), float(scale), gain, float(off_m), float(np.concatenate(moved).mean())
+    )
 
 
 @dataclass(frozen=True)
 class _Edges:
-    """Depth edges (K,) of a reduced image, and the distances (h, w) of its pixels from color edges, pixels."""
+    """Depth edges (K,) of a reduced image, and the distances (h, w) of its pixels from color edges, pixels.
+    meters: (K,) width of a pixel on the surface at an edge."""
 
     u: NDArray[np.int64]
     v: NDArray[np.int64]
+    meters: NDArray[np.float32]
     away: NDArray[np.float32]
     frame_width: int
+
+    def displacements(self, place: Place) -> NDArray[np.float64]:
+        """(K,) how far the edges move to a place, pixels."""
+        scale, right, down = place
+        x = (self.u - (_WIDTH - 1) / 2) * (scale - 1) + right
+        y = (self.v - (len(self.away) - 1) / 2) * (scale - 1) + down
+        return np.hypot(x, y)
 
     def mean_distance(self, place: Place) -> float:
         """Mean saturating distance of the depth edges, moved to a place, from color edges."""
@@ -148,7 +161,8 @@ def _edges(frame: Frame) -> _Edges | None:
         return None
     step = max(1, len(u) // _MOST_EDGES)
     away = np.minimum(cv2.distanceTransform(np.uint8(~color_edges), cv2.DIST_L2, 3), _FAR_PX)
-    return _Edges(u[::step], v[::step], away, frame.color.shape[1])
+    meters = depth[v, u] * (frame.color.shape[1] / _WIDTH / frame.intrinsics.fx)
+    return _Edges(u[::step], v[::step], meters[::step].astype(np.float32), away, frame.color.shape[1])
 
 
 def _depth_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
