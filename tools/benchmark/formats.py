@@ -19,6 +19,7 @@ import numpy as np
 from freeocc3d.capture import open_capture, select_frames
 from freeocc3d.capture.base import Capture
 from freeocc3d.capture.focal_correction import Reregistered
+from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.types import Frame
 from freeocc3d.evaluation.trajectory_errors import measure_trajectory_errors
 from freeocc3d.tracking.rgbd import focal_calibration
@@ -48,11 +49,16 @@ def measure_formats(capture: str) -> Figures:
     scan, base = take_piece(capture), None
     cases = []
     for name in sorted(written, key=lambda name: name != BASE):
-        with tempfile.TemporaryDirectory(prefix="freeocc3d-format-") as temporary:
-            row, frames = measure_format(written[name], scan, Path(temporary), base)
-        base = base or (frames, row.get("ate_rmse_m", float("nan")))
+        facts = {"format": name, "reader": written[name].reader}
+        try:
+            with tempfile.TemporaryDirectory(prefix="freeocc3d-format-") as temporary:
+                row, frames = measure_format(written[name], scan, Path(temporary), base)
+        except FreeOccError as error:
+            cases.append({**facts, "error": str(error)})
+            continue
         ate = row.get("ate_rmse_m", float("nan"))
-        cases.append({"format": name, "reader": written[name].reader, **row, "over_base": ate / base[1]})
+        base = base or (frames, ate)
+        cases.append({**facts, **row, "over_base": ate / base[1]})
     return {"cases": cases}
 
 
@@ -92,10 +98,10 @@ def tabulate_formats(rows: Sequence[Figures]) -> list[str]:
         "decoding alone, ms", "over decoding (asked <= 1.2)", f"s to open {MANY:,} (asked <= 2)",
         f"MB more after {MANY_READ:,} reads (asked none)",
     )  # fmt: skip
-    if errors := [row for row in rows if "error" in row]:
-        return [f"not available: {row['error']}" for row in errors]
     lines = [
-        (
+        (row["capture"], row.get("format", "–"), f"not available, {row['error']}", *["–"] * (len(header) - 3))
+        if "error" in row
+        else (
             row["capture"],
             row["format"],
             row["reader"],
