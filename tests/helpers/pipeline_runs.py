@@ -9,6 +9,8 @@ import yaml
 from freeocc3d.core.warnings import Notice, read_notices
 
 ROOM = {"capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "stop": 24}}
+QUICK_ROOM = {"capture": {**ROOM["capture"], "color_focal": 1.0}, "fitting": {"passes": 1}}
+"""The same without the calibration of color, which takes half of the time."""
 
 
 def notices(made) -> list[Notice]:

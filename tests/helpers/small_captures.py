@@ -133,3 +133,19 @@ def truncate(path: Path, share: float = 0.5) -> None:
     """Cut the end of a file off, as an interrupted copy does."""
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
+
+
+def thin_house(room: Path, folder: Path, step: int) -> Path:
+    """Every ``step``-th frame of a room of the house, with its pose, classes and ground truth, in an empty folder of
+    the room's name."""
+    made = folder / room.parent.name / room.name
+    for inner in ("results", "semantic_class"):
+        (made / inner).mkdir(parents=True)
+    poses = (room / "traj.txt").read_text().splitlines()[::step]
+    (made / "traj.txt").write_text("\n".join(poses) + "\n")
+    for name in ("cam_params.json", "classes.json", "ground_truth.npz"):
+        (made / name).symlink_to(room / name)
+    for n in range(len(poses)):
+        for name in ("results/frame{:06d}.jpg", "results/depth{:06d}.png", "semantic_class/semantic_class_{:06d}.png"):
+            (made / name.format(n)).symlink_to(room / name.format(n * step))
+    return made

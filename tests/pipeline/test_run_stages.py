@@ -7,10 +7,12 @@ import json
 
 import numpy as np
 import pytest
-from pipeline_runs import ROOM, content, listing, notices
+from pipeline_runs import QUICK_ROOM as ROOM
+from pipeline_runs import content, listing, notices
 from vision_servers import saying, serving
 
 import freeocc3d
+from freeocc3d import Map
 from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, Interrupted, MapError
 from freeocc3d.core.progress import Progress
 from freeocc3d.pipeline import run_stages
@@ -19,6 +21,11 @@ from freeocc3d.storage import writer
 from freeocc3d.storage.manifest import NameCount
 
 ONE_PASS = {"fitting": {"passes": 1}}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Map:
+    return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", ROOM)
 
 
 class Stopper(Progress):
