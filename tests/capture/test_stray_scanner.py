@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scans import plane_scan
 from small_captures import color_image, depth_image, pose_matrix, write_image, write_matrix
-from written_phones import STRAY_COLUMNS, write_odometry, write_stray
+from written_phones import STRAY_COLUMNS, write_lossless, write_odometry, write_stray
 
 from freeocc3d.capture import Options, open_capture
 from freeocc3d.capture.readers.stray_scanner import Reader
@@ -86,6 +86,13 @@ def test_depth_may_be_arrays(tmp_path: Path) -> None:
     for index in range(6):
         np.save(tmp_path / "depth" / f"{index:06d}.npy", depth_image(index, size=DEPTH_SIZE) / np.float32(1000))
     np.testing.assert_allclose(open_capture(tmp_path)[2].depth_m.max(), 2.02, atol=1e-6)
+
+
+@pytest.mark.parametrize("rotation", [90, 180])
+def test_a_video_that_a_player_turns_stays_as_depth_is(tmp_path: Path, rotation: int) -> None:
+    write_planes(tmp_path, 3, SIZE)
+    write_lossless(tmp_path / "rgb.mp4", [color_image(index, SIZE) for index in range(3)], rotation=rotation)
+    np.testing.assert_array_equal(open_capture(tmp_path)[1].color, color_image(1, SIZE))
 
 
 def test_threads_get_the_frames_that_they_ask_for(tmp_path: Path) -> None:

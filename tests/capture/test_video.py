@@ -276,7 +276,7 @@ def test_a_decoder_that_makes_no_progress_is_ended(tmp_path: Path, monkeypatch: 
 
 
 def test_memory_of_the_decoder_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    taking = "v.VideoDecoder = lambda *_: bytearray(8 << 30)"
+    taking = "v.VideoDecoder = lambda *_, **more: bytearray(8 << 30)"
     code = f"from freeocc3d.capture.videos import video_decoding as v; {taking}; v.main()"
     monkeypatch.setattr(video_process, "_CODE", code)
     with pytest.raises(CaptureError, match="needs too much memory"):

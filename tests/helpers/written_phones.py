@@ -30,13 +30,18 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _TICKS = 90_000
 
 
-def write_lossless(path: Path, images: Sequence[NDArray[np.uint8]], times: Sequence[float] | None = None) -> Path:
-    """A video whose frames come back as they were. times: seconds, by default 60 frames a second."""
+def write_lossless(
+    path: Path, images: Sequence[NDArray[np.uint8]], times: Sequence[float] | None = None, rotation: int = 0
+) -> Path:
+    """A video whose frames come back as they were. times: seconds, by default 60 frames a second.  rotation: degrees,
+    counterclockwise, by which a player has to turn the frames."""
     at = [i / 60 for i in range(len(images))] if times is None else [time - times[0] for time in times]
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264rgb", rate=60, options={"qp": "0", "preset": "ultrafast"})
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "rgb24"
+        if rotation:
+            stream.set_display_rotation(rotation)
         stream.time_base = stream.codec_context.time_base = Fraction(1, _TICKS)
         for seconds, image in zip(at, images, strict=True):
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")

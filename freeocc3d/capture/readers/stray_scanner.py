@@ -66,7 +66,8 @@ class Reader(RgbdFrames):
     depth are frames, with a warning about the others. ``odometry.csv`` has times, poses and, in newer files, a camera
     per frame, which wins over ``camera_matrix.csv``. Both are for the video's size, or ``USUAL_SIZE``.
 
-    The decoder reduces color to the pixels of the depth. Reading in ascending order passes through the video once.
+    Frames stay as they are stored, as depth and poses do, if the video says that a player should turn them. The decoder
+    reduces color to the pixels of the depth. Reading in ascending order passes through the video once.
     Raises CaptureError for a missing or damaged file, or no common frame.
     """
 
@@ -76,7 +77,7 @@ class Reader(RgbdFrames):
     def __init__(self, path: Path, options: Options):
         self._lock = threading.Lock()
         self._images = list_numbered(path / "rgb", IMAGE)
-        self._video = None if self._images else VideoProcess(_find_video(path))
+        self._video = None if self._images else VideoProcess(_find_video(path), upright=False)
         self._depth = list_numbered(path / "depth", DEPTH) if options.depth else {}
         self._confidence = list_numbered(path / "confidence", CONFIDENCE) if options.depth else {}
         self._numbers, self.warnings = self._choose(path, options)

@@ -57,13 +57,13 @@ class VideoDecoder:
     """Decodes one video stream. Not thread-safe. The constructor raises CaptureError.
 
     beat: is called often.  keys: (N,) int64 presentation times in units of ``time_base``, ascending.  upright_size:
-    size of the frames with square pixels, after rotation.
+    size of the frames with square pixels, after the rotation that the file states if ``upright`` is true.
 
     Some streams do not say when a frame is shown: raw ones, and H.264 in AVI, which states the order of decoding. Their
     frames are counted as they come out of the decoder, which is the order of display, always from the first one.
     """
 
-    def __init__(self, path: Path, beat: Callable[[], None] = lambda: None):
+    def __init__(self, path: Path, beat: Callable[[], None] = lambda: None, upright: bool = True):
         self.path, self._beat = path, beat
         _refuse_text(path)
         self._open()
@@ -78,7 +78,7 @@ class VideoDecoder:
         self._frames: Iterator[tuple[int, Any]] = iter(())
         self._last: tuple[int, Any] | None = None
         first = self._first_frame()
-        self._turns = round(first.rotation / 90) % 4
+        self._turns = round(first.rotation / 90) % 4 if upright else 0
         aspect = self._stream.sample_aspect_ratio
         width, height = round(first.width * float(aspect)) if aspect else first.width, first.height
         self.upright_size: Size = (height, width) if self._turns % 2 else (width, height)
@@ -248,7 +248,7 @@ _NOT_OF_TEXT = set(range(32)) - set(b"\t\n\v\f\r\x1b")
 
 
 def main() -> None:
-    """Serve the frames of the video that the command line names: ``path shared-memory parent``.
+    """Serve the frames of the video that the command line names: ``path shared-memory parent upright``.
 
     Each line that comes in asks for a frame, {"index", "width", "height"}; the answer is {} when its (height, width, 3)
     pixels are in the shared memory, or {"error"}. The first line that goes out describes the video. An empty line says
@@ -267,7 +267,7 @@ def main() -> None:
             print(flush=True)
 
     try:
-        decoder = VideoDecoder(path, beat)
+        decoder = VideoDecoder(path, beat, upright=sys.argv[4] == "1")
     except (FreeOccError, MemoryError) as error:
         print(json.dumps({"error": str(error) or f"{path} needs too much memory: convert the video."}), flush=True)
         return

@@ -67,8 +67,9 @@ class _Ended(Exception):
 class VideoProcess:
     """Frames of a video, decoded elsewhere. Not thread-safe. The constructor raises CaptureError."""
 
-    def __init__(self, path: Path):
-        self.path = path
+    def __init__(self, path: Path, upright: bool = True):
+        """upright: turn frames as the file states; otherwise they stay as they are stored."""
+        self.path, self._upright = path, upright
         self._starts = 0
         self._process: subprocess.Popen[bytes] | None = None
         self._answers = bytearray()
@@ -81,7 +82,7 @@ class VideoProcess:
             raise CaptureError(f"{path} is not a readable video: {error}. Convert it to H.264 in mp4.") from error
 
     def image(self, index: int, size: Size) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 RGB of an upright frame, resampled to ``size``. Raises FrameError."""
+        """(H, W, 3) uint8 RGB of a frame, resampled to ``size``. Raises FrameError."""
         width, height = size
         try:
             if self._process is None:
@@ -108,7 +109,8 @@ class VideoProcess:
             raise _Ended("the decoder has ended too often")
         paths = [path or os.getcwd() for path in sys.path]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OPENBLAS_NUM_THREADS": "1"}
-        arguments = [sys.executable, "-c", _CODE, os.fspath(self.path), str(self._memory), str(os.getpid())]
+        numbers = map(str, (self._memory, os.getpid(), int(self._upright)))
+        arguments = [sys.executable, "-c", _CODE, os.fspath(self.path), *numbers]
         try:
             self._process = subprocess.Popen(
                 arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0,
