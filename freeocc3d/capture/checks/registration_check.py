@@ -35,8 +35,8 @@ _LEAST_INSIDE, _LEAST_STRENGTH = 0.5, 40.0
 """Smallest share of the depth edges within the image, and smallest gradient of a color edge, 8 bits."""
 
 _OFF_M, _OFF_PX = 0.05, 2.0
-"""Smallest mean displacement of the surfaces that is told: meters, and pixels of the reduced image. The two cameras of a
-Kinect are 25 mm apart: color lies that far off at any depth, which does little harm. This is twice as much."""
+"""Smallest mean displacement of the surfaces that is told: meters, and pixels of the reduced image. The two cameras of
+a Kinect are 25 mm apart: color lies that far off at any depth, which does little harm. This is twice as much."""
 
 _GAIN = 0.12
 """Smallest decrease of the mean distance, as a share of it, by which another place is better."""
