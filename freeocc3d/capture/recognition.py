@@ -177,12 +177,32 @@ def _is_there(part: str, names: list[str]) -> bool:
 def find_unread_depth(path: Path, name: str) -> list[Notice]:
     """A warning if depth images lie beside the color of a capture that was read without any, as format ``name``."""
     folders = find_folders(path)
-    if folders is None or holds_depth_or_confidence(folders.depth) != "depth":
+    if folders is None:
+        return _find_depth_beside(path)
+    if holds_depth_or_confidence(folders.depth) != "depth":
         return []
     return [
         Notice(
             "depth-not-read",
             f"{folders.depth} holds {len(folders.depth_names)} depth images, which the format {name} does not name, so "
             "they are not read: set capture.format=image_folders to use them in place of the poses that it states.",
+        )
+    ]
+
+
+def _find_depth_beside(path: Path) -> list[Notice]:
+    """A warning if ``path`` is the color folder of a capture with depth."""
+    folder = path.absolute()
+    try:
+        folders = find_folders(folder.parent)
+    except CaptureError:  # of another user
+        return []
+    if folders is None or folders.color != folder or holds_depth_or_confidence(folders.depth) != "depth":
+        return []
+    return [
+        Notice(
+            "depth-not-read",
+            f"{folders.depth} holds {len(folders.depth_names)} depth images, and {path} has the color alone: give "
+            f"{folder.parent} to use both.",
         )
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -140,3 +141,16 @@ def test_a_format_whose_package_is_missing_is_recognized_and_names_the_extra(tmp
 def test_the_extra_of_a_package_is_read_from_what_is_installed() -> None:
     assert registry._extra("rosbags") in ("ros", "")
     assert registry._extra("no_such_package") == ""
+
+
+def test_the_color_folder_of_a_capture_with_depth_is_told_to_be_one(tmp_path: Path, monkeypatch) -> None:
+    write_scannet(tmp_path / "scan", 3)
+    color = tmp_path / "scan" / "color"
+    monkeypatch.chdir(color)
+    for given in (color, Path(".")):
+        (notice,) = open_capture(given).warnings
+        assert notice.code == "depth-not-read"
+        assert f"give {tmp_path / 'scan'} to use both" in notice.text
+    assert open_capture(color, Options(depth=False)).warnings == ()
+    shutil.rmtree(tmp_path / "scan" / "depth")
+    assert open_capture(color).warnings == ()
