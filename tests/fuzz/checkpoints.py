@@ -34,17 +34,15 @@ _FINISHING = 0.2
 """Share of the kills that hit the moments in which the map gets its name."""
 
 
-class _Stop(Exception):
-    pass
+class _Snapshots(Progress):
+    """Copies the work folder of a run when each stage begins: what is left of a run that is stopped there."""
 
-
-class _StopAt(Progress):
-    def __init__(self, stage: str):
-        self.target = stage
+    def __init__(self, output: Path):
+        self.work = output.with_name(f"{output.name}.partial")
 
     def stage(self, name: str, total: int | None = None) -> None:
-        if name == self.target:
-            raise _Stop
+        if name in STAGES:
+            shutil.copytree(self.work, self.work.with_name(f"{name}.partial"))
 
 
 def _reconstruct(output: Path, **options: Any) -> None:
@@ -53,28 +51,27 @@ def _reconstruct(output: Path, **options: Any) -> None:
 
 
 def prepare(folder: Path) -> None:
-    """An uninterrupted map, how long it takes, a map to replace, and the work folders of runs that stop at each
-    stage."""
-    _reconstruct(folder / "whole")
+    """An uninterrupted map, its work folders as they were at each stage, how long a run takes, and a map to
+    replace."""
+    finish, progress = WorkFolder.finish, _Snapshots(folder / "whole")
+
+    def finish_later(self: WorkFolder, output: Path) -> None:
+        progress.stage("finish")
+        finish(self, output)
+
+    WorkFolder.finish = finish_later  # type: ignore[method-assign]
+    try:
+        _reconstruct(folder / "whole", progress=progress)
+    finally:
+        WorkFolder.finish = finish  # type: ignore[method-assign]
+    if missing := [stage for stage in STAGES if not (folder / f"{stage}.partial").is_dir()]:
+        raise AssertionError(f"the run had no stages {missing}")
     start = time.perf_counter()
     _child(folder / "again", {}).join()
     (folder / "seconds").write_text(str(time.perf_counter() - start))
     _require_same(folder / "again", folder)
     shutil.rmtree(folder / "again")
     shutil.copytree(folder / "whole", folder / "old")
-    for stage in STAGES:
-        original = WorkFolder.finish
-        WorkFolder.finish = _raise if stage == "finish" else original  # type: ignore[method-assign]
-        try:
-            _reconstruct(folder / stage, progress=_StopAt(stage))
-        except _Stop:
-            pass
-        finally:
-            WorkFolder.finish = original  # type: ignore[method-assign]
-
-
-def _raise(self: WorkFolder, output: Path) -> None:
-    raise _Stop
 
 
 def attack(rng: random.Random, originals: Path, folder: Path) -> Attack:
