@@ -24,8 +24,10 @@ from freeocc3d.settings import config
 from freeocc3d.viewer.map_pictures import write_map_picture
 
 RED, YELLOW = (np.array(CUPS[name]) + (0, 0, 0.5 * CUP_HEIGHT) for name in ("red", "yellow"))
+
+
 SETTINGS = {
-    "capture": {"stride": 8, "synthetic": {"width": 320, "height": 240}},
+    "capture": {"stride": 8, "color_focal": 1.0, "synthetic": {"width": 160, "height": 120}},
     "tracking": {"backend": "known"},
     "fitting": {"passes": 0},
 }
@@ -37,8 +39,8 @@ def room(tmp_path_factory) -> Map:
 
 
 @pytest.fixture(scope="module")
-def fine(room: Map) -> Map:
-    return adaptive_voxels.refine_where_needed(room, 0.01, room.path.parent / "fine")
+def fine(room: Map, tmp_path_factory) -> Map:
+    return adaptive_voxels.refine_where_needed(room, 0.01, tmp_path_factory.mktemp("adaptive") / "fine")
 
 
 def flat(n: int, z: float = 0.0, depth: float = 1.0) -> Gaussians:
@@ -222,9 +224,11 @@ def test_saved_loaded_exported_and_drawn(room: Map, fine: Map, tmp_path: Path) -
     assert f"from {room.path}" in told
 
 
-def test_as_an_option_of_reconstruct_it_is_the_same_map(room: Map, tmp_path: Path) -> None:
-    settings = {**SETTINGS, "occupancy": {"finest": 0.02}}
-    made = pipeline.reconstruct("builtin:room", tmp_path / "at_once", settings)
+def test_as_an_option_of_reconstruct_it_is_the_same_map(tmp_path: Path) -> None:
+    part = {"stop": 40, "stride": 8, "color_focal": 1.0, "synthetic": {"width": 320, "height": 240}}
+    settings = {**SETTINGS, "capture": part}
+    room = pipeline.reconstruct("builtin:room", tmp_path / "room", settings)
+    made = pipeline.reconstruct("builtin:room", tmp_path / "at_once", {**settings, "occupancy": {"finest": 0.02}})
     later = adaptive_voxels.refine_where_needed(room, 0.02, tmp_path / "later")
     np.testing.assert_array_equal(made.occupancy.keys, later.occupancy.keys)
     agree = made.occupancy.state == later.occupancy.state

@@ -15,7 +15,6 @@ from freeocc3d.core.types import FREE
 from freeocc3d.editing import box_refinement
 from freeocc3d.language.encoders import color
 from freeocc3d.occupancy.connected_components import label_components
-from freeocc3d.pipeline import run as pipeline
 from freeocc3d.query.scan_map import Map
 
 RED, YELLOW = (np.array(CUPS[name]) + (0, 0, 0.5 * CUP_HEIGHT) for name in ("red", "yellow"))
@@ -24,19 +23,9 @@ MIDDLE, REACH = 0.5 * (RED + YELLOW), np.array((0.2, 0.2, 0.1))
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory) -> Map:
-    settings = {
-        "capture": {"stride": 4, "synthetic": {"width": 320, "height": 240}},
-        "tracking": {"backend": "known"},
-        "fitting": {"passes": 0},
-    }
-    return pipeline.reconstruct("builtin:room", tmp_path_factory.mktemp("refine") / "room", settings)
-
-
-@pytest.fixture(scope="module")
-def cups(room: Map) -> Map:
+def cups(room: Map, tmp_path_factory) -> Map:
     box = box_refinement.Box(MIDDLE - REACH, MIDDLE + REACH)
-    return box_refinement.refine_box(room, box, 0.005, room.path.parent / "cups")
+    return box_refinement.refine_box(room, box, 0.005, tmp_path_factory.mktemp("refine") / "cups")
 
 
 def near(found: Map, point: np.ndarray, radius: float) -> np.ndarray:

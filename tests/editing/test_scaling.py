@@ -19,7 +19,6 @@ from freeocc3d.core.tum_files import write_tum
 from freeocc3d.core.types import Intrinsics, Trajectory
 from freeocc3d.core.warnings import Notice, read_notices
 from freeocc3d.editing import scaling
-from freeocc3d.pipeline import run as pipeline
 from freeocc3d.query.scan_map import Map, load_map
 from freeocc3d.storage import map_files
 from freeocc3d.storage.manifest import MapScale, Refined, matrix
@@ -30,19 +29,9 @@ ANOTHER = Notice("frames-lost", "another")
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory) -> Map:
-    settings = {
-        "capture": {"stride": 8, "synthetic": {"width": 320, "height": 240}},
-        "tracking": {"backend": "known"},
-        "fitting": {"passes": 0},
-    }
-    return pipeline.reconstruct("builtin:room", tmp_path_factory.mktemp("scale") / "room", settings)
-
-
-@pytest.fixture(scope="module")
-def half(room: Map) -> Map:
+def half(room: Map, tmp_path_factory) -> Map:
     """Half as large, in no unit."""
-    made = scaling.scale_map(room, 0.5, "given", room.path.parent / "half")
+    made = scaling.scale_map(room, 0.5, "given", tmp_path_factory.mktemp("scale") / "half")
     manifest = yaml.safe_load((made.path / map_files.MANIFEST).read_text())
     manifest["scale"] = {"metric": False, "by": "none", "factor": 1.0}
     report = {**made.report, "warnings": [Notice("scale-unknown", "").to_dict(), ANOTHER.to_dict()]}
