@@ -114,7 +114,7 @@ def test_rows_of_nan_are_frames_without_a_pose(scan, tmp_path) -> None:
     (notice,) = tracker.warnings
     assert notice.code == "poses-missing"
     assert "4 of 6 frames" in notice.text
-    assert "holds 4 poses, and 2 rows without one; the other 2 are lost" in notice.text
+    assert "holds 4 poses, and 2 rows without one; the other 2 have none of their own" in notice.text
     whole = file.load(file.Options(path=str(write_table(tmp_path / "w.txt", TUM))), scan)
     assert whole.warnings == ()
 
@@ -124,7 +124,7 @@ def test_fewer_poses_than_frames_are_told(scan, tmp_path) -> None:
     path.write_text("\n".join(path.read_text().splitlines()[:3]))
     (notice,) = file.load(file.Options(path=str(path)), scan).warnings
     assert "3 of 6 frames" in notice.text
-    assert "holds 3 poses; the other 3 are lost" in notice.text
+    assert "holds 3 poses; the other 3 have none of their own" in notice.text
 
 
 @pytest.mark.parametrize(

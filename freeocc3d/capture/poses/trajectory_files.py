@@ -102,7 +102,7 @@ class PoseFile:
         return Notice(
             "poses-missing",
             f"{posed} of {len(frames)} frames of {capture} have a pose in {self.path}, which holds {int(held.sum())} "
-            f"poses{none}; the other {len(frames) - posed} are lost.",
+            f"poses{none}; the other {len(frames) - posed} have none of their own.",
         )
 
     def _by_time(self, times: NDArray[np.float64], tolerance_s: float) -> dict[int, int]:
