@@ -31,6 +31,7 @@ SHAPE = (40, 40, 48)
 ORIGIN = np.array((-1.6, -1.6, 0.0))
 QUARTER = np.array(((0, -1, 0), (1, 0, 0), (0, 0, 1.0)))
 NO_CLASSES = ClassMap((), {})
+SHORT = {"stop": 30, "color_focal": 1.0, "synthetic": {"width": 160, "height": 120}}
 
 
 def lattice(origin: NDArray[np.float64] = ORIGIN, size: float = 0.08, shape: tuple[int, ...] = SHAPE) -> GroundTruth:
@@ -48,7 +49,7 @@ def agreement(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    settings = {"capture": {"stop": 30, "synthetic": {"width": 160, "height": 120}}}
+    settings = {"capture": SHORT}
     return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", settings)
 
 
@@ -80,7 +81,7 @@ def test_a_map_on_its_own_lattice_is_the_map(room: Any) -> None:
 
 
 def test_a_map_of_finer_cells_claims_the_same_voxels(room: Any, tmp_path: Path) -> None:
-    cells = {"gaussians": {"cell_size": 0.02}, "capture": {"stop": 30, "synthetic": {"width": 160, "height": 120}}}
+    cells = {"gaussians": {"cell_size": 0.02}, "capture": SHORT}
     fine = freeocc3d.reconstruct("builtin:room", tmp_path / "fine", cells)
     assert len(fine.gaussians) > 2.5 * len(room.gaussians)
     same, claimed = (of_room(scan_map, TrajectoryAlignment.identity(), lattice()) for scan_map in (room, fine))

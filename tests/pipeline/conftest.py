@@ -20,14 +20,14 @@ def room(tmp_path_factory) -> Map:
 
 @pytest.fixture(scope="session")
 def glued(tmp_path_factory):
-    """A folder that holds two places, at half their size: 15 frames of the bedroom, then 8 of the living room."""
+    """A folder of two places, at a quarter of their size: 15 frames of the bedroom, then 8 of the living room."""
     folder = tmp_path_factory.mktemp("glued") / "scan"
     (folder / "results").mkdir(parents=True)
     house = data_folder() / "house"
     parameters = json.loads((house / "bedroom" / "cam_params.json").read_text())
     camera = parameters["camera"]
-    camera.update({name: camera[name] // 2 for name in ("w", "h")}, fx=camera["fx"] / 2, fy=camera["fy"] / 2)
-    camera.update({name: (camera[name] + 0.5) / 2 - 0.5 for name in ("cx", "cy")})
+    camera.update({name: camera[name] // 4 for name in ("w", "h")}, fx=camera["fx"] / 4, fy=camera["fy"] / 4)
+    camera.update({name: (camera[name] + 0.5) / 4 - 0.5 for name in ("cx", "cy")})
     (folder / "cam_params.json").write_text(json.dumps(parameters))
     shown = [*((house / "bedroom", i) for i in range(0, 60, 4)), *((house / "living", i) for i in range(0, 32, 4))]
     for n, (source, i) in enumerate(shown):

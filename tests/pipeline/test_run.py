@@ -225,6 +225,7 @@ def test_labels_of_the_capture_answer_by_class(tmp_path) -> None:
             "capture": {"stop": 60, "stride": 6},
             "tracking": {"backend": "known"},
             "language": {"encoder": "labels"},
+            "fitting": {"passes": 0},
         },
     )
     found = made.query("bed")
@@ -241,7 +242,7 @@ def test_labels_of_the_capture_answer_by_class(tmp_path) -> None:
 def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -> None:
     from freeocc3d.cli.map_summary import summary_text
 
-    made = freeocc3d.reconstruct(glued, tmp_path / "map")
+    made = freeocc3d.reconstruct(glued, tmp_path / "map", {"fitting": {"passes": 1}})
     assert made.manifest.counts.submaps == 2
     assert made.manifest.counts.frames_with_pose == 15
     assert made.report["frames"]["apart"] == 8
@@ -268,6 +269,7 @@ def test_poses_of_another_system_make_a_map(tmp_path) -> None:
     settings = {
         "capture": {"stop": 40, "stride": 4},
         "tracking": {"backend": "file", "file": {"path": str(tmp_path / "kitti.txt")}},
+        "fitting": {"passes": 0},
     }
     made = freeocc3d.reconstruct(capture, tmp_path / "map", settings)
     assert made.manifest.counts.frames_with_pose == 10

@@ -19,7 +19,7 @@ from freeocc3d.storage.manifest import MapScale
 UNIT_M = 2.5
 """Meters per unit of what the other system gives."""
 
-ROOM = {"synthetic": {"width": 160, "height": 120, "frames": 60, "noise": False}}
+ROOM = {"synthetic": {"width": 160, "height": 120, "frames": 36, "noise": False}}
 
 
 def write_tum(path: Path, times: np.ndarray, T: np.ndarray) -> None:
@@ -89,7 +89,7 @@ def test_with_a_scale_given_from_the_start_the_map_is_metric(scan: Path, tmp_pat
     assert config.load_saved(scan_map.path / "config.yaml").gaussians.cell_size is None
     room = open_capture("builtin:room", None, ROOM)
     centers = scan_map.trajectory.T_world_cam[:, :3, 3]
-    np.testing.assert_allclose(centers, [room.pose(index)[:3, 3] for index in range(60)], atol=1e-5)
+    np.testing.assert_allclose(centers, [room.pose(index)[:3, 3] for index in range(36)], atol=1e-5)
     truth = room.ground_truth(0.08)  # type: ignore[attr-defined]
     occupied = truth["origin"] + (np.argwhere((truth["labels"] > 0) & (truth["labels"] != 255)) + 0.5) * 0.08
     found = scan_map.occupancy.centers(scan_map.occupancy.occupied_voxels())

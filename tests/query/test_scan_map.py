@@ -12,7 +12,7 @@ from freeocc3d.storage.manifest import MapScale
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    settings = {"capture": {"stop": 8, "synthetic": {"width": 160, "height": 120}}}
+    settings = {"capture": {"stop": 8, "color_focal": 1.0, "synthetic": {"width": 160, "height": 120}}}
     return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", settings).path
 
 
