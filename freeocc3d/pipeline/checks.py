@@ -76,15 +76,24 @@ def warn_of_estimated_focal(capture: Capture, focal_px: float, uncertainty: floa
     )
 
 
-def explain_unknown_camera(capture: Capture, size: Size) -> str:
-    """Says that nothing tells the focal length, and what to give. size: of the stored color images."""
+def explain_unknown_camera(capture: Capture, size: Size, roughly: str = "") -> str:
+    """Says that nothing tells the focal length, and what to give. size: of the stored color images.  roughly: what the
+    scan shows of it, such as "121 ± 6 %"; empty if nothing."""
     width = max(size)
     wide = max(size) > 1.5 * min(size)
     usual = ", ".join(f"{name} {ratio * width:.0f}" for name, ratio in (_WIDE_FOCALS if wide else _FOCALS).items())
     return (
-        f"Nothing states the camera of {capture.path}, and the scan shows too little to estimate its focal length: "
+        f"Nothing states the camera of {capture.path}{_folders(capture)}, and the scan shows "
+        f"{f'its focal length only roughly, {roughly}' if roughly else 'too little to estimate its focal length'}: "
         f"give --focal with the focal length of its color images in pixels (usual for {size[0]} x {size[1]}: {usual})."
     )
+
+
+def _folders(capture: Capture) -> str:
+    """Where its color and depth lie, for messages; empty if they are not in folders of their own."""
+    files = capture.files(0)
+    names = [file.parent.name for file in files[:2] if file.parent != capture.path]
+    return f" (color in {names[0]}/, depth in {names[1]}/)" if len(names) > 1 and names[0] != names[1] else ""
 
 
 def warn_of_color_focal(capture: Capture, ratio: float) -> Notice:

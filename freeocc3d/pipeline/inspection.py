@@ -161,7 +161,8 @@ def _describe_camera(capture: Capture, frames: list[Frame]) -> tuple[str, list[N
     if (found is None or not found.sure) and capture.focal_stated:
         return f"roughly stated, focal length {focal:.0f} px", [warn_of_camera(capture)]
     if found is None or not found.sure:
-        return "not stated", [Notice("intrinsics-unknown", explain_unknown_camera(capture, size))]
+        roughly = "" if found is None else found.describe(focal / frames[0].intrinsics.fx)
+        return "not stated", [Notice("intrinsics-unknown", explain_unknown_camera(capture, size, roughly))]
     focal_px = focal * found.focal_px / frames[0].intrinsics.fx
     notice = warn_of_estimated_focal(capture, focal_px, found.uncertainty)
     return f"not stated; the scan shows a focal length of {focal_px:.0f} px", [notice]

@@ -123,7 +123,8 @@ def _know_camera(
     if (found is None or not found.sure) and capture.focal_stated:
         return capture, settings
     if found is None or not found.sure:
-        raise CaptureError(explain_unknown_camera(capture, (stored.width, stored.height)))
+        roughly = "" if found is None else found.describe(stored.fx / guess.fx)
+        raise CaptureError(explain_unknown_camera(capture, (stored.width, stored.height), roughly))
     focal_px = round(stored.fx * found.focal_px / guess.fx, 1)
     work.warn(progress, warn_of_estimated_focal(capture, focal_px, found.uncertainty))
     settings = settings.changed("capture", focal=focal_px)

@@ -31,8 +31,8 @@ _FAR_PX, _FAR = 3.0, 0.02
 _NEAREST_M = 0.05
 
 _STEPS = 8  # of reweighted least squares
-_SURE = 0.03
-"""Largest relative standard error, over the pairs, of a focal length that is taken."""
+_SURE, _VAGUE = 0.03, 0.12
+"""Largest relative standard errors, over the pairs, of a focal length that is taken, and of one that is told."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,10 @@ class FocalEstimate:
 
     focal_px: float
     uncertainty: float
+
+    def describe(self, factor: float) -> str:
+        """The focal length times a factor and its error, such as "121 ± 6 %"; empty if it says next to nothing."""
+        return f"{self.focal_px * factor:.0f} ± {self.uncertainty:.0%}" if self.uncertainty < _VAGUE else ""
 
     @property
     def sure(self) -> bool:
