@@ -94,7 +94,7 @@ class ImagePairs(FileFrames):
         """The class image at ``path`` on the frame's pixel grid. Raises FrameError if the file is unusable."""
         if path is None or not self.classes:
             return None
-        return self._registered(index).classes(read_classes(path, len(self.classes), self._pairs.color_size))
+        return self.registration(index).classes(read_classes(path, len(self.classes), self._pairs.color_size))
 
 
 def _holds_floats(depth: Sequence[Path | None]) -> bool:

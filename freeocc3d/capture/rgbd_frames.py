@@ -94,7 +94,7 @@ class RgbdFrames(Capture):
     def __getitem__(self, index: int) -> Frame:
         if not 0 <= index < len(self):
             raise IndexError(f"Frame {index} of a capture of {len(self)} frames.")
-        registration = self._registered(index)
+        registration = self.registration(index)
         color = self.stored_color(index)
         _check_size(color, self.rig(index).color.camera, f"The color of frame {index} of {self.path}")
         color = registration.color(color)
@@ -109,7 +109,8 @@ class RgbdFrames(Capture):
         raw = self.stored_depth(index) if self.has_depth else None
         return None if raw is None else (raw, self.units_per_meter or usual_units(raw))
 
-    def _registered(self, index: int) -> Registration:
+    def registration(self, index: int) -> Registration:
+        """What brings the frame's stored images to one pixel grid. Raises FrameError for a rig that is not usable."""
         try:
             return self._registration(self.rig(index))
         except CaptureError as error:

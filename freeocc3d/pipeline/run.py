@@ -101,7 +101,6 @@ def _prepare(capture: Capture, settings: Settings, work: WorkFolder, progress: P
 
 def _open(capture: str | Path, settings: Settings, progress: Progress, work: WorkFolder) -> Capture:
     opened = open_capture(capture, settings.capture, settings.backends.get("capture"))
-    select_frames(opened)
     broken = check_heads(opened, select_frames(opened))
     work.warn(progress, *([broken] if broken else []))
     warning = settle_depth_unit(opened)
@@ -118,7 +117,7 @@ def _know_camera(
         return capture, settings
     progress.stage("self-calibration")
     frames = select_frames(capture)
-    stored, guess = capture.rig(frames[0]).color.camera, capture[frames[0]].intrinsics
+    stored, guess = capture.rig(frames[0]).color.camera, capture.registration(frames[0]).intrinsics
     found = self_calibration.estimate_focal(capture, frames)
     if (found is None or not found.sure) and capture.focal_stated:
         return capture, settings

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from pipeline_runs import ROOM, listing, notices
-from small_captures import data_folder, truncate, write_scannet, write_seven_scenes
+from small_captures import data_folder, truncate, write_image, write_scannet, write_seven_scenes
 
 import freeocc3d
 from freeocc3d.capture import open_capture
@@ -293,3 +293,16 @@ def test_a_color_camera_of_another_focal_length_is_reported_and_corrected(tmp_pa
     (warning,) = (notice.text for notice in notices(found) if notice.code == "color-focal-corrected")
     assert "0.9" in warning
     assert "capture.color_focal=1" in warning
+
+
+def test_a_broken_first_frame_does_not_keep_the_scan_from_telling_its_camera(tmp_path) -> None:
+    """No file states the camera, and the first image is cut off."""
+    room = open_capture("builtin:room", None, {"synthetic": {"frames": 120, "width": 320, "height": 240}})
+    for index in range(30):
+        frame = room[index]
+        write_image(tmp_path / "scan" / "color" / f"{index}.png", frame.color)
+        write_image(tmp_path / "scan" / "depth" / f"{index}.png", (frame.depth_m * 1000).round().astype(np.uint16))
+    truncate(tmp_path / "scan" / "color" / "0.png")
+    made = freeocc3d.reconstruct(tmp_path / "scan", tmp_path / "map", {"fitting": {"passes": 0}})
+    assert {"focal-estimated", "broken-frames"} <= {notice.code for notice in notices(made)}
+    assert made.report["frames"]["broken"] == 1

@@ -54,12 +54,14 @@ class FocalEstimate:
 
 @dataclass(frozen=True)
 class _Matches:
-    """M matched features of two frames: (M, 2) pixels from the image center, and (M,) depths, meters, in both."""
+    """M matched features of two frames: (M, 2) pixels from the image center, and (M,) depths, meters, in both.
+    longer: side of the images, pixels."""
 
     a: NDArray[np.float64]
     b: NDArray[np.float64]
     depth_a: NDArray[np.float64]
     depth_b: NDArray[np.float64]
+    longer: int = 0
 
 
 def estimate_focal(capture: Capture, frames: range) -> FocalEstimate | None:
@@ -68,7 +70,7 @@ def estimate_focal(capture: Capture, frames: range) -> FocalEstimate | None:
     pairs = _matched_pairs(capture, frames)
     if len(pairs) < _LEAST_PAIRS:
         return None
-    longer = max(capture[frames[0]].color.shape[:2])
+    longer = pairs[0].longer
     errors = np.array([[_error(pair, ratio * longer) for ratio in _FOCALS] for pair in pairs])
     best = _minimum(errors.mean(axis=0))
     if best is None:
@@ -129,7 +131,7 @@ def _match(source: tuple[Frame, OrbFeatures], target: tuple[Frame, OrbFeatures])
         return None
     height, width = source[0].color.shape[:2]
     center = np.array(((width - 1) / 2, (height - 1) / 2))
-    return _Matches(a[kept] - center, b[kept] - center, depth_a[kept], depth_b[kept])
+    return _Matches(a[kept] - center, b[kept] - center, depth_a[kept], depth_b[kept], max(width, height))
 
 
 def _look_up(frame: Frame, pixels: NDArray[np.float32]) -> NDArray[np.float64]:
