@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..core.errors import CaptureError, ConfigError
 from ..core.regular_files import read_text
 from ..core.typed_documents import InvalidDocument, parse_json
-from ..core.yaml_documents import InvalidYaml, parse_yaml
+from ..core.yaml_documents import parse_yaml
 from ..settings.presets import find_preset
 from ..settings.registry import nearest
 
@@ -135,7 +135,7 @@ def _content(path: Path) -> Any:
         return parse_yaml(text) if form == "YAML" else [line for line in text.splitlines() if line.strip()]
     except OSError as error:
         raise CaptureError(f"Cannot read the class file {path}: {(error.strerror or str(error)).lower()}.") from error
-    except (InvalidDocument, InvalidYaml, UnicodeDecodeError) as error:
+    except (InvalidDocument, UnicodeDecodeError) as error:
         raise CaptureError(
             f"The class file {path} is not valid {form}: {error}. It must hold 'classes', a list of names."
         ) from error

@@ -15,7 +15,7 @@ from pathlib import Path
 from .errors import ModelError
 from .regular_files import open_regular
 
-_DEEPEST = 32
+_DEEPEST = 100  # as protobuf
 _MOST_MADE = 1 << 28
 """Numbers in the largest tensor that a network may make without an input."""
 _MAKERS = {b"ConstantOfShape": 0, b"Expand": 1, b"Tile": 1}
@@ -34,8 +34,8 @@ graph."""
 
 
 def find_external_files(path: Path) -> list[str]:
-    """The names of the files in which an ONNX file keeps weights, as it states them; those of a file that is not ONNX
-    may be anything. Raises OSError; ModelError if it makes tensors that fill the memory."""
+    """The names of the files in which an ONNX file keeps weights, as it states them. Raises OSError; ModelError if it
+    is not ONNX, or makes tensors that fill the memory."""
     with open_regular(path) as stream:
         if stream.seek(0, 2) == 0:
             return []
@@ -43,10 +43,10 @@ def find_external_files(path: Path) -> list[str]:
             found = _Contents(data)
             try:
                 found.read("model", 0, len(data), 0)
-            except (IndexError, ValueError):  # not ONNX; onnxruntime says why
-                return []
+            except (IndexError, ValueError) as error:
+                raise ModelError(f"{path} is not an ONNX network that can be read.") from error
     if (made := found.largest_made()) > _MOST_MADE:
-        raise ModelError(f"{path} makes a tensor of {made:,} numbers, which no network of ours does.")
+        raise ModelError(f"{path} makes a tensor of {made:,} numbers, larger than any network here needs.")
     return list(dict.fromkeys(found.external))
 
 

@@ -13,16 +13,18 @@ T = TypeVar("T")
 
 _DEEPEST = 100
 _HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
+NOT_TEXT = "it holds bytes that are not text in UTF-8"
 _TOO_DEEP = f"its values are nested more than {_DEEPEST} deep"
 
 
 class InvalidDocument(ValueError):
-    """A document is not JSON, or its content has another type. The message is part of a sentence."""
+    """A document is not JSON or YAML of plain values, or its content has another type. The message is part of a
+    sentence."""
 
 
 def parse_json(text: str | bytes, finite: bool = False) -> Any:
     """The value of a JSON text, at most 100 deep; as Python writes it, with NaN and Infinity unless ``finite``. Raises
-    InvalidDocument, also for a name that stands twice in an object, and for half a character."""
+    InvalidDocument, also for a name that appears twice in an object, and for half a character."""
     refuse = _refuse_constant if finite else None
     try:
         value = json.loads(text, object_pairs_hook=_unique, parse_constant=refuse)
@@ -33,7 +35,7 @@ def parse_json(text: str | bytes, finite: bool = False) -> Any:
     except json.JSONDecodeError as error:
         raise InvalidDocument(f"line {error.lineno}: {error.msg}") from error
     except ValueError as error:  # not UTF-8, or a whole number of thousands of digits
-        raise InvalidDocument("it holds bytes that are not text in UTF-8, or a number without end") from error
+        raise InvalidDocument(f"{NOT_TEXT}, or a whole number of too many digits") from error
     except RecursionError as error:
         raise InvalidDocument(_TOO_DEEP) from error
     level = [value]
@@ -48,7 +50,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         names = Counter(name for name, _ in pairs)
-        raise InvalidDocument(f"'{names.most_common(1)[0][0][:80]}' stands twice")
+        raise InvalidDocument(f"'{names.most_common(1)[0][0][:80]}' appears twice")
     return found
 
 

@@ -11,6 +11,8 @@ from typing import Any
 
 import yaml
 
+from .typed_documents import NOT_TEXT, InvalidDocument
+
 _DEEPEST, _MOST_VALUES, _LONGEST_INT = 100, 1_000_000, 400
 _PARSER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TAG = "tag:yaml.org,2002:"
@@ -18,10 +20,6 @@ _RESOLVERS = yaml.SafeLoader.yaml_implicit_resolvers
 _CONSTRUCTOR = yaml.constructor.SafeConstructor()
 _NO_KEY, _MERGE = object(), object()
 """Stand for the key of a mapping that waits for its next key, and for ``<<``, which merges other mappings into it."""
-
-
-class InvalidYaml(ValueError):
-    """A text is not YAML, or more than plain values. The message says where and what, as part of a sentence."""
 
 
 def dump_yaml(content: Any) -> str:
@@ -38,20 +36,21 @@ def _writable(value: Any) -> Any:
     return [_writable(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
-def parse_yaml(text: str, is_float: Callable[[str], object] = lambda word: False) -> Any:
+def parse_yaml(text: str | bytes, is_float: Callable[[str], object] = lambda word: False) -> Any:
     """The value of a YAML text: None, bool, int of 64 bits, float, str, lists, and dicts by text.
 
     is_float: whether a plain word is a number although YAML 1.1 takes it for text. Aliases count as what they stand
-    for. Raises InvalidYaml.
+    for. Raises InvalidDocument, which says where and what, as part of a sentence.
     """
     try:
+        text = text if isinstance(text, str) else text.decode("utf-8-sig")
         return _Builder(is_float).build(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or getattr(error, "reason", None) or str(error)
-        raise InvalidYaml(f"line {mark.line + 1}: {problem}" if mark else " ".join(str(problem).split())) from error
+        raise InvalidDocument(f"line {mark.line + 1}: {problem}" if mark else " ".join(str(problem).split())) from error
     except UnicodeError as error:
-        raise InvalidYaml("it holds a character that is not text") from error
+        raise InvalidDocument(NOT_TEXT) from error
 
 
 class _Builder:
@@ -86,7 +85,7 @@ class _Builder:
         if self._keys[-1] is _NO_KEY:
             key = _MERGE if event.value == "<<" and event.implicit[0] else event.value
             if key in self._open[-1]:
-                raise _invalid(event, f"the key '{event.value[:80]}' stands twice")
+                raise _invalid(event, f"the key '{event.value[:80]}' appears twice")
             self._keys[-1] = key
             self._counted(event, 1)
             return
@@ -94,7 +93,7 @@ class _Builder:
         self._counted(event, 1)
         if event.anchor:
             self._named[event.anchor] = value, 1
-        self._add(event, value)
+        self._add(value)
 
     def _begin(self, event: Any, container: Any) -> None:
         if self._keys[-1] is _NO_KEY:
@@ -116,16 +115,16 @@ class _Builder:
             self._named[anchor] = value, self._count - before + 1
         if isinstance(value, dict) and _MERGE in value:
             _merge(event, value)
-        self._add(event, value)
+        self._add(value)
 
     def _alias(self, event: Any) -> None:
         if self._keys[-1] is _NO_KEY or event.anchor not in self._named:
             raise _invalid(event, f"the alias *{event.anchor[:80]} stands for nothing")
         value, size = self._named[event.anchor]
         self._counted(event, size)
-        self._add(event, value)
+        self._add(value)
 
-    def _add(self, event: Any, value: Any) -> None:
+    def _add(self, value: Any) -> None:
         container = self._open[-1]
         if isinstance(container, list):
             container.append(value)
@@ -196,5 +195,5 @@ def _whole_number(event: Any, word: str) -> int:
     return value
 
 
-def _invalid(event: Any, what: str) -> InvalidYaml:
-    return InvalidYaml(f"line {event.start_mark.line + 1}: {what}")
+def _invalid(event: Any, what: str) -> InvalidDocument:
+    return InvalidDocument(f"line {event.start_mark.line + 1}: {what}")

@@ -27,6 +27,7 @@ from ..core.compiling import njit
 from ..core.errors import ConfigError, FrameError, FreeOccError
 from ..core.progress import Progress
 from ..core.transforms import back_project, invert, transform
+from ..core.typed_documents import InvalidDocument
 from ..core.types import UNKNOWN, Frame
 from ..core.voxel_keys import KEY_LIMIT, pack_voxels, unpack_voxels
 from ..settings import config
@@ -82,7 +83,10 @@ def build_truth(capture: str | Path, overrides: Sequence[str] = (), progress: Pr
         if name.startswith("capture."):
             of_capture.append(override)
         else:
-            own[name.strip()] = parse_yaml(text)
+            try:
+                own[name.strip()] = parse_yaml(text)
+            except InvalidDocument as error:
+                raise ConfigError(f"The value in '{override}' is not valid YAML.") from error
     options = build_options(Options, own)
     settings = config.load(None, [f"capture.max_depth={options.max_range}", *of_capture])
     opened = open_capture(capture, settings.capture, settings.backends.get("capture"))

@@ -28,7 +28,7 @@ def find_preset(given: str | Path, kind: Literal["configuration", "classes"] = "
     """
     path = Path(given)
     if not is_text(str(given)):
-        raise ConfigError(f"'{shortened(str(given))}' is no name of a file or preset.")
+        raise ConfigError(f"'{shortened(str(given))}' is not the name of a file or preset.")
     if path.suffix or path.is_absolute() or os.path.isfile(path):
         return path
     folders = (FOLDER / "classes",) if kind == "classes" else (FOLDER, FOLDER / _ABLATIONS)

@@ -9,8 +9,8 @@ from typing import Any
 
 from ..core import yaml_documents
 from ..core.errors import ConfigError
-from ..core.regular_files import read_text
-from ..core.yaml_documents import InvalidYaml
+from ..core.regular_files import read_bytes
+from ..core.typed_documents import InvalidDocument
 from .option_types import holds_text, is_list
 
 _MOST_BYTES = 16 << 20
@@ -19,8 +19,8 @@ _FLOAT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
 """1e-4 is a number, as in YAML 1.2; YAML 1.1 requires a decimal point."""
 
 
-def parse_yaml(text: str) -> Any:
-    """The value of a YAML text. Raises InvalidYaml."""
+def parse_yaml(text: str | bytes) -> Any:
+    """The value of a YAML text. Raises InvalidDocument."""
     return yaml_documents.parse_yaml(text, _FLOAT.fullmatch)
 
 
@@ -28,12 +28,10 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     """Reads the sections of a configuration file. Raises ConfigError if it is unreadable, invalid YAML or not a
     mapping."""
     try:
-        loaded = parse_yaml(read_text(path, _MOST_BYTES))
+        loaded = parse_yaml(read_bytes(path, _MOST_BYTES))
     except OSError as error:
         raise ConfigError(f"Cannot read the configuration {path}: {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not valid YAML: it holds bytes that are not text in UTF-8.") from error
-    except InvalidYaml as error:
+    except InvalidDocument as error:
         raise ConfigError(f"{path} is not valid YAML: {error}.") from error
     if loaded is not None and not isinstance(loaded, dict):
         raise ConfigError(f"{path} must contain sections such as 'tracking:', got a {type(loaded).__name__}.")
@@ -48,7 +46,7 @@ def apply_override(values: dict[Any, Any], override: str) -> None:
         raise ConfigError(f"An override has the form section.key=value, got '{override}'.")
     try:
         value = parse_yaml(text)
-    except InvalidYaml as error:
+    except InvalidDocument as error:
         raise ConfigError(f"The value in '{override}' is not valid YAML.") from error
     node = values
     for key in keys[:-1]:
@@ -78,6 +76,6 @@ def named_values(assignments: Iterable[str], kinds: Mapping[str, Any]) -> dict[s
             else:
                 items = [part.strip() for part in text.split(",")]
                 values[name] = items if holds_text(kind) else [parse_yaml(item) for item in items]
-        except InvalidYaml as error:
+        except InvalidDocument as error:
             raise ConfigError(f"The value of '{name}' is not valid YAML: '{text}'.") from error
     return values

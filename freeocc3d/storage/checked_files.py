@@ -47,7 +47,7 @@ class CheckedFiles:
                 stated = self._checksums.get(name)
                 if stated is not None and hash_file(path) != stated:
                     raise MapError(
-                        f"{path} is damaged: it has another checksum than {MANIFEST} states. Copy the whole folder "
+                        f"{path} is damaged: its checksum differs from the one in {MANIFEST}. Copy the whole folder "
                         "again, or map again."
                     )
             except OSError as error:

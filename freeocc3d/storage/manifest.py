@@ -20,7 +20,7 @@ from ..core.errors import MapError
 from ..core.regular_files import read_bytes
 from ..core.transforms import is_rigid
 from ..core.typed_documents import InvalidDocument, as_type
-from ..core.yaml_documents import InvalidYaml, dump_yaml, parse_yaml
+from ..core.yaml_documents import dump_yaml, parse_yaml
 from .map_files import MANIFEST
 
 FORMAT_VERSION = 3
@@ -211,20 +211,18 @@ def read_manifest(folder: Path) -> Manifest:
         raise MapError(f"The map folder {folder} does not exist.")
     try:
         data = read_bytes(path, _MOST_BYTES)
-        content = parse_yaml(data.decode("utf-8-sig"))
+        content = parse_yaml(data)
     except FileNotFoundError as error:
         raise MapError(f"{folder} is not a map: it has no {MANIFEST}.") from error
     except OSError as error:
         raise MapError(f"{path} cannot be read: {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise MapError(f"{path} is damaged: it holds bytes that are not text in UTF-8.") from error
-    except InvalidYaml as error:
+    except InvalidDocument as error:
         raise MapError(f"{path} is damaged: {error}.") from error
     body, seal, stated = data.rpartition(_SEAL)
     if seal and stated.strip() != hash_bytes(body).encode():
         raise MapError(
             f"{path} is damaged or was changed: its last line states another checksum. Copy the whole folder "
-            "again; who changed it on purpose removes that line."
+            "again; if you changed it on purpose, remove that line."
         )
     version = content.get("format_version") if isinstance(content, dict) else None
     if not isinstance(version, int) or isinstance(version, bool):
@@ -239,12 +237,12 @@ def read_manifest(folder: Path) -> Manifest:
         manifest = as_type(content, Manifest)
     except InvalidDocument as error:
         raise MapError(f"{path} is damaged: {error}.") from error
-    if problem := _problem(manifest, folder):
+    if problem := _problem(manifest):
         raise MapError(f"{path} is damaged: {problem}.")
     return manifest
 
 
-def _problem(manifest: Manifest, folder: Path) -> str:
+def _problem(manifest: Manifest) -> str:
     """The problem of a manifest whose types are right; empty if it has none."""
     counts, keyframes = manifest.counts, np.array(manifest.keyframes, np.int64)
     ratio = manifest.voxel_size_m / manifest.finest_m

@@ -79,10 +79,18 @@ def test_damaged_files_are_no_networks(tmp_path: Path, cut: int) -> None:
         load_network(path)
 
 
-@pytest.mark.parametrize("content", [b"\xff" * 100, b"\x3a\xff\xff\xff\xff\x0f", b"\x3a\x02" * 999, b"x", bytes(50)])
-def test_bytes_that_are_no_messages_name_no_files(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize("content", [b"\xff" * 100, b"\x3a\xff\xff\xff\xff\x0f", b"\x3a\x02" * 999, b"x"])
+def test_bytes_that_are_no_messages_are_no_network(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.onnx").write_bytes(content)
+    with pytest.raises(ModelError, match=r"a\.onnx is not an ONNX network"):
+        find_external_files(tmp_path / "a.onnx")
+
+
+def test_zeros_name_no_files_and_are_no_network(tmp_path: Path) -> None:
+    (tmp_path / "a.onnx").write_bytes(bytes(50))
     assert find_external_files(tmp_path / "a.onnx") == []
+    with pytest.raises(ModelError, match=r"a\.onnx is not an ONNX network"):
+        load_network(tmp_path / "a.onnx")
 
 
 def test_deep_nesting_ends(tmp_path: Path) -> None:
@@ -94,6 +102,5 @@ def test_deep_nesting_ends(tmp_path: Path) -> None:
                 varint, size = varint + bytes([size & 127 | 128]), size >> 7
             inner = tag + varint + bytes([size]) + inner
     (tmp_path / "a.onnx").write_bytes(b"\x3a" + inner[1:])
-    assert find_external_files(tmp_path / "a.onnx") == []
     with pytest.raises(ModelError, match="is not an ONNX network"):
         load_network(tmp_path / "a.onnx")

@@ -20,7 +20,7 @@ class Cup(msgspec.Struct):
         ("[" * 200 + "]" * 200, "nested more than 100 deep"),
         ("[" * 100_000, "nested more than 100 deep"),
         ('{"a":' * 150 + "1" + "}" * 150, "nested more than 100 deep"),
-        ("9" * 5000, "number without end"),
+        ("9" * 5000, "a whole number of too many digits"),
         (b'"\xff"', "not text in UTF-8"),
         ("", "line 1"),
         ("\ufeff1", "line 1"),

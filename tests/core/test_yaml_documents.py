@@ -8,7 +8,8 @@ import pytest
 import yaml
 
 from freeocc3d.core.regular_files import stored_path
-from freeocc3d.core.yaml_documents import InvalidYaml, dump_yaml, parse_yaml
+from freeocc3d.core.typed_documents import InvalidDocument
+from freeocc3d.core.yaml_documents import dump_yaml, parse_yaml
 
 SOUND = (
     "",
@@ -66,14 +67,14 @@ def test_keys_and_dates_are_text() -> None:
     assert parse_yaml("1: a\nyes: b\n2024-01-01: 2024-01-01") == {"1": "a", "yes": "b", "2024-01-01": "2024-01-01"}
     assert parse_yaml("d: '2024-13-45'\ne: =") == {"d": "2024-13-45", "e": "="}
     for impossible in ("d: 2024-13-45", "d: !!timestamp x"):
-        with pytest.raises(InvalidYaml, match=r"line 1: '.*' is not a timestamp"):
+        with pytest.raises(InvalidDocument, match=r"line 1: '.*' is not a timestamp"):
             parse_yaml(impossible)
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a: 1\na: 2", "line 2: the key 'a' stands twice"),
+        ("a: 1\na: 2", "line 2: the key 'a' appears twice"),
         ("a:\n  - !!int abc", "line 2: 'abc' is not a whole number"),
         ("!!float x", "'x' is not a float"),
         ("!!bool x", "'x' is not a bool"),
@@ -102,15 +103,22 @@ def test_keys_and_dates_are_text() -> None:
     ],
 )
 def test_what_is_more_than_plain_values_is_refused_with_the_line(text: str, said: str) -> None:
-    with pytest.raises(InvalidYaml, match=said) as raised:
+    with pytest.raises(InvalidDocument, match=said) as raised:
         parse_yaml(text)
     assert "\n" not in str(raised.value)
+
+
+def test_bytes_are_text_in_utf_8_with_or_without_a_mark() -> None:
+    for data in ("a: é".encode(), "a: é".encode("utf-8-sig")):
+        assert parse_yaml(data) == {"a": "é"}
+    with pytest.raises(InvalidDocument, match="bytes that are not text in UTF-8"):
+        parse_yaml(b"a: \xe9")
 
 
 def test_laughs_are_counted() -> None:
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 12)]
-    with pytest.raises(InvalidYaml, match="more than 1,000,000 values"):
+    with pytest.raises(InvalidDocument, match="more than 1,000,000 values"):
         parse_yaml("\n".join(lines))
     assert len(parse_yaml("\n".join(lines[:4]))) == 4
 

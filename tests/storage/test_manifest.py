@@ -62,7 +62,7 @@ def test_who_edits_the_manifest_removes_its_checksum(tmp_path: Path) -> None:
     path = tmp_path / "map.yaml"
     edited = path.read_text().replace("camera to world", "world to camera")
     path.write_text(edited)
-    with pytest.raises(MapError, match="removes that line"):
+    with pytest.raises(MapError, match="remove that line"):
         read_manifest(tmp_path)
     path.write_text("\n".join(edited.splitlines()[:-1]))
     assert read_manifest(tmp_path).poses == "world to camera"
@@ -161,7 +161,7 @@ def test_a_key_that_every_map_has_is_missed(tmp_path: Path) -> None:
         ("voxel_size_m: !!bool x", "'x' is not a bool"),
         ("voxel_size_m: " + "9" * 5000, "64 bits"),
         ("voxel_size_m: " + "[" * 3000, "line"),
-        ("voxel_size_m: 0.1\nvoxel_size_m: 0.2", "the key 'voxel_size_m' stands twice"),
+        ("voxel_size_m: 0.1\nvoxel_size_m: 0.2", "the key 'voxel_size_m' appears twice"),
         ("voxel_size_m: &a [*a]", "stands for nothing"),
         ("? [voxel_size_m]\n: 3", "a key is a list"),
         ("voxel_size_m: \x00", "map.yaml"),

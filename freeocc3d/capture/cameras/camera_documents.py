@@ -25,7 +25,7 @@ from ...core.errors import CaptureError
 from ...core.image_files import Size
 from ...core.transforms import invert, is_rigid
 from ...core.typed_documents import InvalidDocument, parse_json
-from ...core.yaml_documents import InvalidYaml, parse_yaml
+from ...core.yaml_documents import parse_yaml
 from ..files.number_files import read_text
 from .camera_files import Calibration
 from .lenses import Lens
@@ -132,7 +132,7 @@ def _yaml(text: str) -> Any:
     parts = re.split(r"(?m)^---\s*$", "\n".join(lines))
     try:
         content = parse_yaml(next((part for part in parts if part.strip()), ""))
-    except InvalidYaml:
+    except InvalidDocument:
         return None
     return content if isinstance(content, dict) else None
 

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import CaptureError
-from ...core.regular_files import check_content, open_regular, read_text
-from ...core.yaml_documents import InvalidYaml, parse_yaml
+from ...core.regular_files import check_content, open_regular, read_bytes
+from ...core.typed_documents import InvalidDocument
+from ...core.yaml_documents import parse_yaml
 from ..files.file_bytes import DamagedFile
 from ..files.numbered_files import list_folder
 from . import bag1_store, database_store, mcap_store
@@ -94,8 +95,8 @@ def _read_metadata(folder: Path) -> dict[str, Any]:
     if not (folder / METADATA).exists():
         return {}
     try:
-        stated = parse_yaml(read_text(folder / METADATA, _METADATA_BYTES))
-    except (InvalidYaml, UnicodeDecodeError) as error:
+        stated = parse_yaml(read_bytes(folder / METADATA, _METADATA_BYTES))
+    except InvalidDocument as error:
         raise DamagedFile(f"its {METADATA} is damaged ({error}): run ros2 bag reindex") from error
     found = stated.get("rosbag2_bagfile_information") if isinstance(stated, dict) else None
     if not isinstance(found, dict):
