@@ -10,6 +10,7 @@ from .errors import printable
 Code = Literal[
     "option-renamed",
     "option-removed",
+    "option-clamped",
     "images-left-out",
     "images-unreadable",
     "depth-scale-doubtful",

@@ -20,7 +20,7 @@ from ..core.errors import ConfigError
 from ..core.warnings import Notice
 from ..core.yaml_documents import dump_yaml
 from . import registry, renamed, stages
-from .option_types import converted, shown
+from .option_types import clamped, converted, shown
 from .presets import find_preset
 from .typed_options import TypedOptions, build, field_types, nearest, shortened
 from .yaml_files import apply_override, read_yaml
@@ -69,7 +69,7 @@ class Settings(msgspec.Struct, frozen=True):
     backends: dict[str, BackendValues] = {}
     """Section -> the values given for its backends; other options have their defaults."""
     notices: tuple[Notice, ...] = ()
-    """Warnings about names that changed."""
+    """Warnings about names that changed, and about values of an older map that are out of today's ranges."""
 
     def changed(self, section: str, **values: Any) -> Settings:
         """Returns a copy with other values in a section (a field of this class). Raises ConfigError."""
@@ -162,8 +162,9 @@ def load(path: Path | None, overrides: Iterable[str] = ()) -> Settings:
 def load_saved(path: Path, overrides: Iterable[str] = ()) -> Settings:
     """Reads the configuration that a map was made with; overrides are as in ``load``.
 
-    It was checked then. Options of backends that it does not select are left out; those of the selected ones are
-    checked when the backends are used.
+    Numbers that an earlier release took and that are out of today's ranges count as the nearest end of them; a notice
+    says so. Options of backends that it does not select are left out; those of the selected ones are checked when the
+    backends are used. Raises ConfigError.
     """
     try:
         saved = _resolve(read_yaml(path), saved=True)
@@ -173,7 +174,7 @@ def load_saved(path: Path, overrides: Iterable[str] = ()) -> Settings:
     overrides = list(overrides)
     for override in overrides:
         apply_override(values, override)
-    return resolve(values) if overrides else saved
+    return msgspec.structs.replace(resolve(values), notices=saved.notices) if overrides else saved
 
 
 def resolve(values: Mapping[str, Any] | Settings) -> Settings:
@@ -203,19 +204,22 @@ def fingerprint(settings: Settings, sections: Iterable[str], *identity: Any) -> 
 
 
 def _resolve(values: Mapping[Any, Any], saved: bool) -> Settings:
-    """saved: the values come from a map's file, so old names give no warning."""
+    """saved: the values come from a map's file, so old names give no warning, and numbers are brought into range."""
     outer = [name for name, section in SECTIONS.items() if not section.within]
     for name in values:
         if name not in outer:
             raise ConfigError(f"Unknown section '{shortened(name)}'{nearest(name, outer)}.")
     found: dict[str, Any] = {"backends": {}}
     notices: list[Notice] = []
+    out_of_range: list[Notice] = []
     for name in outer:
         section, where = SECTIONS[name], f"{name}."
         given = renamed.current_keys(_section(values, name), where, notices)
         nested = [inner for inner, other in SECTIONS.items() if other.within == name]
         for inner in nested:
             below = renamed.current_keys(_lines(given.pop(inner, None), where + inner), f"{where}{inner}.", notices)
+            if saved:
+                below = _in_range(SECTIONS[inner].options, below, f"{where}{inner}.", out_of_range)
             found[inner] = build(SECTIONS[inner].options, below, f"{where}{inner}.")
         own, backends = _divided(name, given, nested, notices)
         if section.choice and isinstance(own.get(section.choice), str):
@@ -223,6 +227,8 @@ def _resolve(values: Mapping[Any, Any], saved: bool) -> Settings:
             named = f"{where}{section.choice}="
             notices += renamed.compare_names(named + own[section.choice], named + current)
             own[section.choice] = current
+        if saved:
+            own = _in_range(section.options, own, where, out_of_range)
         found[name] = build(section.options, own, where)
         if saved and section.choice:
             chosen = getattr(found[name], section.choice)
@@ -231,7 +237,19 @@ def _resolve(values: Mapping[Any, Any], saved: bool) -> Settings:
             backends = {backend: _checked(name, backend, lines) for backend, lines in backends.items()}
         if backends := {backend: lines for backend, lines in backends.items() if lines}:
             found["backends"][name] = backends
-    return Settings(**found, notices=() if saved else tuple(notices))
+    return Settings(**found, notices=tuple(out_of_range if saved else notices))
+
+
+def _in_range(options: type[TypedOptions], values: dict[Any, Any], where: str, notices: list[Notice]) -> dict[Any, Any]:
+    """The values, with numbers brought into the ranges of their options. notices: receives one for each."""
+    types, found = field_types(options), dict(values)
+    for key, value in values.items():
+        fitting = clamped(types[key], value) if key in types else value
+        if fitting != value:
+            found[key] = fitting
+            said = f"'{where}{key}' of this map was {shown(value)}, which is out of range: {shown(fitting)} is used."
+            notices.append(Notice("option-clamped", said))
+    return found
 
 
 def _divided(

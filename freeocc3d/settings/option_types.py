@@ -88,6 +88,19 @@ def converted(kind: Any, value: Any, name: str) -> Any:
         raise ConfigError(f"'{name}' must be {_expected(kind, value)}, got {shown(value)}.") from None
 
 
+def clamped(kind: Any, value: Any) -> Any:
+    """A number that is out of the range of its type, at the nearest end of it; any other value as it is."""
+    if not _is_number(value) or not math.isfinite(value):
+        return value
+    for part in _parts(kind):
+        if _base(part) is float or (_base(part) is int and isinstance(value, int)):
+            for meta in _metas(part):
+                value = meta.ge if meta.ge is not None and value < meta.ge else value
+                value = meta.le if meta.le is not None and value > meta.le else value
+            return value
+    return value
+
+
 def described(kind: Any) -> str:
     """Describes a type in words, such as "a number greater than 0 or null"."""
     return _listed(_alternatives(kind))

@@ -277,6 +277,28 @@ def test_a_saved_configuration_is_read_without_what_it_does_not_choose(tmp_path:
         config.load_saved(path, ["occupancy.treshold=0.4"])
 
 
+def test_numbers_of_an_older_map_are_brought_into_range(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "c.yaml",
+        "carving: {noise: 2, min_free: 0, margin: 1}\ntracking: {stereo: {size: 1}}\noccupancy: {finest: null}\n",
+    )
+    with pytest.raises(ConfigError, match=r"'tracking\.stereo\.size' must be from 64"):
+        config.load(path)
+    for settings in (config.load_saved(path), config.load_saved(path, ["occupancy.threshold=0.4"])):
+        assert (settings.carving.noise, settings.carving.min_free, settings.carving.margin) == (0.1, 1, 1.0)
+        assert settings.stereo.size > 1
+        assert {notice.code for notice in settings.notices} == {"option-clamped"}
+        assert [notice.text.split("'")[1] for notice in settings.notices] == [
+            "tracking.stereo.size",
+            "carving.noise",
+            "carving.min_free",
+        ]
+        assert "was 2, which is out of range: 0.1 is used" in settings.notices[1].text
+    for wrong in ("noise: x", "noise: .nan", "noise: [2]", "noise: true"):
+        with pytest.raises(ConfigError, match=r"'carving\.noise' must be"):
+            config.load_saved(write(tmp_path / "d.yaml", f"carving: {{{wrong}}}\n"))
+
+
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 
