@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
-_CGROUPS = (
-    (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
-    (Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"), Path("/sys/fs/cgroup/memory/memory.usage_in_bytes")),
-)
-"""Limit and use of a container, of version 2 and 1 of Linux's control groups."""
+from .control_groups import MEMBERSHIP, MOUNT, find_groups, read_line
+
+_FILES = {1: ("memory.limit_in_bytes", "memory.usage_in_bytes"), 2: ("memory.max", "memory.current")}
+"""Files with the limit and the use of a group, for each version of Linux's control groups."""
 _UNKNOWN = 1 << 62
 
 
 def available_memory() -> int:
-    """Bytes that can be taken: those that the machine has free, and at most those that its container leaves. A very
+    """Bytes that can be taken: those that the machine has free, and at most those that its containers leave. A very
     large number where neither is known."""
-    available = _free()
-    for limit, current in _CGROUPS:
-        most, used = _number(limit), _number(current)
+    return min([_free(), *_left(MEMBERSHIP, MOUNT)])
+
+
+def _left(membership: Path, mount: Path) -> Iterator[int]:
+    """Yield the bytes that each control group of this process leaves, if it sets a limit."""
+    for folder, version in find_groups("memory", membership, mount):
+        most, used = (_number(folder / name) for name in _FILES[version])
         if most is not None and used is not None:
-            available = min(available, max(most - used, 0) + _reclaimable(limit.parent))
-    return available
+            yield max(most - used, 0) + _reclaimable(folder)
 
 
 def _free() -> int:
@@ -42,8 +45,5 @@ def _reclaimable(folder: Path) -> int:
 
 
 def _number(path: Path) -> int | None:
-    try:
-        text = path.read_text(encoding="ascii").strip()
-    except (OSError, UnicodeDecodeError):
-        return None
+    text = read_line(path) or ""
     return int(text) if text.isdecimal() else None

@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-_MOUNT = Path("/sys/fs/cgroup")
+from .control_groups import MEMBERSHIP, MOUNT, find_groups, read_line
 
 _POOLS = (
     "OMP_NUM_THREADS",  # torch, Open3D
@@ -23,7 +23,7 @@ _POOLS = (
 def count_threads() -> int:
     """Number of processors that this process may use, at least 1: those of its affinity, limited by the CPU quota of
     its control groups, rounded up, and by ``$OMP_NUM_THREADS``. Containers set the quota (``docker run --cpus``)."""
-    quotas = (math.ceil(quota) for quota in _quotas(Path("/proc/self/cgroup"), _MOUNT))
+    quotas = (math.ceil(quota) for quota in _quotas(MEMBERSHIP, MOUNT))
     return max(1, min([len(os.sched_getaffinity(0)), *quotas, *_wish()]))
 
 
@@ -42,36 +42,19 @@ def _wish() -> Iterator[int]:
 
 
 def _quotas(membership: Path, mount: Path) -> Iterator[float]:
-    """Yield the number of processors that each control group of this process allows, if it sets a limit.
-
-    membership: lines of hierarchy:controllers:path (man 7 cgroups).  mount: mount point of the hierarchies.
-    """
-    for line in (_read(membership) or "").splitlines():
-        _, _, rest = line.partition(":")
-        controllers, _, path = rest.partition(":")
-        if controllers and "cpu" not in controllers.split(","):
-            continue
-        root = mount / controllers if controllers else mount
-        own = root / path.lstrip("/")
-        for group in (own, *(parent for parent in own.parents if parent.is_relative_to(root))):
-            with contextlib.suppress(ValueError, ZeroDivisionError):  # not the file that Linux writes
-                quota = _version_1(group) if controllers else _version_2(group)
-                if quota is not None:
-                    yield quota
+    """Yield the number of processors that each control group of this process allows, if it sets a limit."""
+    for group in find_groups("cpu", membership, mount):
+        with contextlib.suppress(ValueError, ZeroDivisionError):  # not the file that Linux writes
+            quota = _version_1(group.folder) if group.version == 1 else _version_2(group.folder)
+            if quota is not None:
+                yield quota
 
 
 def _version_1(group: Path) -> float | None:
-    quota, period = (_read(group / f"cpu.cfs_{name}_us") for name in ("quota", "period"))
+    quota, period = (read_line(group / f"cpu.cfs_{name}_us") for name in ("quota", "period"))
     return int(quota) / int(period) if quota and period and int(quota) > 0 else None
 
 
 def _version_2(group: Path) -> float | None:
-    quota, _, period = (_read(group / "cpu.max") or "max").partition(" ")
+    quota, _, period = (read_line(group / "cpu.max") or "max").partition(" ")
     return int(quota) / int(period) if quota != "max" else None
-
-
-def _read(path: Path) -> str | None:
-    try:
-        return path.read_text(encoding="ascii").strip()
-    except OSError:
-        return None
