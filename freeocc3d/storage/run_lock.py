@@ -1,10 +1,11 @@
 """The lock of a work folder: one process at a time writes a map. The system releases it when its process ends, however
-that ends, so that no lock is ever stale."""
+that ends, so that no lock is ever stale. Where the file system has no locks, runs are not kept apart."""
 
 from __future__ import annotations
 
 import contextlib
 import datetime
+import errno
 import fcntl
 import json
 import os
@@ -49,7 +50,7 @@ class RunLock:
         except FileNotFoundError:
             return -1
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _flock(descriptor)
             if _same_file(path, descriptor):
                 said = {"process": os.getpid(), "host": socket.gethostname(), "since": _now()}
                 os.ftruncate(descriptor, 0)
@@ -76,6 +77,15 @@ class RunLock:
                 (self.folder / LOCK).unlink()
         os.close(self._descriptor)
         self._descriptor = -1
+
+
+def _flock(descriptor: int) -> None:
+    """Lock an open file; nothing on a file system without locks, as some of networks are. Raises OSError."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP):
+            raise
 
 
 def _same_file(path: Path, descriptor: int) -> bool:

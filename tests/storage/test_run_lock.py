@@ -1,5 +1,7 @@
 """One run at a time writes a map; a lock ends with its process."""
 
+import errno
+import fcntl
 import os
 import signal
 import subprocess
@@ -57,6 +59,23 @@ def test_what_is_in_the_place_of_the_lock_is_not_written_to(tmp_path: Path) -> N
         with pytest.raises(OSError, match=r"."):
             RunLock(tmp_path / name)
     assert (tmp_path / "precious").read_text() == "mine"
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_file_system_without_locks_is_used_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def refuse(descriptor: int, operation: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    held = RunLock(tmp_path / "work")
+    assert (tmp_path / "work" / LOCK).is_file()
+    held.release()
+    assert list((tmp_path / "work").iterdir()) == []
+    number = errno.EIO
+    with pytest.raises(OSError, match=os.strerror(errno.EIO)):
+        RunLock(tmp_path / "work")
 
 
 def test_the_holder_of_an_unreadable_lock_is_another_run(tmp_path: Path) -> None:
