@@ -27,6 +27,7 @@ from ..settings import config
 from ..settings.config import Settings
 from . import map_files
 from .manifest import read_manifest
+from .output_folder import follow_link, refuse_output
 from .run_lock import LOCK, RunLock
 
 Stage = Literal["tracking", "gaussians", "language", "map"]
@@ -77,12 +78,13 @@ class WorkFolder:
 
     @classmethod
     def open(cls, output: Path, overwrite: bool, resume: bool) -> WorkFolder:
-        """Lock the work folder of a map; change nothing else but what a killed run forgot to clean up. Raises MapError
-        if a map, an interrupted run or a running one is in the way."""
+        """Lock the work folder of a map; change nothing else but what a killed run forgot to clean up. A link to a map
+        stands for that map. Raises MapError if a map, an interrupted run or a running one is in the way."""
+        output = follow_link(output)
         if not output.name:
             raise MapError(f"'{output}' cannot be the name of a map folder.")
         folder = output.with_name(output.name + ".partial")
-        _refuse_output(output, overwrite)
+        refuse_output(output, overwrite)
         _refuse_strange(folder)
         try:
             lock = RunLock(folder)
@@ -90,7 +92,7 @@ class WorkFolder:
             raise MapError(f"Cannot create {folder}: {error.strerror}.") from error
         try:
             _put_back(output)
-            _refuse_output(output, overwrite)
+            refuse_output(output, overwrite)
             if (folder / _MARKS).is_file() and not (resume or overwrite):
                 raise MapError(
                     f"{folder} holds the work of an interrupted run: continue with --resume, or start again with "
@@ -278,8 +280,9 @@ class WorkFolder:
         self._mark("map", map_files.MANIFEST)
 
     def finish(self, output: Path) -> None:
-        """Give the work folder the map's name. At every moment the folder of that name is the old or the new map, and
-        the work can be resumed until it is the new one. Raises OSError."""
+        """Give the work folder the map's name; a link stands for what it leads to. At every moment the folder of that
+        name is the old or the new map, and the work can be resumed until it is the new one. Raises OSError."""
+        output = follow_link(output)
         listed = {map_files.MANIFEST, *read_manifest(self.folder).files}
         for path in self.folder.rglob("*"):
             name = path.relative_to(self.folder).as_posix()
@@ -350,18 +353,15 @@ def _read_marks(path: Path) -> dict[Stage, _Mark]:
     return msgspec.json.decode(unseal(read_bytes(path, _LARGEST_MARKS)), type=dict[Stage, _Mark])
 
 
-def _refuse_output(output: Path, overwrite: bool) -> None:
-    if output.exists() and not overwrite:
-        raise MapError(f"{output} exists: choose another folder, or replace it with --overwrite.")
-    if output.exists() and not (output / map_files.MANIFEST).is_file():
-        raise MapError(f"{output} is not a map, so it is not overwritten: choose another folder.")
-
-
 def _refuse_strange(folder: Path) -> None:
     """Raise MapError if the folder is there but holds other things than an interrupted run."""
     if not (folder.exists() or folder.is_symlink()):
         return
-    known = folder.is_dir() and all(path.name in _OWN_FILES or is_temporary(path) for path in folder.iterdir())
+    known = (
+        not folder.is_symlink()
+        and folder.is_dir()
+        and all(path.name in _OWN_FILES or is_temporary(path) for path in folder.iterdir())
+    )
     if not known:
         raise MapError(f"{folder} is in the way and holds no interrupted run: move it, or choose another.")
 

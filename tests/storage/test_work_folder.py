@@ -205,3 +205,30 @@ def test_a_stopped_run_goes_on_with_other_options_of_later_layers(tmp_path, comp
     other = {**FEW, "carving": {"noise": 0.02}}
     made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", other, resume=True)
     assert content(made.path) == content(freeocc3d.reconstruct("builtin:room", tmp_path / "anew", other).path)
+
+
+def test_a_link_stands_for_the_map_to_which_it_leads(tmp_path, whole) -> None:
+    disk = tmp_path / "disk"
+    shutil.copytree(whole, disk / "stored")
+    (tmp_path / "map").symlink_to(disk / "stored")
+    other = {**FEW, "capture": {**FEW["capture"], "stop": 4}}
+    with pytest.raises(MapError, match="--overwrite"):
+        freeocc3d.reconstruct("builtin:room", tmp_path / "map", other)
+    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", other, overwrite=True)
+    assert made.manifest.counts.frames_with_pose == 4
+    assert (tmp_path / "map").is_symlink()
+    assert sorted(path.name for path in (*tmp_path.iterdir(), *disk.iterdir())) == ["disk", "map", "stored"]
+    assert freeocc3d.load_map(disk / "stored").manifest.counts.frames_with_pose == 4
+
+
+def test_links_that_lead_nowhere_or_stand_for_the_work_are_refused(tmp_path, stopped) -> None:
+    (tmp_path / "one").symlink_to(tmp_path / "other")
+    (tmp_path / "other").symlink_to(tmp_path / "one")
+    with pytest.raises(MapError, match="a link that leads nowhere"):
+        freeocc3d.reconstruct("builtin:room", tmp_path / "one", FEW)
+    (tmp_path / "map.partial").symlink_to(stopped)
+    before = listing(stopped)
+    for options in ({"resume": True}, {"overwrite": True}):
+        with pytest.raises(MapError, match="in the way"):
+            freeocc3d.reconstruct("builtin:room", tmp_path / "map", FEW, **options)
+    assert listing(stopped) == before
