@@ -25,7 +25,7 @@ from .harness import Attack, Silent
 SHORT = 3
 
 SETTINGS: dict[str, Any] = {
-    "capture": {"synthetic": {"frames": 120, "width": 96, "height": 72}, "stop": 12},
+    "capture": {"synthetic": {"frames": 120, "width": 96, "height": 72}, "stop": 12, "color_focal": 1},
     "fitting": {"passes": 1},
 }
 STAGES = ("refinement", "gaussians", "language", "occupancy", "saving", "finish")

@@ -35,7 +35,7 @@ from .harness import Attack, Silent, command
 SHORT = 40
 
 _SETTINGS: dict[str, Any] = {
-    "capture": {"stop": 8, "synthetic": {"frames": 60, "width": 80, "height": 60}},
+    "capture": {"stop": 8, "color_focal": 1, "synthetic": {"frames": 60, "width": 80, "height": 60}},
     "occupancy": {"voxel_size": 0.1},
     "fitting": {"passes": 1},
 }

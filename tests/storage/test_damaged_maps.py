@@ -25,7 +25,7 @@ FILES = ("map.yaml", "config.yaml", "report.json", "trajectory.txt", "gaussians.
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     settings = {
-        "capture": {"stop": 6, "synthetic": {"frames": 60, "width": 80, "height": 60}},
+        "capture": {"stop": 6, "color_focal": 1.0, "synthetic": {"frames": 60, "width": 80, "height": 60}},
         "fitting": {"passes": 1},
     }
     return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", settings).path

@@ -23,9 +23,10 @@ from freeocc3d.viewer import answer_page
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Map:
     settings = {
-        "capture": {"stride": 24, "synthetic": {"width": 160, "height": 120}}, "tracking": {"backend": "known"},
+        "capture": {"stride": 24, "color_focal": 1.0, "synthetic": {"width": 160, "height": 120}},
+        "tracking": {"backend": "known"},
         "fitting": {"passes": 0},
-    }  # fmt: skip
+    }
     return reconstruct("builtin:room", tmp_path_factory.mktemp("page") / "room", settings)
 
 
