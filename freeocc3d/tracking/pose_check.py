@@ -53,6 +53,9 @@ _SAME_UNIT = 0.15
 _APART_M = 0.05
 """Frames that are nearer to each other tell no unit, meters."""
 
+_LEAST_UNITS = 12
+"""Smallest number of pairs that tells another unit of poses that agree; the pairs of a short walk share their error."""
+
 _SURE_UNIT = 0.3
 """Largest spread of the middle half of the pairs' units, as a share of their median, that tells a unit."""
 
@@ -204,7 +207,7 @@ def _has_other_unit(predicted: Poses, motions: _Motions) -> bool:
     """Whether the pairs agree on another unit of the translations than a meter. Turns may dominate the motion, so that
     poses in slightly other units agree well enough otherwise."""
     units = _units(predicted, motions)
-    if len(units) < _LEAST_PAIRS:
+    if len(units) < _LEAST_UNITS:
         return False
     low, unit, high = np.quantile(units, (0.25, 0.5, 0.75))
     return bool(unit > 0 and high - low < _SURE_UNIT * unit and abs(np.log(unit)) > np.log(1 + _SAME_UNIT))
