@@ -63,7 +63,7 @@ def test_points_of_the_tracker_are_taken_and_frames_get_depth(tmp_path: Path, mo
 
 def test_a_tracker_without_poses_ahead_is_refused(tmp_path: Path) -> None:
     source = stereo_source.StereoSource(ColorOnly(), Options())
-    with pytest.raises(TrackingError, match=r"tracking\.backend=colmap"):
+    with pytest.raises(TrackingError, match=r"leave tracking\.backend at auto"):
         source.prepare(FrameByFrame(POSES, 0.85), tmp_path, range(3), Progress())
 
 
