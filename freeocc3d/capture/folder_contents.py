@@ -12,14 +12,14 @@ from ..core.errors import FrameError
 from ..core.image_files import PNG_START, Size
 from ..core.regular_files import IMAGE_BYTES, open_regular
 from .files.numbered_files import list_folder
-from .images.image_decoding import image_size
+from .images.depth_decoding import SUFFIXES as DEPTH_SUFFIXES
+from .images.heif_files import HEIF_SUFFIXES
+from .images.image_decoding import COLOR_SUFFIXES, image_size
 
 Kind = Literal["color", "depth", "confidence"]
 
-COLOR_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif"})
-FLOAT_SUFFIXES = frozenset({".exr", ".npy", ".npz", ".pfm"})
-
-_SUFFIXES = (*COLOR_SUFFIXES, *FLOAT_SUFFIXES, ".pgm")
+_SUFFIXES = (*COLOR_SUFFIXES, *HEIF_SUFFIXES, *DEPTH_SUFFIXES)
+_DEPTH_ALONE = DEPTH_SUFFIXES - set(COLOR_SUFFIXES)
 
 _CONFIDENCE = re.compile(r"conf", re.IGNORECASE)
 _DEPTH = re.compile(r"depth|disp", re.IGNORECASE)
@@ -81,14 +81,14 @@ def _group(folder: Path, names: list[str]) -> ImageFolder:
     suffix = Counter(Path(name).suffix.lower() for name in names).most_common(1)[0][0]
     first = folder / next(name for name in names if name.lower().endswith(suffix))
     try:
-        size = image_size(first) if suffix in COLOR_SUFFIXES - {".heic", ".heif"} else None
+        size = image_size(first) if suffix in COLOR_SUFFIXES else None
     except FrameError:
         size = None
     return ImageFolder(folder, _kind(first), len(names), suffix, size)
 
 
 def _kind(file: Path) -> Kind:
-    if file.suffix.lower() in FLOAT_SUFFIXES | {".pgm"}:
+    if file.suffix.lower() in _DEPTH_ALONE:
         return "depth"
     try:
         with open_regular(file, IMAGE_BYTES) as stream:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..core.image_files import MOST_PIXELS, Size
 from ..core.regular_files import IMAGE_BYTES, open_regular
+from ..core.sampling import spread_evenly
 from ..core.types import Intrinsics
 from .cameras.camera_files import DIAGONAL_35MM, convert_35mm
 from .cameras.lenses import Lens
@@ -97,7 +98,7 @@ def find_common_lens(headers: Sequence[Header], size: Size) -> Intrinsics | None
 def read_rough_lens(paths: Sequence[Path], size: Size) -> Lens | None:
     """The lens whose focal length the EXIF data of a few images of ``size`` state; None if they state none, or several.
     It is accurate to a few percent."""
-    rows = np.unique(np.linspace(0, len(paths) - 1, min(_SAMPLES, len(paths))).astype(int)).tolist()
+    rows = spread_evenly(len(paths), _SAMPLES)
     headers = [header for row in rows if (header := read_header(paths[row])) is not None]
     camera = find_common_lens(headers, size)
     return None if camera is None else Lens(camera)

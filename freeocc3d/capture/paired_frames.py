@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, FrameError
 from ..core.image_files import Size
+from ..core.sampling import spread_evenly
 from .base import Options
 from .cameras.camera_discovery import FoundCameras, find_cameras, find_frame_files
 from .cameras.camera_documents import read_cameras
@@ -123,7 +124,7 @@ def _cameras(
 def _check_depth(depth: list[Path], path: Path) -> None:
     """Raise CaptureError if the files hold no depth, such as pictures of it, according to a few of them."""
     reason = ""
-    for row in np.unique(np.linspace(0, len(depth) - 1, min(_SAMPLES, len(depth))).astype(int)).tolist():
+    for row in spread_evenly(len(depth), _SAMPLES):
         try:
             read_raw_depth(depth[row])
         except FrameError as error:

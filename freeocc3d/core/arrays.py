@@ -3,12 +3,13 @@ before it allocates memory."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from io import BufferedIOBase
 from pathlib import Path
 from typing import IO, Any, cast
@@ -59,10 +60,19 @@ def read_arrays(
     all arrays are read.  most_bytes: of all arrays together. Other arrays are not unpacked. Raises MapError.
     """
     try:
-        with open_regular(path, _LARGEST) as stream, zipfile.ZipFile(stream) as archive:
+        with _named(path), open_regular(path, _LARGEST) as stream, zipfile.ZipFile(stream) as archive:
             return _read(archive, expected, also, most_bytes)
     except FileNotFoundError as error:
         raise MapError(f"{path} is missing: copy the whole map folder again, or make the map again.") from error
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Turns what readers raise about a file that is there into a MapError that names it."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise
     except UnusableFile as error:
         raise MapError(f"{path} cannot be read: {error.strerror}.") from error
     except _Unusable as error:
@@ -90,16 +100,12 @@ def _read(
 def read_array(path: Path, most_bytes: int = _LARGEST) -> NDArray[Any]:
     """Read the array of an .npy file, in the machine's byte order. Raises MapError, as ``read_arrays`` does."""
     try:
-        with open_regular(path, most_bytes + _LONGEST_HEADER) as stream:
+        with _named(path), open_regular(path, most_bytes + _LONGEST_HEADER) as stream:
             size = stream.seek(0, 2)
             stream.seek(0)
             return _unpack(stream, path.name, size, None, most_bytes)
-    except OSError as error:
+    except FileNotFoundError as error:
         raise MapError(f"{path} cannot be read: {error.strerror}.") from error
-    except _Unusable as error:
-        raise MapError(f"{path} is damaged: {error}.") from error
-    except _ERRORS as error:
-        raise MapError(f"{path} is damaged: {' '.join(str(error).split()) or 'it ends too early'}.") from error
 
 
 def is_whole(path: Path) -> bool:

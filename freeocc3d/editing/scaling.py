@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..capture import associate, read_trajectory
 from ..core.errors import FreeOccError, MapError
+from ..core.sampling import spread_evenly
 from ..core.transforms import back_project, transform
 from ..core.types import Gaussians, Submap, Trajectory
 from ..core.warnings import read_notices
@@ -239,7 +240,7 @@ def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussi
     width = scan_map.settings.fitting.width
     keyframes = scan_map.keyframes
     shown = []
-    for row in np.unique(np.linspace(0, len(keyframes) - 1, render_pictures.SHOWN).astype(int)).tolist():
+    for row in spread_evenly(len(keyframes), render_pictures.SHOWN):
         frame = keyframes[row]
         frame = frame.scaled(factor)
         view = rendered_views.prepare_captured_view(frame, trajectory.T_world_keyframe[row], width, rasterizer.device)

@@ -105,6 +105,16 @@ def warn_of_color_focal(capture: Capture, ratio: float) -> Notice:
     )
 
 
+def warn_of_registration(capture: Capture) -> Notice:
+    """Warns that no focal length of the color camera makes color and depth match."""
+    return Notice(
+        "registration-doubtful",
+        f"Color and depth of {capture.path} do not seem to lie on each other: matched features fit depth better and "
+        "better up to the largest change of the focal length that is tried, a quarter. Record depth aligned to color, "
+        "or give the intrinsics of both cameras.",
+    )
+
+
 def warn_of_scale() -> Notice:
     """Warns that lengths are not in meters."""
     return Notice(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..capture import Capture
 from ..core.errors import FrameError
+from ..core.sampling import spread_evenly
 from ..core.types import Frame, Trajectory
 from ..tracking.rgbd import orb_features
 
@@ -131,8 +132,8 @@ class _Sample:
 
     def measure(self, rows: NDArray[np.int64]) -> list[FrameQuality]:
         """The quality of some of the frames, evenly chosen, that can be read."""
-        chosen = np.unique(np.linspace(0, len(rows) - 1, _SAMPLES).astype(int)) if len(rows) else np.zeros(0, int)
-        return [quality for row in rows[chosen].tolist() if (quality := self._measure(row)) is not None]
+        chosen = rows[spread_evenly(len(rows), _SAMPLES)]
+        return [quality for row in chosen.tolist() if (quality := self._measure(row)) is not None]
 
     def _measure(self, index: int) -> FrameQuality | None:
         """The quality of a frame; None if it cannot be read."""

@@ -8,26 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from ..capture import Capture, open_capture
+from ..capture import Capture, open_capture, select_frames
 from ..capture.checks.depth_units import UNITS, DepthSample, sample_depth, settle_depth_unit
 from ..capture.checks.file_heads import check_heads
-from ..capture.checks.registration_check import check_registration
-from ..capture.focal_correction import Reregistered
 from ..capture.rgbd_frames import RgbdFrames
 from ..core.errors import CaptureError, FreeOccError
+from ..core.sampling import spread_evenly
 from ..core.types import Frame
 from ..core.warnings import Notice
 from ..settings import config
 from ..settings.config import Settings
-from ..tracking.rgbd import focal_calibration, self_calibration
 from ..tracking.rgbd.measured_pairs import measure_pairs
-from .checks import (
-    check_brightness,
-    explain_unknown_camera,
-    warn_of_camera,
-    warn_of_color_focal,
-    warn_of_estimated_focal,
-)
+from .calibration import estimate_unknown_focal, register_color
+from .checks import check_brightness, warn_of_camera
 from .tracking_choice import choose_tracker
 
 _SAMPLES = 9
@@ -93,9 +86,9 @@ def inspect(path: str | Path, settings: Settings | None = None) -> Inspection:
     if it is no capture."""
     settings = settings or config.resolve({})
     capture = open_capture(path, settings.capture, settings.backends.get("capture"))
-    notices = list(capture.warnings)
+    used, notices = select_frames(capture), list(capture.warnings)
     try:
-        notices += [broken] if (broken := check_heads(capture, range(len(capture)))) else []
+        notices += [broken] if (broken := check_heads(capture, used)) else []
     except CaptureError as error:
         notices.append(Notice("images-unreadable", str(error)))
     if unit := settle_depth_unit(capture):
@@ -104,8 +97,8 @@ def inspect(path: str | Path, settings: Settings | None = None) -> Inspection:
     frames, problems = _look(capture)
     camera, more = _describe_camera(capture, frames)
     notices += more
-    if capture.has_depth:
-        notices += _check_color(capture)
+    if capture.has_depth and settings.capture.color_focal is None:
+        notices += register_color(capture, used, measure_pairs(capture, used))[1]
     if dark := check_brightness(frames, capture.path):
         notices.append(dark)
     first = frames[0] if frames else None
@@ -128,10 +121,11 @@ def inspect(path: str | Path, settings: Settings | None = None) -> Inspection:
 
 def _look(capture: Capture) -> tuple[list[Frame], list[str]]:
     """Frames across the capture, and what keeps others from being used."""
+    used = select_frames(capture)
     frames, problems = [], []
-    for index in np.unique(np.linspace(0, len(capture) - 1, _SAMPLES).astype(int)).tolist():
+    for row in spread_evenly(len(used), _SAMPLES):
         try:
-            frames.append(capture[index])
+            frames.append(capture[used[row]])
         except FreeOccError as error:
             problems.append(str(error))
     return frames, problems
@@ -148,34 +142,20 @@ def _describe_camera(capture: Capture, frames: list[Frame]) -> tuple[str, list[N
     """Where the focal length comes from, and what to fix about it."""
     if not frames:
         return "unknown", []
-    focal = frames[0].intrinsics.fx * _stored_size(capture, (1, 1))[0] / max(frames[0].color.shape[1], 1)
-    if not isinstance(capture, RgbdFrames):
+    if not isinstance(capture, RgbdFrames) or not capture.has_depth:
         focal = frames[0].intrinsics.fx
-    if capture.intrinsics_known:
-        return f"stated, focal length {focal:.0f} px", []
-    if not capture.has_depth:
+        if capture.intrinsics_known:
+            return f"stated, focal length {focal:.0f} px", []
         how = "roughly stated" if capture.focal_stated else "not stated; a run estimates it"
         return f"{how}, start {focal:.0f} px", [] if capture.focal_stated else [warn_of_camera(capture)]
-    found = self_calibration.estimate_focal(capture, range(len(capture)))
-    size = _stored_size(capture, (1, 1))
-    if (found is None or not found.sure) and capture.focal_stated:
-        return f"roughly stated, focal length {focal:.0f} px", [warn_of_camera(capture)]
-    if found is None or not found.sure:
-        roughly = "" if found is None else found.describe(focal / frames[0].intrinsics.fx)
-        return "not stated", [Notice("intrinsics-unknown", explain_unknown_camera(capture, size, roughly))]
-    focal_px = focal * found.focal_px / frames[0].intrinsics.fx
-    notice = warn_of_estimated_focal(capture, focal_px, found.uncertainty)
-    return f"not stated; the scan shows a focal length of {focal_px:.0f} px", [notice]
-
-
-def _check_color(capture: Capture) -> list[Notice]:
-    """What is wrong between color and depth: another focal length, which a run corrects, or what it cannot."""
-    frames = range(len(capture))
-    ratio = capture.options.color_focal or focal_calibration.estimate_color_focal(measure_pairs(capture, frames))
-    found = [] if ratio == 1 else [warn_of_color_focal(capture, ratio)]
-    registered = capture if ratio == 1 else Reregistered(capture, ratio)
-    notice = check_registration(registered, frames)
-    return [*found, notice] if notice else found
+    if capture.intrinsics_known:
+        return f"stated, focal length {capture.rig(0).color.camera.fx:.0f} px", []
+    found = estimate_unknown_focal(capture, select_frames(capture))
+    if found.focal_px is None:
+        return "not stated", [found.notice]
+    if found.notice.code == "intrinsics-unknown":
+        return f"roughly stated, focal length {found.focal_px:.0f} px", [found.notice]
+    return f"not stated; the scan shows a focal length of {found.focal_px:.0f} px", [found.notice]
 
 
 def _describe_depth(capture: Capture, frames: list[Frame]) -> DepthFacts | None:
@@ -207,7 +187,7 @@ def _duration(capture: Capture) -> float | None:
 
 def _share_of_poses(capture: Capture) -> float:
     """Share of the frames that state a pose, of some that are looked at."""
-    rows = np.unique(np.linspace(0, len(capture) - 1, _POSES_LOOKED_AT).astype(int)).tolist()
+    rows = spread_evenly(len(capture), _POSES_LOOKED_AT)
     try:
         return float(np.mean([capture.pose(row) is not None for row in rows]))
     except FreeOccError:

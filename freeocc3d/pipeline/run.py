@@ -9,26 +9,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .. import __version__
 from ..capture import Capture, open_capture, select_frames
 from ..capture.checks.depth_units import settle_depth_unit
 from ..capture.checks.file_heads import check_heads
-from ..capture.checks.registration_check import check_registration
 from ..capture.focal_correction import Reregistered
 from ..capture.rgbd_frames import RgbdFrames
 from ..core.errors import CaptureError, FrameError, Interrupted, MapError, TrackingError, is_interrupt
 from ..core.progress import Progress
+from ..core.sampling import spread_evenly
 from ..core.types import Frame
 from ..language.encoders.base import Encoder
 from ..query.scan_map import Map, load_map
 from ..settings import config
 from ..settings.config import Settings
 from ..storage.work_folder import WorkFolder
-from ..tracking.rgbd import focal_calibration, self_calibration
 from ..tracking.rgbd.measured_pairs import MeasuredPair, measure_pairs
-from .checks import check, check_brightness, explain_unknown_camera, warn_of_color_focal, warn_of_estimated_focal
+from .calibration import estimate_unknown_focal, register_color
+from .checks import check, check_brightness
 from .mapper import Mapper
 from .run_stages import STAGES, Run
 from .saving import absolute
@@ -116,17 +114,13 @@ def _know_camera(
     if not isinstance(capture, RgbdFrames) or not capture.has_depth or capture.intrinsics_known:
         return capture, settings
     progress.stage("self-calibration")
-    frames = select_frames(capture)
-    stored, guess = capture.rig(frames[0]).color.camera, capture.registration(frames[0]).intrinsics
-    found = self_calibration.estimate_focal(capture, frames)
-    if (found is None or not found.sure) and capture.focal_stated:
+    found = estimate_unknown_focal(capture, select_frames(capture))
+    if found.focal_px is None:
+        raise CaptureError(found.notice.text)
+    if found.notice.code == "intrinsics-unknown":  # the tracking stage tells it
         return capture, settings
-    if found is None or not found.sure:
-        roughly = "" if found is None else found.describe(stored.fx / guess.fx)
-        raise CaptureError(explain_unknown_camera(capture, (stored.width, stored.height), roughly))
-    focal_px = round(stored.fx * found.focal_px / guess.fx, 1)
-    work.warn(progress, warn_of_estimated_focal(capture, focal_px, found.uncertainty))
-    settings = settings.changed("capture", focal=focal_px)
+    work.warn(progress, found.notice)
+    settings = settings.changed("capture", focal=found.focal_px)
     known = open_capture(capture.path, settings.capture, settings.backends.get("capture"))
     assert isinstance(known, RgbdFrames)
     known.units_per_meter = capture.units_per_meter
@@ -137,7 +131,7 @@ def _look(capture: Capture) -> list[Frame]:
     """A few of the selected frames, of those that can be read."""
     frames = select_frames(capture)
     found = []
-    for row in np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int)).tolist():
+    for row in spread_evenly(len(frames), _LOOKED_AT):
         with contextlib.suppress(FrameError):
             found.append(capture[frames[row]])
     return found
@@ -146,21 +140,21 @@ def _look(capture: Capture) -> list[Frame]:
 def _calibrate(
     capture: Capture, settings: Settings, progress: Progress, work: WorkFolder
 ) -> tuple[Capture, Sequence[MeasuredPair]]:
-    """The capture with color registered to the depth images, if the focal lengths of its cameras differ, and pairs of
-    frames whose motion depth measures; none if nothing is to be compared with them."""
-    ratio = settings.capture.color_focal
-    given = settings.tracking.backend in GIVEN
-    if not capture.has_depth or (ratio is not None and not given):
-        return (capture if ratio in (None, 1) or not capture.has_depth else Reregistered(capture, ratio)), ()
+    """The capture with color registered to the depth images, and pairs of frames whose motion depth measures; none if
+    nothing is to be compared with them."""
+    if not capture.has_depth:
+        return capture, ()
+    ratio, given = settings.capture.color_focal, settings.tracking.backend in GIVEN
+    if ratio is not None:
+        capture = capture if ratio == 1 else Reregistered(capture, ratio)
+        if not given:
+            return capture, ()
     progress.stage("calibration")
     if dark := check_brightness(_look(capture), capture.path):
         work.warn(progress, dark)
-    pairs = measure_pairs(capture, select_frames(capture))
+    frames = select_frames(capture)
+    pairs = measure_pairs(capture, frames)
     if ratio is None:
-        ratio = focal_calibration.estimate_color_focal(pairs)
-        if ratio != 1:
-            work.warn(progress, warn_of_color_focal(capture, ratio))
-    registered = capture if ratio == 1 else Reregistered(capture, ratio)
-    if settings.capture.color_focal is None and (notice := check_registration(registered, select_frames(capture))):
-        work.warn(progress, notice)
-    return registered, pairs if given else ()
+        capture, notices = register_color(capture, frames, pairs)
+        work.warn(progress, *notices)
+    return capture, pairs if given else ()

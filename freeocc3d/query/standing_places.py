@@ -11,6 +11,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from ..core.errors import MapError
+from ..core.sampling import spread_evenly
 from ..core.transforms import invert, transform
 from ..core.types import FREE, OCCUPIED, UNKNOWN, Occupancy
 from ..occupancy.resampling import resample_occupancy
@@ -108,7 +109,7 @@ class _Cells:
         """Returns the (2,) place that sees the targets and is nearest to them. targets: (N, 3) centers of a region."""
         distance = KDTree(targets[:, :2]).query(places)[0] if len(places) else np.zeros(0)
         order = np.argsort(distance, kind="stable")
-        some = targets[np.unique(np.linspace(0, len(targets) - 1, _SAMPLES).astype(np.int64))]
+        some = targets[spread_evenly(len(targets), _SAMPLES)]
         blocks = self.state == OCCUPIED
         blocks[tuple((own - self.corner).T)] = False
         for start in range(0, len(order), _AT_ONCE):

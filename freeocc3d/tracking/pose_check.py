@@ -70,7 +70,7 @@ _SHIFTS = (1, -1, 2, -2, 3, -3, 5, -5, 10, -10, 30, -30)
 @dataclass(frozen=True)
 class PoseAgreement:
     """How well poses agree with depth. pairs: number of compared pairs.  agreeing: of them.  change: words for the
-    change under which ``explained`` pairs would agree; empty if none is found, or none is needed."""
+    change under which ``explained`` pairs would agree, or agree better; empty if none is found, or none is needed."""
 
     pairs: int
     agreeing: int
@@ -80,7 +80,7 @@ class PoseAgreement:
     @property
     def right(self) -> bool:
         """Whether nothing speaks against the poses: they agree, or too little can be compared."""
-        return self.pairs < _LEAST_PAIRS or self.agreeing >= _RIGHT * self.pairs
+        return self.pairs < _LEAST_PAIRS or (self.agreeing >= _RIGHT * self.pairs and not self.change)
 
     @property
     def wrong(self) -> bool:
@@ -97,6 +97,11 @@ def check_poses(T_world_cam: Poses, pairs: Sequence[MeasuredPair], source: str) 
     said = f"The poses of {source} do not agree with the depth: {found.agreeing} of {found.pairs} pairs of frames do"
     if found.change:
         said += f". {found.explained} would {found.change}"
+    if found.agreeing >= _RIGHT * found.pairs:
+        said = (
+            f"The poses of {source} do not agree with the depth: {found.explained} of {found.pairs} pairs of frames "
+            f"would agree better {found.change}"
+        )
     if found.wrong:
         advice = "Correct the poses" if found.change else "Check that the poses belong to this capture"
         raise TrackingError(f"{said}. {advice}, or let them be estimated from the depth with tracking.backend=rgbd.")
@@ -109,12 +114,11 @@ def compare_poses(T_world_cam: Poses, pairs: Sequence[MeasuredPair]) -> PoseAgre
     if motions is None:
         return PoseAgreement(0, 0)
     total, given = motions.count, T_world_cam
-    agreeing = int((motions.errors(motions.predicted(given)) < 1).sum())
+    predicted = motions.predicted(given)
+    agreeing = int((motions.errors(predicted) < 1).sum())
     if agreeing >= _RIGHT * total:
-        for unit, _ in _in_other_units(motions.predicted(given), motions):
-            if _has_other_unit(motions.predicted(given), motions):
-                return PoseAgreement(total, 0, _sentence("", unit), agreeing)
-        return PoseAgreement(total, agreeing)
+        unit = _other_unit(predicted, motions)
+        return PoseAgreement(total, agreeing, _sentence("", unit), agreeing) if unit else PoseAgreement(total, agreeing)
     best, least = PoseAgreement(total, agreeing), np.inf
     for words, changed in _changes(given, motions):
         for unit, scaled in ((1.0, changed), *_in_other_units(changed, motions)):
@@ -197,20 +201,26 @@ def _in_other_units(predicted: Poses, motions: _Motions) -> Iterator[tuple[float
     units = _units(predicted, motions)
     unit = float(np.median(units)) if len(units) else 1.0
     if unit > 0 and not 1 / 1.1 < unit < 1.1:
-        unit = next((usual for usual in _USUAL_UNITS if abs(unit / usual - 1) < _SAME_UNIT), unit)
+        unit = _usual_unit(unit)
         scaled = predicted.copy()
         scaled[:, :3, 3] *= unit
         yield unit, scaled
 
 
-def _has_other_unit(predicted: Poses, motions: _Motions) -> bool:
-    """Whether the pairs agree on another unit of the translations than a meter. Turns may dominate the motion, so that
-    poses in slightly other units agree well enough otherwise."""
+def _other_unit(predicted: Poses, motions: _Motions) -> float:
+    """Meters per unit of the translations, if the pairs agree on another one; 0 if they do not. Turns may dominate the
+    motion, so that poses in slightly other units agree well enough otherwise."""
     units = _units(predicted, motions)
     if len(units) < _LEAST_UNITS:
-        return False
+        return 0.0
     low, unit, high = np.quantile(units, (0.25, 0.5, 0.75))
-    return bool(unit > 0 and high - low < _SURE_UNIT * unit and abs(np.log(unit)) > np.log(1 + _SAME_UNIT))
+    other = unit > 0 and high - low < _SURE_UNIT * unit and abs(np.log(unit)) > np.log(1 + _SAME_UNIT)
+    return _usual_unit(float(unit)) if other else 0.0
+
+
+def _usual_unit(unit: float) -> float:
+    """The usual unit that a measured one is, meters; else the measured one."""
+    return next((usual for usual in _USUAL_UNITS if abs(unit / usual - 1) < _SAME_UNIT), unit)
 
 
 def _changes(given: Poses, motions: _Motions) -> Iterator[tuple[str, Poses]]:

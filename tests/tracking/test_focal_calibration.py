@@ -111,6 +111,18 @@ def test_a_ratio_must_stand_out(monkeypatch, changes: dict, found: bool) -> None
     assert (decided(monkeypatch, **{"best": 1.1, **changes}) != 1.0) == found
 
 
+@pytest.mark.parametrize(("best", "out"), [(0.79, True), (1.26, True), (1.1, False), (1.0, False)])
+def test_an_error_that_falls_up_to_the_end_is_told(monkeypatch, best: float, out: bool) -> None:
+    rows = np.zeros((63, 2), np.int64)
+    pair = MeasuredPair(0, 1, None, None, np.eye(4), rows)  # type: ignore[arg-type]
+
+    def error(pairs, ratio) -> float:
+        return 1.0 if best == 1 else 0.5 + (np.log(ratio / best) / np.log(1 / best)) ** 2 / 2
+
+    monkeypatch.setattr(focal_calibration, "_error", error)
+    assert focal_calibration.fit_color_focal([pair] * 8).out_of_range == out
+
+
 def test_the_error_saturates_and_counts_matches_with_a_depth() -> None:
     """Features at a depth of 2 m, 3 pixels off in the target: a half; and one without depth, which does not count."""
     camera = Intrinsics(160, 120, 100.0, 100.0, 79.5, 59.5)

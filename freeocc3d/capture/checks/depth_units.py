@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import FrameError
+from ...core.sampling import spread_evenly
 from ...core.warnings import Notice
 from ..base import Capture
 from ..images.depth_decoding import SATURATED, RawDepth
@@ -90,7 +91,7 @@ class DepthSample:
 def sample_depth(capture: Capture, samples: int = _SAMPLES) -> DepthSample | None:
     """Measured depth of frames across the capture, as stored; None if they hold none."""
     values, units_per_meter = [], 1.0
-    for index in np.unique(np.linspace(0, len(capture) - 1, samples).astype(int)).tolist():
+    for index in spread_evenly(len(capture), samples):
         try:
             stored = capture.raw_depth(index)
         except FrameError:

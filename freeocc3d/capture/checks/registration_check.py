@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import FrameError
+from ...core.sampling import spread_evenly
 from ...core.types import Frame
 from ...core.warnings import Notice
 from ..base import Capture
@@ -80,7 +81,7 @@ def check_registration(capture: Capture, frames: range) -> Notice | None:
 
 
 def _read(capture: Capture, frames: range) -> Iterable[Frame]:
-    for row in np.unique(np.linspace(0, len(frames) - 1, _SAMPLES).astype(int)).tolist():
+    for row in spread_evenly(len(frames), _SAMPLES):
         try:
             yield capture[frames[row]]
         except FrameError:

@@ -19,11 +19,12 @@ from typing import Literal
 from ...core.errors import CaptureError
 from ...core.regular_files import MOST_ENTRIES
 from ...core.warnings import Notice
+from ..images.image_decoding import COLOR_SUFFIXES
 
 Kind = Literal["color", "depth", "any"]
 
 SUFFIXES = {
-    "color": (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"),
+    "color": COLOR_SUFFIXES,
     "depth": (".png", ".tif", ".tiff", ".exr", ".npy", ".npz", ".pgm", ".pfm"),
     "any": (),
 }

@@ -12,10 +12,9 @@ from pathlib import Path
 from ...core.errors import CaptureError
 from ...core.warnings import Notice
 from ..images.depth_decoding import SUFFIXES as DEPTH_SUFFIXES
+from ..images.image_decoding import COLOR_SUFFIXES
 from .name_matching import FEWEST_PAIRED, match_names, order_names
 from .numbered_files import list_folder
-
-COLOR_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"})
 
 _KIND = r"(?:rgb|colou?r|image|img|frame|left|picture|photo)s?"
 _MADE = r"(?:aligned|undistorted|undist|rectified|rect|resized|raw|registered|camera|cam|kinect|realsense|main)"
@@ -28,7 +27,7 @@ _NO_DEPTH = re.compile(
 _CONFIDENCE = re.compile(r"(?:depth)?conf(?:idence)?s?(?:maps?|images?|imgs?|depth)?")
 _POSES = re.compile(r"(?:camera|cam|gt)?poses?")
 _NO_COLOR = re.compile(r"depth|disp|conf|mask|label|sem|inst|normal|thumb|_ir\b|infra")
-_ENDINGS = tuple(COLOR_SUFFIXES | DEPTH_SUFFIXES)
+_ENDINGS = (*COLOR_SUFFIXES, *DEPTH_SUFFIXES)
 _MOST_FOLDERS = 50
 _FIRST_COLOR = ("rgb", "color", "colour")
 _FIRST_DEPTH = ("depth", "depths")
@@ -155,7 +154,7 @@ def _split(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         stem = lower.rpartition(".")[0]
         if lower.endswith(tuple(DEPTH_SUFFIXES)) and _DEPTH.search(stem) and not _NO_DEPTH.search(stem):
             depth.append(name)
-        elif lower.endswith(tuple(COLOR_SUFFIXES)) and not _NO_COLOR.search(stem):
+        elif lower.endswith(COLOR_SUFFIXES) and not _NO_COLOR.search(stem):
             color.append(name)
     return tuple(color), tuple(depth)
 

@@ -23,6 +23,10 @@ from ...core.image_files import (
     read_image_size,
 )
 from ...core.regular_files import IMAGE_BYTES, open_regular
+from ...core.sampling import spread_evenly
+
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+"""Suffixes of color images that OpenCV decodes."""
 
 
 def read_color(path: Path, size: Size | None = None, bits: int = 16) -> NDArray[np.uint8]:
@@ -43,7 +47,7 @@ def count_color_bits(paths: Sequence[Path], samples: int = 5) -> int:
     if not paths or not _has_16_bits(paths[0]):
         return 16
     largest = 0
-    for row in np.unique(np.linspace(0, len(paths) - 1, samples).astype(int)).tolist():
+    for row in spread_evenly(len(paths), samples):
         try:
             image = decode_image(paths[row], cv2.IMREAD_UNCHANGED)
         except FrameError:

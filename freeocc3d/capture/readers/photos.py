@@ -21,13 +21,12 @@ from ..files.numbered_files import list_folder
 from ..files.paired_folders import find_folders
 from ..folder_contents import holds_depth_or_confidence
 from ..image_headers import Header, find_common_lens, read_header
-from ..images.heif_files import read_heif
-from ..images.image_decoding import read_color
+from ..images.heif_files import HEIF_SUFFIXES, read_heif
+from ..images.image_decoding import COLOR_SUFFIXES, read_color
 
 REQUIRES: tuple[str, ...] = ("PIL", "pillow_heif")
 
-HEIF_SUFFIXES = {".heic", ".heif", ".hif", ".avif"}
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF_SUFFIXES}
+SUFFIXES = {*COLOR_SUFFIXES, *HEIF_SUFFIXES}
 _ENDINGS = tuple(SUFFIXES)
 UNREADABLE = {
     ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw", ".jxl", ".insp",

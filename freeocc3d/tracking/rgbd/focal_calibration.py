@@ -9,7 +9,7 @@ out; else nothing changes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,18 +25,33 @@ _LEAST_PAIRS, _LEAST_MATCHES = 8, 500  # the smallest numbers; with fewer, the r
 _FAR_PX = 3.0  # a match with a larger error counts as wrong
 
 
-def estimate_color_focal(pairs: Sequence[MeasuredPair]) -> float:
+@dataclass(frozen=True)
+class ColorFocal:
     """Focal length of the color camera over that of the depth camera; 1 unless the pairs of frames clearly show another
-    value."""
+    value. out_of_range: whether the error still falls at the end of what is tried, so that no ratio explains it."""
+
+    ratio: float = 1.0
+    out_of_range: bool = False
+
+
+def fit_color_focal(pairs: Sequence[MeasuredPair]) -> ColorFocal:
+    """Compares the focal lengths of color and depth by pairs of frames."""
     if len(pairs) < _LEAST_PAIRS or sum(len(pair.matches) for pair in pairs) < _LEAST_MATCHES:
-        return 1.0
+        return ColorFocal()
     errors = np.array([_error(pairs, ratio) for ratio in _RATIOS])
     unchanged, best = _error(pairs, 1.0), int(np.argmin(errors))
-    if best in (0, len(_RATIOS) - 1) or errors[best] > (1 - _LEAST_GAIN) * unchanged:
-        return 1.0
+    if errors[best] > (1 - _LEAST_GAIN) * unchanged:
+        return ColorFocal()
+    if best in (0, len(_RATIOS) - 1):
+        return ColorFocal(out_of_range=True)
     a, b, _ = np.polyfit(np.log(_RATIOS[best - 1 : best + 2]), errors[best - 1 : best + 2], 2)
     ratio = float(np.exp(-b / (2 * a)))
-    return ratio if abs(np.log(ratio)) >= _LEAST_CHANGE else 1.0
+    return ColorFocal(ratio) if abs(np.log(ratio)) >= _LEAST_CHANGE else ColorFocal()
+
+
+def estimate_color_focal(pairs: Sequence[MeasuredPair]) -> float:
+    """The ratio of ``fit_color_focal``."""
+    return fit_color_focal(pairs).ratio
 
 
 def _error(pairs: Sequence[MeasuredPair], ratio: float) -> float:

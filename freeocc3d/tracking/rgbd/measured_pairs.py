@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture.base import Capture
+from ...core.sampling import spread_evenly
 from ...core.threads import count_threads
 from ...core.transforms import measure_pose_difference
 from . import dense_alignment, orb_features
@@ -44,10 +45,10 @@ class MeasuredPair:
 
 def measure_pairs(capture: Capture, frames: range) -> list[MeasuredPair]:
     """Pairs of frames, spread over the selected frames of a capture. Does not read poses."""
-    starts = np.unique(np.linspace(0, max(len(frames) - 1, 0), PAIRS, dtype=int))
+    starts = spread_evenly(len(frames), PAIRS)
     gaps = _GAPS if len(frames) >= _SHORT_SCAN else _SHORT_GAPS
     with ThreadPoolExecutor(count_threads()) as pool:
-        found = pool.map(lambda start: _measure(capture, frames[start:], gaps), starts.tolist())
+        found = pool.map(lambda start: _measure(capture, frames[start:], gaps), starts)
         return [pair for pair in found if pair is not None]
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...capture.base import Capture
 from ...core.errors import FrameError
+from ...core.sampling import spread_evenly
 from ...core.types import Frame
 from . import orb_features
 from .orb_features import OrbFeatures
@@ -94,7 +95,7 @@ def _minimum(errors: NDArray[np.float64]) -> float | None:
 def _matched_pairs(capture: Capture, frames: range) -> list[_Matches]:
     """Pairs of frames, spread over the scan, as far apart as enough features can be matched."""
     found = []
-    for start in np.unique(np.linspace(0, max(len(frames) - 2, 0), _PAIRS, dtype=int)).tolist():
+    for start in spread_evenly(len(frames) - 1, _PAIRS):
         target = _seen(capture, frames[start])
         for gap in _GAPS:
             if target is None or start + gap >= len(frames):

@@ -16,6 +16,7 @@ from ...capture.base import Capture
 from ...capture.point_files import read_points
 from ...core.errors import ConfigError, TrackingError
 from ...core.regular_files import user_path
+from ...core.sampling import spread_evenly
 from ...core.transforms import invert, project, transform
 from ...core.types import Frame
 from ...settings.option_types import FilePath
@@ -141,7 +142,7 @@ def estimate_depth_scale(T_world_cam: NDArray[np.float64], capture: Capture) -> 
     """
     posed = np.flatnonzero(np.isfinite(T_world_cam).all(axis=(1, 2)))
     scales = []
-    for start in np.unique(np.linspace(0, max(len(posed) - 2, 0), _PAIRS).astype(int)).tolist():
+    for start in spread_evenly(len(posed) - 1, _PAIRS):
         if len(posed) < 2:
             break
         found = _pair_scale(T_world_cam, capture, posed[start:])
