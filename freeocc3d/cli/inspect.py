@@ -64,8 +64,9 @@ def _depth(found: Inspection) -> str:
         return "none"
     depth = found.depth
     return (
-        f"{depth.size[0]} x {depth.size[1]}, {unit_name(depth.unit)}: half of it nearer than {depth.median_m:.2g} m, "
-        f"95 % than {depth.far_m:.2g} m; {depth.coverage:.0%} of the pixels have any that is used"
+        f"{depth.size[0]} x {depth.size[1]}, {unit_name(depth.unit)}: half of it is nearer than "
+        f"{depth.median_m:.2g} m, 95 % nearer than {depth.far_m:.2g} m; {depth.coverage:.0%} of the pixels have depth "
+        "that is used"
     )
 
 

@@ -26,5 +26,6 @@ def choose_tracker(settings: Settings, capture: Capture) -> tuple[Settings, str]
         name, reason = "known", "the capture has poses but no depth, so its poses are used and stereo gives the depth"
     else:
         name, reason = "colmap", "the capture has no depth, so structure from motion and stereo estimate all from color"
-    sentence = f"Tracking with {name}: {reason} (read as {capture.format}, {len(capture)} frames)."
+    frames = f"{len(capture)} frame{'s' if len(capture) != 1 else ''}"
+    sentence = f"Tracking with {name}: {reason} (read as {capture.format}, {frames})."
     return settings.changed("tracking", backend=name), sentence

@@ -15,7 +15,7 @@ from small_captures import SIZE, camera_matrix, color_image, depth_image, pose_m
 
 from freeocc3d.capture import open_capture
 from freeocc3d.core.transforms import rotations_to_quats
-from freeocc3d.core.types import Intrinsics
+from freeocc3d.core.types import Frame, Intrinsics
 
 START_S = 1_700_000_000.25
 """When the frames of scans begin, seconds since 1970."""
@@ -91,6 +91,15 @@ def plane_scan(
         times if times is not None else [START_S + i / 30 + 0.002 * (i % 3) for i in range(count)],
         confidence if unsure else None,
     )
+
+
+def assert_confidence_counts(frame: Frame, index: int) -> None:
+    """A frame of an unsure ``plane_scan`` has no depth of low confidence, and twice the deviation at medium."""
+    wanted = depth_image(index, size=frame.depth_m.shape[::-1]) / 1000
+    wanted[:, -2:] = 0
+    np.testing.assert_allclose(frame.depth_m, wanted, atol=1e-6)
+    assert frame.depth_sigma_m is not None
+    np.testing.assert_allclose(frame.depth_sigma_m[1, -5], 2 * frame.depth_sigma_m[1, 5], rtol=1e-6)
 
 
 @functools.cache

@@ -81,7 +81,7 @@ def test_the_command_prints_rows_or_one_document(tmp_path: Path) -> None:
     text = run("inspect", str(tmp_path / "scan"))
     rows = dict(line.split(maxsplit=1) for line in text.stdout.splitlines())
     assert rows["frames"] == "4, without times"
-    assert rows["depth"].startswith("32 x 24, 1000 units per meter (millimeters): half of it nearer than 2 m")
+    assert rows["depth"].startswith("32 x 24, 1000 units per meter (millimeters): half of it is nearer than 2 m")
     document = json.loads(run("inspect", str(tmp_path / "scan"), "--json").stdout)
     assert document["format"] == "scannet"
     assert document["depth"]["units_per_meter"] == 1000

@@ -38,9 +38,10 @@ def pair_streams(
     left = [count - len(pairs) for count in counts]
     if not any(left):
         return pairs, ()
+    alone = [f"{n} {kind} image{'s' * (n > 1)}" for n, kind in zip(left, ("color", "depth"), strict=True) if n]
     text = (
-        f"{path} holds {counts[0]} color and {counts[1]} depth images; {left[0]} and {left[1]} of them have no "
-        f"partner within {within * 1e3:.0f} ms and are left out."
+        f"Of {counts[0]} color and {counts[1]} depth images of {path}, {' and '.join(alone)} without a partner within "
+        f"{within * 1e3:.0f} ms {'is' if sum(left) == 1 else 'are'} left out."
     )
     return pairs, (Notice("images-left-out", text),)
 
