@@ -35,7 +35,10 @@ MOST_LOOSE = 3
 HEAVY = {"open3d", "torch", "pyvista", "vtk", "numba", "pycolmap", "scipy", "cv2", "onnxruntime"}
 """Packages whose import takes a good part of a second."""
 
-FAST = ("storage", "query", "cli", "settings", "core.types", "core.progress", "core.errors", "__init__")
+FAST = (
+    *("storage", "query", "cli", "settings", "core.types", "core.progress", "core.errors", "__init__"),
+    *("language.encoders.color", "language.encoders.labels"),
+)
 """Rooms and modules that have to be imported in no time, for a query starts with them."""
 
 SLOW = {"storage.keyframes", "storage.work_folder", "storage.writer", "query.best_views", "query.standing_places"}

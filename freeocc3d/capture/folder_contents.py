@@ -11,10 +11,9 @@ from typing import Literal
 from ..core.errors import FrameError
 from ..core.image_files import PNG_START, Size
 from ..core.regular_files import IMAGE_BYTES, open_regular
+from .files.image_suffixes import COLOR_SUFFIXES, DEPTH_SUFFIXES, HEIF_SUFFIXES
 from .files.numbered_files import list_folder
-from .images.depth_decoding import SUFFIXES as DEPTH_SUFFIXES
-from .images.heif_files import HEIF_SUFFIXES
-from .images.image_decoding import COLOR_SUFFIXES, image_size
+from .images.image_decoding import image_size
 
 Kind = Literal["color", "depth", "confidence"]
 

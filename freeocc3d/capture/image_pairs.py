@@ -20,9 +20,9 @@ from ..core.errors import CaptureError, FrameError
 from ..core.image_files import Size
 from .base import Options
 from .cameras.rigs import Rig
+from .files.image_suffixes import DEPTH_SUFFIXES
 from .files.numbered_files import list_folder
 from .frame_files import FileFrames, FrameFiles, read_first_depth_size, read_first_size
-from .images.depth_decoding import SUFFIXES as DEPTH_SUFFIXES
 from .images.depth_decoding import read_raw_depth
 from .images.image_decoding import read_classes
 from .rgbd_frames import Registration

@@ -12,7 +12,7 @@ from small_captures import SIZE, color_image, depth_image, pose_matrix, truncate
 
 from freeocc3d.capture import open_capture
 from freeocc3d.capture.base import Options
-from freeocc3d.capture.images.depth_decoding import SUFFIXES
+from freeocc3d.capture.files.image_suffixes import DEPTH_SUFFIXES
 from freeocc3d.capture.readers.image_folders import Reader
 from freeocc3d.core.errors import CaptureError, FrameError
 
@@ -62,7 +62,7 @@ def test_pairs_of_folders_under_any_names(tmp_path: Path, color: str, depth: str
     check_frames(write_frames(tmp_path, color, depth, range(9, 13)), range(9, 13))
 
 
-@pytest.mark.parametrize("suffix", sorted(SUFFIXES))
+@pytest.mark.parametrize("suffix", sorted(DEPTH_SUFFIXES))
 def test_depth_of_every_kind_in_a_scannet_layout(tmp_path: Path, suffix: str) -> None:
     capture = open_capture(write_frames(tmp_path, "color/{}.png", "depth/{}" + suffix))
     assert capture.format == "scannet"

@@ -18,7 +18,7 @@ from scans import Scan
 from small_captures import write_image
 
 from freeocc3d.capture import Options
-from freeocc3d.capture.images.depth_decoding import SUFFIXES
+from freeocc3d.capture.files.image_suffixes import DEPTH_SUFFIXES
 
 MILLIMETER = 0.001
 _EXACT_S, _FLOATS = 1e-6, (".exr", ".npy", ".npz", ".pfm", ".tiff")
@@ -113,7 +113,7 @@ WRITTEN: dict[str, Written] = {
             options={} if suffix in _FLOATS else {"depth_scale": 1000.0},
             depth=suffix.removeprefix("."),
         )
-        for suffix in sorted(SUFFIXES)
+        for suffix in sorted(DEPTH_SUFFIXES)
     },
     "one folder": Written(
         "image_folders",

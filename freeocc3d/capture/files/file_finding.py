@@ -19,7 +19,7 @@ from typing import Literal
 from ...core.errors import CaptureError
 from ...core.regular_files import MOST_ENTRIES
 from ...core.warnings import Notice
-from ..images.image_decoding import COLOR_SUFFIXES
+from .image_suffixes import COLOR_SUFFIXES
 
 Kind = Literal["color", "depth", "any"]
 

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from ...core.errors import CaptureError
 from ...core.warnings import Notice
-from ..images.depth_decoding import SUFFIXES as DEPTH_SUFFIXES
-from ..images.image_decoding import COLOR_SUFFIXES
+from .image_suffixes import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from .name_matching import FEWEST_PAIRED, match_names, order_names
 from .numbered_files import list_folder
 

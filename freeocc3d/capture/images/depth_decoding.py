@@ -18,9 +18,9 @@ from ...core import arrays
 from ...core.errors import DependencyError, FrameError, MapError
 from ...core.image_files import MOST_PIXELS, Size
 from ...core.regular_files import IMAGE_BYTES, check_content, read_bytes
+from ..files.image_suffixes import DEPTH_SUFFIXES
 from .image_decoding import decode_image, describe, image_size
 
-SUFFIXES = frozenset({".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".npy", ".npz"})
 """Suffixes of files that may hold depth."""
 
 SATURATED = np.iinfo(np.uint16).max
@@ -60,7 +60,7 @@ def read_depth_size(path: Path) -> Size:
     suffix = path.suffix.lower()
     if suffix == ".exr":
         return _exr_size(path)
-    if suffix in SUFFIXES - {".png", ".tif", ".tiff"}:
+    if suffix in DEPTH_SUFFIXES - {".png", ".tif", ".tiff"}:
         height, width = read_raw_depth(path).shape
         return width, height
     return image_size(path)

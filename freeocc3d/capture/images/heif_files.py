@@ -17,7 +17,6 @@ from ...core.errors import FrameError
 from ...core.image_files import MOST_PIXELS
 from ...core.regular_files import IMAGE_BYTES, open_regular
 
-HEIF_SUFFIXES = {".heic", ".heif", ".hif", ".avif"}
 HEIF_FORMATS = ("HEIF", "AVIF")
 """Pillow's names of the formats."""
 

@@ -25,9 +25,6 @@ from ...core.image_files import (
 from ...core.regular_files import IMAGE_BYTES, open_regular
 from ...core.sampling import spread_evenly
 
-COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-"""Suffixes of color images that OpenCV decodes."""
-
 
 def read_color(path: Path, size: Size | None = None, bits: int = 16) -> NDArray[np.uint8]:
     """Read (H, W, 3) uint8 RGB as stored. The EXIF orientation is not applied, because depth and intrinsics ignore it.

@@ -17,12 +17,13 @@ from ...core.types import Frame, Intrinsics
 from ...core.warnings import Notice
 from ..base import Capture, Options
 from ..cameras.camera_files import guess_camera, read_given_calibration, reduce_camera
+from ..files.image_suffixes import COLOR_SUFFIXES, HEIF_SUFFIXES
 from ..files.numbered_files import list_folder
 from ..files.paired_folders import find_folders
 from ..folder_contents import holds_depth_or_confidence
 from ..image_headers import Header, find_common_lens, read_header
-from ..images.heif_files import HEIF_SUFFIXES, read_heif
-from ..images.image_decoding import COLOR_SUFFIXES, read_color
+from ..images.heif_files import read_heif
+from ..images.image_decoding import read_color
 
 REQUIRES: tuple[str, ...] = ("PIL", "pillow_heif")
 
