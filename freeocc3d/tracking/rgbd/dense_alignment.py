@@ -140,13 +140,10 @@ def _descend(
             information, gradient, _ = remove_undetermined(information, gradient)
             for a in range(6):
                 information[a, a] += DAMPING[0] * information[a, a] + DAMPING[1]
-            step = np.linalg.solve(information, -gradient)
-            D = np.ascontiguousarray(H[6:, 6:])
-            D[0, 0] += BRIGHTNESS_DAMPING
-            D[1, 1] += BRIGHTNESS_DAMPING
-            weighting.brightness[:] += np.linalg.solve(D, -g[6:] - np.ascontiguousarray(H[6:, :6]) @ step)
+            step = _solve(information, -gradient)
+            _update_brightness(weighting.brightness, H, g, step)
             apply_twist(T, step)
-            if np.abs(step).max() < STILL:
+            if _largest(step) < STILL:
                 break
 
 
@@ -157,14 +154,29 @@ def remove_undetermined(
     """(6, 6), (6,) normal equations without the contribution of noise in the normals, and whether every direction keeps
     some information. If the fitted normals of a bare plane are off by a few hundredths, the plane seems to resist a
     slide by the square of that."""
-    scale = np.array((ARM_M, ARM_M, ARM_M, 1.0, 1.0, 1.0))
-    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
+    scaled = H.copy()
+    for a in range(6):
+        for b in range(6):
+            scaled[a, b] /= _scale(a) * _scale(b)
+    values, vectors = np.linalg.eigh(scaled)
     least = NORMALS_NOISE * values[5]
-    kept = np.maximum(values - least, 0.0)
-    share = kept / np.maximum(values, _TINY)
-    H_out = (vectors * kept) @ vectors.T * np.outer(scale, scale)
-    g_out = (vectors * share) @ (vectors.T @ (g / scale)) * scale
+    H_out = np.zeros((6, 6))
+    g_out = np.zeros(6)
+    for k in range(6):
+        kept = max(values[k] - least, 0.0)
+        along = 0.0
+        for a in range(6):
+            along += vectors[a, k] * g[a] / _scale(a)
+        for a in range(6):
+            g_out[a] += kept / max(values[k], _TINY) * along * vectors[a, k] * _scale(a)
+            for b in range(6):
+                H_out[a, b] += kept * vectors[a, k] * _scale(a) * vectors[b, k] * _scale(b)
     return H_out, g_out, values[0] > 2.0 * least
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _scale(unknown: int) -> float:
+    return ARM_M if unknown < 3 else 1.0
 
 
 @njit(nogil=True, cache=True)
@@ -178,13 +190,19 @@ def apply_twist(T: NDArray[np.float64], xi: NDArray[np.float64]) -> None:
         A = math.sin(angle) / angle
         B = (1.0 - math.cos(angle)) / angle**2
         C = (1.0 - A) / angle**2
-    W2 = W @ W
-    R = np.eye(3) + A * W + B * W2
-    V = np.eye(3) + B * W + C * W2
-    t = V @ xi[3:6]
-    old = T[:3].copy()
-    T[:3] = R @ old
-    T[:3, 3] += t
+    R = np.eye(3)
+    V = np.eye(3)
+    for i in range(3):
+        for j in range(3):
+            squared = W[i, 0] * W[0, j] + W[i, 1] * W[1, j] + W[i, 2] * W[2, j]
+            R[i, j] += A * W[i, j] + B * squared
+            V[i, j] += B * W[i, j] + C * squared
+    for j in range(4):
+        x, y, z = T[0, j], T[1, j], T[2, j]
+        for i in range(3):
+            T[i, j] = R[i, 0] * x + R[i, 1] * y + R[i, 2] * z
+    for i in range(3):
+        T[i, 3] += V[i, 0] * xi[3] + V[i, 1] * xi[4] + V[i, 2] * xi[5]
 
 
 @njit(nogil=True, cache=True)
@@ -192,9 +210,64 @@ def eliminate_brightness(
     H: NDArray[np.float64], g: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(6, 6), (6,) normal equations of xi: eliminates gain and offset from (8, 8), (8,)."""
-    D = np.ascontiguousarray(H[6:, 6:])
-    D[0, 0] += BRIGHTNESS_DAMPING
-    D[1, 1] += BRIGHTNESS_DAMPING
-    C = np.ascontiguousarray(H[6:, :6])
-    X = np.ascontiguousarray(np.linalg.solve(D, C).T)
-    return H[:6, :6] - X @ C, g[:6] - X @ g[6:]
+    H_out = np.empty((6, 6))
+    g_out = np.empty(6)
+    i, j, k = _invert_brightness(H)
+    for a in range(6):
+        gain, offset = i * H[6, a] + j * H[7, a], j * H[6, a] + k * H[7, a]
+        g_out[a] = g[a] - (gain * g[6] + offset * g[7])
+        for b in range(6):
+            H_out[a, b] = H[a, b] - (gain * H[6, b] + offset * H[7, b])
+    return H_out, g_out
+
+
+@njit(nogil=True, cache=True)
+def _update_brightness(
+    brightness: NDArray[np.float64], H: NDArray[np.float64], g: NDArray[np.float64], step: NDArray[np.float64]
+) -> None:
+    """Add the gain and offset that belong to a step of the pose."""
+    left_gain, left_offset = -g[6], -g[7]
+    for a in range(6):
+        left_gain -= H[6, a] * step[a]
+        left_offset -= H[7, a] * step[a]
+    i, j, k = _invert_brightness(H)
+    brightness[0] += i * left_gain + j * left_offset
+    brightness[1] += j * left_gain + k * left_offset
+
+
+@njit(nogil=True, cache=True)
+def _invert_brightness(H: NDArray[np.float64]) -> tuple[float, float, float]:
+    """The inverse of the damped information of gain and offset: first entry, off the diagonal, last entry."""
+    gain, both, offset = H[6, 6] + BRIGHTNESS_DAMPING, H[6, 7], H[7, 7] + BRIGHTNESS_DAMPING
+    determinant = gain * offset - both * both
+    return offset / determinant, -both / determinant, gain / determinant
+
+
+@njit(nogil=True, cache=True)
+def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """x with A x = b for a positive definite A, which Cholesky's decomposition overwrites."""
+    n = len(b)
+    x = np.empty(n)
+    for i in range(n):
+        for j in range(i + 1):
+            left = A[i, j]
+            for k in range(j):
+                left -= A[i, k] * A[j, k]
+            A[i, j] = left / A[j, j] if j < i else math.sqrt(left)
+        left = b[i]
+        for k in range(i):
+            left -= A[i, k] * x[k]
+        x[i] = left / A[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= A[k, i] * x[k]
+        x[i] /= A[i, i]
+    return x
+
+
+@njit(nogil=True, cache=True)
+def _largest(step: NDArray[np.float64]) -> float:
+    largest = 0.0
+    for value in step:
+        largest = max(largest, abs(value))
+    return largest

@@ -63,7 +63,7 @@ def refine_poses(
     neighbors: number of earlier keyframes to pair each keyframe with, those that share most of its view.  rounds: how
     often pairs are chosen at most; a new round starts only if keyframes moved far.
     """
-    T = [np.array(pose) for pose in poses]
+    T = [np.array(pose, np.float64, order="C") for pose in poses]
     if len(T) < 2:
         return T
     made: dict[tuple[int, int], _Pair] = {}
