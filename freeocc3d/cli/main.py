@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 from .. import __version__
 from ..core.errors import FreeOccError, Interrupted, is_interrupt, printable
 from . import models
+from .check import check
 from .console import flag, say
 from .demo import demo
 from .evaluate import evaluate
@@ -64,7 +65,7 @@ def _options(
         raise typer.Exit
 
 
-for _command in (demo, inspect, reconstruct, query, view, info, export, refine, scale, evaluate, ground_truth):
+for _command in (demo, inspect, reconstruct, query, view, info, check, export, refine, scale, evaluate, ground_truth):
     app.command()(_command)
 app.command("list")(list_backends)
 app.add_typer(models.app, name="models")

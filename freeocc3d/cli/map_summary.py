@@ -48,6 +48,7 @@ def summary_document(loaded: Map) -> dict[str, Any]:
         },
         "seconds": report["seconds"],
         "peak_memory_bytes": report["peak_memory_bytes"],
+        "check": report.get("check"),
         "warnings": report["warnings"],
     }
 
@@ -68,6 +69,7 @@ def summary_text(loaded: Map) -> str:
         *([_vocabulary_text(said["vocabulary"])] if said["vocabulary"] else []),
         f"time       {sum(said['seconds'].values()):.1f} s: {seconds}",
         f"memory     {said['peak_memory_bytes'] / 1e9:.2f} GB at peak",
+        *([_check_text(said["check"], said["metric"])] if said["check"] else []),
     ]
     if said["submaps"] > 1:
         lines += [
@@ -104,6 +106,25 @@ def _scale_text(scale: dict[str, Any]) -> str:
     told = {"given": "as given", "length": "by a known length", "camera height": "by the cameras' height"}
     times = "" if scale["factor"] == 1 else f", {scale['factor']:.4g} per unit of the tracker"
     return f"scale      meters, {told.get(scale['by'], 'by the poses')}{times}"
+
+
+def _check_text(check: dict[str, Any], metric: bool) -> str:
+    """The verdict, how far the keyframes' depth differs, and how much of the map frames see through."""
+    told = {name: said for name, said in check["measures"].items() if said["value"] is not None}
+    parts = [
+        f"{length_text(told[name]['value'], metric)} {where}"
+        for name, where in (("step", "from one keyframe to the next"), ("revisit", "at revisits"))
+        if name in told
+    ]
+    depth = f", depth differs by {', by '.join(parts)}" if parts else ""
+    through = told.get("seen_through")
+    seen = f", {through['value']:.1%} of the occupied voxels are seen through" if through else ""
+    return f"check      {check['verdict'] or 'nothing to compare'}{depth}{seen}"
+
+
+def length_text(value: float, metric: bool) -> str:
+    """A small length with its unit."""
+    return f"{100 * value:.2f} cm" if metric else f"{value:.2g} units"
 
 
 def _vocabulary_text(vocabulary: dict[str, Any]) -> str:

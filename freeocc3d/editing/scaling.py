@@ -204,7 +204,17 @@ def _report(scan_map: Map, factor: float) -> dict[str, Any]:
     report["warnings"] = [notice.to_dict() for notice in warnings if notice.code != "scale-unknown"]
     if (rendering := report.get("rendering")) and rendering.get("depth_l1_m") is not None:
         report["rendering"] = {**rendering, "depth_l1_m": rendering["depth_l1_m"] * factor}
+    if check := report.get("check"):
+        measures = {name: _scaled(measure, factor) for name, measure in check["measures"].items()}
+        report["check"] = {**check, "measures": measures}
     return report
+
+
+def _scaled(measure: dict[str, Any], factor: float) -> dict[str, Any]:
+    """A measure of ``pipeline.map_check`` in a report; only lengths change."""
+    if measure["unit"] != "m" or measure["value"] is None:
+        return measure
+    return {**measure, "value": measure["value"] * factor}
 
 
 def _manifest(scan_map: Map, factor: float, by: str) -> Manifest:

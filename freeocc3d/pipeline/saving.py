@@ -20,7 +20,9 @@ from ..storage import map_files
 from ..storage.manifest import CaptureRecord, EncoderRecord, MapFacts, MapScale, SceneWords, matrix, vector
 from ..storage.work_folder import WorkFolder
 from ..storage.writer import MapParts, write_map
+from ..tracking.view_agreement import prepare_compared_view
 from ..viewer import render_pictures, trajectory_picture
+from .map_check import check_agreement
 from .mapper import Mapper
 from .report import report_of
 
@@ -49,6 +51,10 @@ def save(
         views = list(zip(trajectory.keyframes.tolist(), mapper.views(trajectory), strict=True))
         measured = [views[row][1] for row in evenly(len(views), _MEASURED_VIEWS)]
         fidelity = rendered_views.measure_fidelity(gaussians, measured, mapper.rasterizer)
+    with work.timed("check"):
+        held = [agrees for submap in submaps for agrees in submap.held.tolist()]
+        compared = [prepare_compared_view(frame) for frame in mapper.mapped(trajectory)]
+        checked = check_agreement(compared, trajectory.T_world_keyframe, occupancy, held).summary()
 
     def draw(folder: Path) -> None:
         path, up = folder / map_files.PATH_PICTURE, np.array(facts.up)
@@ -61,6 +67,7 @@ def save(
         return {
             **report_of(work, mapper, trajectory, submaps, tracking_reason),
             "rendering": dataclasses.asdict(fidelity),
+            "check": checked,
         }
 
     parts = MapParts(

@@ -43,6 +43,17 @@ class _Rendering(msgspec.Struct):
     depth_l1_m: float | None = None
 
 
+class _Measure(msgspec.Struct):
+    value: float | None
+    unit: str
+    count: _Count
+
+
+class _Check(msgspec.Struct):
+    verdict: Annotated[str, msgspec.Meta(max_length=12)]
+    measures: dict[str, _Measure]
+
+
 class _Report(msgspec.Struct):
     seconds: dict[str, float]
     peak_memory_bytes: _Count
@@ -52,6 +63,7 @@ class _Report(msgspec.Struct):
     color_focal: Annotated[float, msgspec.Meta(gt=0)] = 1.0
     submaps: list[_Submap] = []
     rendering: _Rendering | None = None
+    check: _Check | None = None
 
 
 def read_report(path: Path) -> dict[str, Any]:

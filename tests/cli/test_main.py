@@ -92,9 +92,9 @@ def test_mistakes_with_configurations_and_outputs(tmp_path, room) -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        [], ["demo"], ["reconstruct"], ["query"], ["view"], ["info"], ["export"], ["refine"], ["scale"], ["evaluate"],
-        ["ground-truth"], ["list"], ["models"], ["models", "pull"], ["models", "export"], ["models", "list"],
-        ["models", "verify"],
+        [], ["demo"], ["reconstruct"], ["query"], ["view"], ["info"], ["check"], ["export"], ["refine"], ["scale"],
+        ["evaluate"], ["ground-truth"], ["list"], ["models"], ["models", "pull"], ["models", "export"],
+        ["models", "list"], ["models", "verify"],
     ],
     ids=" ".join,
 )  # fmt: skip

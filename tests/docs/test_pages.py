@@ -40,7 +40,7 @@ def test_links_of_the_top_lead_somewhere(page: Path) -> None:
     assert not [link for link in links if not (ROOT / link).exists()]
 
 
-@pytest.mark.parametrize("module", ["map_summary", "query_answers", "region_details", "scores"])
+@pytest.mark.parametrize("module", ["map_summary", "check", "query_answers", "region_details", "scores"])
 def test_every_key_of_json_is_explained(module: str) -> None:
     """Keys of the dictionaries in functions whose names end in document, or that details are made by."""
     page = (ROOT / "docs" / "reference" / "json.md").read_text(encoding="utf-8")

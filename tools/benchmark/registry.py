@@ -109,6 +109,13 @@ MEASUREMENTS = {
         lines="plan_agreement:plan_lines",
         map_of=OURS,
     ),
+    "check": Measurement(
+        f"what the map of {OURS} says of itself: at its own poses, at the capture's, at poses that drift",
+        "map",
+        "self_check:measure_check",
+        lines="self_check:check_lines",
+        map_of=OURS,
+    ),
     "poses_from_color": Measurement(
         "poses from color alone: placed images, ATE and seconds, and those of pycolmap's pipeline at its defaults",
         "capture",
