@@ -52,10 +52,13 @@ class Color(Capture):
         return self.room.pose(index)
 
 
-def _source(capture: Capture, folder: Path, frames=FRAMES, change: Callable = lambda T: T, **options) -> StereoSource:
+SMALL = {"size": 128}
+
+
+def _source(capture: Capture, folder: Path, frames=FRAMES, change: Callable = lambda T: T) -> StereoSource:
     tracker = known.load(known.Options(), capture)
     tracker.T_world_cam = change(tracker.T_world_cam)
-    source = StereoSource(capture, multi_view_stereo.Options(size=128, **options))
+    source = StereoSource(capture, multi_view_stereo.Options(**SMALL))
     assert source.offline
     source.prepare(tracker, folder, frames, Progress())
     return source
@@ -65,6 +68,21 @@ def _source(capture: Capture, folder: Path, frames=FRAMES, change: Callable = la
 def computed(tmp_path_factory):
     capture, folder = Color(), tmp_path_factory.mktemp("stereo")
     return capture, folder, _source(capture, folder)
+
+
+@pytest.fixture(scope="module")
+def scan():
+    capture = Color()
+    return triangulate(capture, known.load(known.Options(), capture).T_world_cam, FRAMES, Progress())
+
+
+def _again(capture: Capture, scan, folder: Path, without: str = "", **options) -> multi_view_stereo.StereoDepth:
+    """Computes what a folder lacks, after the files of a pattern were removed from it."""
+    for path in folder.glob(without) if without else ():
+        path.unlink()
+    depth = multi_view_stereo.StereoDepth(folder, multi_view_stereo.Options(**SMALL, **options))
+    depth.compute(capture, scan, FRAMES, Progress())
+    return depth
 
 
 def _against_truth(capture, source):
@@ -96,74 +114,64 @@ def test_the_room_is_measured(computed) -> None:
 
 
 def test_what_was_computed_is_taken_up_again(computed) -> None:
-    capture, folder, source = computed
-    before = source._depth.depth(10)
-    times = {path: path.stat().st_mtime_ns for path in (folder / "depth").iterdir()}
-    removed = {folder / "depth" / name for name in ("surface.npz", "000010.depth.npz")}
-    for path in removed:
-        path.unlink()
-    again = _source(capture, folder)
-    np.testing.assert_array_equal(again._depth.depth(10)[0], before[0])
-    made_again = removed | {folder / "depth" / "layout.npz"}
-    assert {p for p in times if p.stat().st_mtime_ns != times[p]} == made_again
-    assert not list((folder / "depth").glob("*tmp*"))
-
-
-def test_a_damaged_surface_is_reported(computed, tmp_path: Path) -> None:
     capture, folder, _ = computed
-    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    (tmp_path / "depth" / "000010.depth.npz").unlink()
-    path = tmp_path / "depth" / "surface.npz"
+    files = {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in (folder / "depth").iterdir()}
+    for name in ("layout.npz", "000010.depth.npz"):
+        (folder / "depth" / name).unlink()
+    _source(capture, folder)
+    made_again = {name for name in files if (folder / "depth" / name).stat().st_mtime_ns != files[name][0]}
+    assert made_again == {"surface.npz", "layout.npz", "000010.depth.npz"}
+    assert {path.name: path.read_bytes() for path in (folder / "depth").iterdir()} == {
+        name: content for name, (_, content) in files.items()
+    }
+
+
+def test_a_damaged_surface_is_reported(computed, scan, tmp_path: Path) -> None:
+    capture, folder, _ = computed
+    copied = shutil.copytree(folder / "depth", tmp_path / "depth")
+    path = copied / "surface.npz"
     with np.load(path) as stored:
         arrays = dict(stored)
     np.savez(path, **{**arrays, "triangles": arrays["triangles"] + len(arrays["vertices"])})
     with pytest.raises(MapError, match=r"surface.npz is damaged"):
-        _source(capture, tmp_path)
+        _again(capture, scan, copied)
     np.savez(path, **{**arrays, "sigma_m": arrays["sigma_m"][:-1]})
     with pytest.raises(MapError, match=r"surface.npz is damaged: its arrays"):
-        _source(capture, tmp_path)
+        _again(capture, scan, copied)
     path.write_bytes(b"")
     with pytest.raises(MapError, match=r"surface.npz is damaged"):
-        _source(capture, tmp_path)
+        _again(capture, scan, copied)
 
 
-def test_a_damaged_layout_is_reported(computed, tmp_path: Path) -> None:
+def test_a_damaged_layout_is_reported(computed, scan, tmp_path: Path) -> None:
     capture, folder, _ = computed
-    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    (tmp_path / "depth" / "000010.depth.npz").unlink()
-    path = tmp_path / "depth" / "layout.npz"
+    copied = shutil.copytree(folder / "depth", tmp_path / "depth")
+    path = copied / "layout.npz"
     with np.load(path) as stored:
         arrays = dict(stored)
     assert len(arrays["offsets"]) > 0
     for name, damaged in (("support", arrays["support"][:-1]), ("offsets", arrays["offsets"][:-1])):
         np.savez(path, **{**arrays, name: damaged})
         with pytest.raises(MapError, match=r"layout.npz is damaged: it holds"):
-            _source(capture, tmp_path)
+            _again(capture, scan, copied)
     np.savez(path, **{name: array for name, array in arrays.items() if name != "outermost"})
     with pytest.raises(MapError, match=r"layout.npz is damaged"):
-        _source(capture, tmp_path)
-    path.unlink()  # as a resumed run does with a torn file: it is made again
-    _source(capture, tmp_path)
-    for name in ("layout.npz", "surface.npz", "000010.depth.npz"):
-        assert (tmp_path / "depth" / name).read_bytes() == (folder / "depth" / name).read_bytes()
+        _again(capture, scan, copied)
 
 
-def test_images_that_show_nothing_are_reported(tmp_path: Path) -> None:
+def test_images_that_show_nothing_are_reported(scan, tmp_path: Path) -> None:
     class Blank(Color):
         def __getitem__(self, index: int) -> Frame:
             frame = super().__getitem__(index)
             return replace(frame, color=np.full_like(frame.color, 128))
 
-    capture, tracker = Color(), known.load(known.Options(), Color())
-    scan = triangulate(capture, tracker.T_world_cam, range(6), Progress())
     depth = multi_view_stereo.StereoDepth(tmp_path, multi_view_stereo.Options(size=64))
     with pytest.raises(TrackingError, match="bare surfaces"):
         depth.compute(Blank(), scan, range(6), Progress())
 
 
-def test_points_are_where_surfaces_are(computed) -> None:
+def test_points_are_where_surfaces_are(computed, scan) -> None:
     capture, _, _ = computed
-    scan = triangulate(capture, known.load(known.Options(), capture).T_world_cam, FRAMES, Progress())
     assert len(scan.points) > 500
     frame = capture.room[10]
     seen = scan.points[scan.seen_point[scan.seen_frame == 10]]
@@ -177,20 +185,22 @@ def test_points_are_where_surfaces_are(computed) -> None:
     assert np.median(off) < 0.05
 
 
-def test_broken_frames_are_done_without(tmp_path: Path) -> None:
+def test_broken_frames_are_done_without(computed, scan, tmp_path: Path) -> None:
     capture = Color()
     capture.broken = {5}
-    source = _source(capture, tmp_path, range(8))
-    assert source._depth.depth(5) is None
-    assert source._depth.depth(4) is not None
+    copied = shutil.copytree(computed[1] / "depth", tmp_path / "depth")
+    depth = _again(capture, scan, copied, without="00000[45].*.npz")
+    assert depth.depth(5) is None
+    assert depth.depth(4) is not None
 
 
-def test_a_network_fills_what_stereo_leaves_empty(tmp_path: Path) -> None:
+def test_a_network_fills_what_stereo_leaves_empty(computed, scan, tmp_path: Path) -> None:
     network = write_network(tmp_path / "n.onnx")
-    capture = Color()
-    plain = _source(capture, tmp_path / "a", range(6))
-    fused = _source(capture, tmp_path / "b", range(6), network=str(network))
-    counts = [[np.count_nonzero(t._depth.depth(i)[0]) for i in range(1, 5)] for t in (plain, fused)]
+    copied = shutil.copytree(computed[1] / "depth", tmp_path / "depth")
+    for path in copied.glob("*.depth.npz"):
+        path.unlink()
+    fused = _again(Color(), scan, copied, without="*.view.npz", network=str(network))
+    counts = [[np.count_nonzero(depth.depth(i)[0]) for i in range(1, 5)] for depth in (computed[2]._depth, fused)]
     assert (np.array(counts[1]) >= counts[0]).all()
 
 
