@@ -225,7 +225,7 @@ def test_saved_loaded_exported_and_drawn(room: Map, fine: Map, tmp_path: Path) -
 
 
 def test_as_an_option_of_reconstruct_it_is_the_same_map(tmp_path: Path) -> None:
-    part = {"stop": 40, "stride": 8, "color_focal": 1.0, "synthetic": {"width": 320, "height": 240}}
+    part = {**SETTINGS["capture"], "stop": 24}
     settings = {**SETTINGS, "capture": part}
     room = pipeline.reconstruct("builtin:room", tmp_path / "room", settings)
     made = pipeline.reconstruct("builtin:room", tmp_path / "at_once", {**settings, "occupancy": {"finest": 0.02}})

@@ -13,7 +13,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-SMALL = ["--set", "capture.stop=8", "--set", "capture.synthetic.width=160", "--set", "capture.synthetic.height=120"]
+_VALUES = {
+    "capture.stop": 8, "capture.color_focal": 1, "capture.synthetic.width": 160, "capture.synthetic.height": 120,
+    "fitting.passes": 1,
+}  # fmt: skip
+SMALL = [word for name, value in _VALUES.items() for word in ("--set", f"{name}={value}")]
 """Options of ``reconstruct builtin:room`` for a map in a few seconds."""
 
 _FORKING = multiprocessing.get_context("forkserver")

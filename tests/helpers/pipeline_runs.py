@@ -8,9 +8,13 @@ import yaml
 
 from freeocc3d.core.warnings import Notice, read_notices
 
-ROOM = {"capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "stop": 24}}
-QUICK_ROOM = {"capture": {**ROOM["capture"], "color_focal": 1.0}, "fitting": {"passes": 1}}
-"""The same without the calibration of color, which takes half of the time."""
+ROOM = {
+    "capture": {"synthetic": {"frames": 240, "width": 160, "height": 120}, "stop": 24, "color_focal": 1.0},
+    "fitting": {"passes": 1},
+}
+"""Without the calibration of color, which would take half of the time."""
+
+ONE_PASS = {"fitting": {"passes": 1}}
 
 
 def notices(made) -> list[Notice]:

@@ -3,25 +3,41 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import cv2
 import pytest
-from pipeline_runs import ROOM
+from made_once import make_once
+from pipeline_runs import ONE_PASS, ROOM
 from small_captures import data_folder
 
 import freeocc3d
-from freeocc3d import Map
+from freeocc3d import Map, load_map
 
 
 @pytest.fixture(scope="session")
 def room(tmp_path_factory) -> Map:
-    return freeocc3d.reconstruct("builtin:room", tmp_path_factory.mktemp("maps") / "room", ROOM)
+    def make(path: Path) -> None:
+        freeocc3d.reconstruct("builtin:room", path, ROOM)
+
+    return load_map(make_once(tmp_path_factory, "room-of-runs", make))
 
 
 @pytest.fixture(scope="session")
 def glued(tmp_path_factory):
     """A folder of two places, at a quarter of their size: 15 frames of the bedroom, then 8 of the living room."""
-    folder = tmp_path_factory.mktemp("glued") / "scan"
+    return make_once(tmp_path_factory, "glued", _glue)
+
+
+@pytest.fixture(scope="session")
+def two_places(tmp_path_factory, glued) -> Map:
+    def make(path: Path) -> None:
+        freeocc3d.reconstruct(glued, path, ONE_PASS)
+
+    return load_map(make_once(tmp_path_factory, "two-places", make))
+
+
+def _glue(folder: Path) -> None:
     (folder / "results").mkdir(parents=True)
     house = data_folder() / "house"
     parameters = json.loads((house / "bedroom" / "cam_params.json").read_text())
@@ -36,4 +52,3 @@ def glued(tmp_path_factory):
             how = cv2.INTER_AREA if image.ndim == 3 else cv2.INTER_NEAREST
             small = cv2.resize(image, (camera["w"], camera["h"]), interpolation=how)
             cv2.imwrite(str(folder / "results" / kind.format(n)), small)
-    return folder

@@ -11,7 +11,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from pipeline_runs import ROOM, listing, notices
+from pipeline_runs import ONE_PASS, ROOM, listing, notices
 from small_captures import data_folder, truncate, write_image, write_scannet, write_seven_scenes
 
 import freeocc3d
@@ -84,18 +84,21 @@ def test_a_pose_free_run_never_reads_poses_or_class_images(tmp_path, monkeypatch
     monkeypatch.setattr(Reader, "pose", forbidden)
     monkeypatch.setattr(Reader, "labels", forbidden)
     made = freeocc3d.reconstruct(
-        data_folder() / "7scenes-kitchen", tmp_path / "map", {"capture": {"stop": 40, "stride": 4}}
+        data_folder() / "7scenes-kitchen",
+        tmp_path / "map",
+        {"capture": {"stop": 40, "stride": 4}, **ONE_PASS},
     )
     assert made.manifest.counts.frames_with_pose == 10
     assert made.manifest.counts.voxels.occupied > 500
 
 
-def test_neighboring_folders_are_left_alone(tmp_path, room) -> None:
+def test_overwrite_replaces_a_map_and_leaves_neighboring_folders_alone(tmp_path, room) -> None:
     output = shutil.copytree(room.path, tmp_path / "map")
     (tmp_path / "map.old").mkdir()
     (tmp_path / "map.old" / "backup.txt").write_text("mine")
-    short = {"capture": {**ROOM["capture"], "stop": 4}}
-    freeocc3d.reconstruct("builtin:room", output, short, overwrite=True)
+    short = {**ROOM, "capture": {**ROOM["capture"], "stop": 4}}
+    made = freeocc3d.reconstruct("builtin:room", output, short, overwrite=True)
+    assert made.manifest.counts.frames_with_pose == 4
     assert (tmp_path / "map.old" / "backup.txt").read_text() == "mine"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["map", "map.old"]
     (tmp_path / "next.partial").mkdir()
@@ -125,7 +128,7 @@ def test_an_old_name_is_warned_of_at_once_and_in_the_report(tmp_path) -> None:
         def warn(self, text: str) -> None:
             said.append(text)
 
-    given = {"capture": {**ROOM["capture"], "stop": 4}, "gaussians": {"initialisation": "isotropic"}}
+    given = {**ROOM, "capture": {**ROOM["capture"], "stop": 4}, "gaussians": {"initialisation": "isotropic"}}
     made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", given, progress=Heard())
     (notice,) = (notice for notice in notices(made) if notice.code == "option-renamed")
     assert notice.text in said
@@ -140,14 +143,6 @@ def test_a_folder_that_is_no_map_is_never_overwritten(tmp_path) -> None:
     with pytest.raises(MapError, match="not a map"):
         freeocc3d.reconstruct("builtin:room", precious, ROOM, overwrite=True)
     assert (precious / "thesis.txt").read_text() == "years of work"
-
-
-def test_overwrite_replaces_a_map(tmp_path, room) -> None:
-    output = shutil.copytree(room.path, tmp_path / "map")
-    short = {"capture": {**ROOM["capture"], "stop": 6}}
-    made = freeocc3d.reconstruct("builtin:room", output, short, overwrite=True)
-    assert made.manifest.counts.frames_with_pose == 6
-    assert [p.name for p in tmp_path.iterdir()] == ["map"]
 
 
 @pytest.mark.parametrize(
@@ -181,7 +176,7 @@ def test_frames_that_cannot_be_read_are_skipped_and_counted(tmp_path) -> None:
             shutil.copy(data_folder() / "7scenes-kitchen" / f"frame-{i:06d}.{kind}", scan)
     truncate(scan / "frame-000007.color.jpg")
     truncate(scan / "frame-000011.depth.png")
-    made = freeocc3d.reconstruct(scan, tmp_path / "map")
+    made = freeocc3d.reconstruct(scan, tmp_path / "map", ONE_PASS)
     assert made.report["frames"]["broken"] == 2
     assert len(made.report["broken"]) == 2
     assert "frame-000007.color.jpg" in made.report["broken"]["7"]
@@ -239,10 +234,10 @@ def test_labels_of_the_capture_answer_by_class(tmp_path) -> None:
     assert not made.query("bathtub").matched
 
 
-def test_two_places_are_two_submaps_and_the_largest_is_mapped(tmp_path, glued) -> None:
+def test_two_places_are_two_submaps_and_the_largest_is_mapped(two_places) -> None:
     from freeocc3d.cli.map_summary import summary_text
 
-    made = freeocc3d.reconstruct(glued, tmp_path / "map", {"fitting": {"passes": 1}})
+    made = two_places
     assert made.manifest.counts.submaps == 2
     assert made.manifest.counts.frames_with_pose == 15
     assert made.report["frames"]["apart"] == 8

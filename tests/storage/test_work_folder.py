@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from pipeline_runs import QUICK_ROOM, content, listing, notices
+from pipeline_runs import ROOM, content, listing, notices
 
 import freeocc3d
 from freeocc3d.core.errors import Interrupted, MapError
@@ -15,7 +15,7 @@ from freeocc3d.core.progress import Progress
 from freeocc3d.storage import work_folder
 from freeocc3d.storage.work_folder import WorkFolder
 
-FEW = {**QUICK_ROOM, "capture": {**QUICK_ROOM["capture"], "stop": 6}}
+FEW = {**ROOM, "capture": {**ROOM["capture"], "stop": 6}}
 
 
 class Killed(BaseException):

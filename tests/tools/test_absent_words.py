@@ -36,7 +36,7 @@ def test_a_scene_holds_what_its_truth_holds() -> None:
 
 def test_a_map_of_class_images_is_not_asked_in_vain(tmp_path: Path) -> None:
     models_folder()
-    bedroom = thin_house(data_folder() / "house" / "bedroom", tmp_path, 8)
+    bedroom = thin_house(data_folder() / "house" / "bedroom", tmp_path, 24)
     (row,) = json.loads(run_benchmark("--captures", bedroom, "--variants", "absent_words", "--json"))["measurements"][
         "absent_words"
     ]

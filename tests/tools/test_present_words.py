@@ -14,7 +14,7 @@ from small_captures import data_folder, thin_house
 def test_classes_of_a_real_room_are_found_by_their_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(present_words, "COLD_STARTS", 1)
     monkeypatch.setattr(present_words, "run_inside", lambda function, **given: find_function(function)(**given))
-    bedroom = thin_house(data_folder() / "house" / "bedroom", tmp_path, 8)
+    bedroom = thin_house(data_folder() / "house" / "bedroom", tmp_path, 20)
     row = {"capture": "house/bedroom", **present_words.measure_present_words(str(bedroom))}
     assert json.loads(json.dumps(row)) == row
     found = row["classes"]
