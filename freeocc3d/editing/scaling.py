@@ -24,7 +24,6 @@ from ..core.transforms import back_project, transform
 from ..core.types import Gaussians, Submap, Trajectory
 from ..core.warnings import read_notices
 from ..gaussians import rendered_views
-from ..occupancy.gravity_frame import is_floor_seen
 from ..query.scan_map import Map, load_map
 from ..settings import registry
 from ..settings.config import Settings
@@ -33,6 +32,7 @@ from ..storage.manifest import Manifest, MapScale, matrix, vector
 from ..storage.work_folder import WorkFolder
 from ..storage.writer import MapParts, write_changed_map
 from ..tracking.trajectory_alignment import Poses, align_trajectories, read_poses, select_estimated_poses
+from ..tracking.upright.upright_frame import find_flat_gaussians, find_upright_frame
 from ..viewer import render_pictures, trajectory_picture
 
 _NEAR_PX = 6
@@ -92,10 +92,11 @@ def scale_by_camera_height(scan_map: Map, meters: float) -> float:
     """The factor by which the median height of the keyframes above the floor is ``meters``. Raises MapError if the map
     shows no floor below them."""
     _require_meters(meters, "camera height")
-    T_gravity_map, poses = scan_map.T_gravity_map, scan_map.trajectory.T_world_keyframe
-    if not is_floor_seen(T_gravity_map, poses, scan_map.gaussians):
+    poses, upright = scan_map.trajectory.T_world_keyframe, scan_map.manifest.upright
+    found = upright or find_upright_frame(poses, find_flat_gaussians(scan_map.gaussians, poses))
+    if not found.floor:
         raise MapError(f"{scan_map.path} shows no floor below the cameras: give a known length instead (--length).")
-    height = float(np.median(transform(T_gravity_map, poses[:, :3, 3])[:, 2]))
+    height = float(np.median(transform(scan_map.T_gravity_map, poses[:, :3, 3])[:, 2]))
     return meters / height
 
 
@@ -227,8 +228,9 @@ def _manifest(scan_map: Map, factor: float, by: str) -> Manifest:
     }
     if said.finest_voxel_m is not None:
         changes["finest_voxel_m"] = factor * said.finest_voxel_m
-    if said.T_gravity_map is not None:
-        changes["T_gravity_map"] = matrix(_moved(np.array(said.T_gravity_map), factor))
+    for name in ("T_gravity_map", "T_first_camera"):
+        if (T := getattr(said, name)) is not None:
+            changes[name] = matrix(_moved(np.array(T), factor))
     if said.refined is not None and (box := said.refined.box) is not None:
         low, high = vector(factor * np.array(box[:3])), vector(factor * np.array(box[3:]))
         changes["refined"] = msgspec.structs.replace(said.refined, box=(*low, *high))

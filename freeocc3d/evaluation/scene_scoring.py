@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ..core.errors import FreeOccError
 from ..core.types import UNKNOWN
 from ..gaussians.splat_ply import read_standard_ply
-from ..occupancy.up_direction import estimate_up
 from ..query.scan_map import Map
 from ..settings import config
 from ..storage.map_files import CONFIG
@@ -26,6 +25,7 @@ from ..tracking.trajectory_alignment import (
     read_true_poses,
     select_estimated_poses,
 )
+from ..tracking.upright.up_direction import estimate_up
 from . import predictions
 from .confusion import Prediction
 from .scored_classes import ClassMap

@@ -88,13 +88,13 @@ def to_frame(scan_map: Map, frame: str) -> NDArray[np.float64]:
         return np.eye(4)
     if frame == "gravity":
         return scan_map.T_gravity_map
-    from ..occupancy.gravity_frame import compute_first_camera_frame
+    from ..tracking.upright.upright_frame import compute_start_frame
 
     trajectory = scan_map.trajectory
     posed = np.flatnonzero(trajectory.has_pose)
     if not len(posed):
         raise ExportError("The map has no camera pose, so there is no first camera: use --frame gravity.")
-    return compute_first_camera_frame(scan_map.T_gravity_map, trajectory.T_world_cam[posed[0]])
+    return compute_start_frame(scan_map.T_gravity_map, trajectory.T_world_cam[posed[0]])
 
 
 def place_voxels(
@@ -106,9 +106,9 @@ def place_voxels(
 ) -> PlacedVoxels:
     """Returns the map's voxels in a frame.
 
-    In the map's frame, voxels keep their places. In another frame, they are resampled on a lattice of the map's
-    (largest) voxel size. They are also resampled if ``one_size`` asks for it, or if ``origin`` is not on the map's
-    lattice.
+    In the map's frame, voxels keep their places, and so in the gravity frame of a map that stands upright. In another
+    frame, they are resampled on a lattice of the map's (largest) voxel size. They are also resampled if ``one_size``
+    asks for it, or if ``origin`` is not on the map's lattice.
 
     origin: (3,) lower corner of some voxel, in the frame; by default the map's lattice in the map's frame, else z = 0
     lies in the middle of a layer of voxels.  box: x0, y0, z0, x1, y1, z1 in the frame; voxels with centers outside of
@@ -125,7 +125,7 @@ def _placed(scan_map: Map, frame: str, origin: ArrayLike | None, one_size: bool)
     occupancy, T = scan_map.occupancy, to_frame(scan_map, frame)
     if not len(occupancy.keys):
         raise ExportError("The map has no known voxels to write.")
-    own = frame == "map" and _on_lattice(occupancy, origin)
+    own = np.array_equal(T, np.eye(4)) and _on_lattice(occupancy, origin)
     if own and not (one_size and occupancy.deepest):
         return PlacedVoxels(occupancy, np.arange(len(occupancy.colors)), frame, T, scan_map.metric)
     plain = occupancy.replace(features=np.zeros((len(occupancy.colors), 0), np.float16))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from ..capture import Capture, read_ahead
 from ..capture import base as capture_base
 from ..core.errors import FrameError, TrackingError
 from ..core.progress import Progress
-from ..core.types import Frame, Gaussians, Occupancy, PosedFrame, Trajectory
+from ..core.types import Frame, Gaussians, Occupancy, PosedFrame, Submap, Trajectory
 from ..depth.base import DepthSource, MeasuredDepth
 from ..depth.stereo_source import StereoSource
 from ..editing import adaptive_voxels
@@ -27,6 +28,10 @@ from ..settings.config import Settings
 from ..storage import map_files
 from ..storage.keyframes import Keyframes
 from ..tracking.base import Tracked, Tracker
+from ..tracking.upright.lattice import find_lattice_origin
+from ..tracking.upright.surface_patches import find_surface_patches
+from ..tracking.upright.up_direction import turn_back
+from ..tracking.upright.upright_frame import UprightFrame, find_upright_frame
 from .tracking_choice import choose_tracker
 
 _FINE = 0.01
@@ -34,7 +39,9 @@ _FINE = 0.01
 
 
 class Mapper:
-    """Takes frames one by one. ``folder`` receives the keyframes. Memory grows with the number of keyframes only."""
+    """Takes frames one by one. ``folder`` receives the keyframes. Memory grows with the number of keyframes only.
+
+    Poses and layers 2-4 are in the map's frame: the tracker's world until ``refine`` finds the upright frame."""
 
     def __init__(self, settings: Settings, capture: Capture, folder: Path):
         settings, _ = choose_tracker(settings, capture)
@@ -53,6 +60,10 @@ class Mapper:
         self.rasterizer: Rasterizer = settings.load_backend("fitting")
         self.refined = False
         """Whether all poses so far are consistent with each other."""
+        self.upright: UprightFrame | None = None
+        """The frame of the map, found by the last ``refine``. None = the tracker's world."""
+        self.origin = np.zeros(3)
+        """(3,) lower corner of voxel (0, 0, 0) in the map's frame, meters."""
 
     @property
     def offline(self) -> bool:
@@ -74,31 +85,55 @@ class Mapper:
         self.refined = False
         if tracked.status == "keyframe":
             self.keyframes.append(frame)
-        return tracked
+        if tracked.T_world_cam is None:
+            return tracked
+        return replace(tracked, T_world_cam=self.T_map_world @ tracked.T_world_cam)
 
     def refine(self) -> None:
-        """Make all poses so far consistent with each other."""
+        """Make all poses so far consistent with each other, and let the map stand upright: z up, the floor at z = 0."""
         self.tracker.optimize()
+        trajectory = self.tracker.trajectory(self.capture.timestamps)
+        poses, keyframes = trajectory.T_world_keyframe, self.mapped(trajectory)
+        turned = np.array([self.capture.turned(index) for index in trajectory.keyframes.tolist()], np.int8)
+        cameras = [camera for _, camera in keyframes.views()]
+        patches = find_surface_patches(zip(map(keyframes.depth_m, range(len(keyframes))), cameras, poses, strict=True))
+        self.upright = find_upright_frame(turn_back(poses, turned), patches)
+        voxel_size = self.settings.occupancy.voxel_size
+        self.origin = find_lattice_origin(patches.moved(self.upright.T_upright_world), voxel_size)
         self.refined = True
+
+    @property
+    def T_map_world(self) -> NDArray[np.float64]:
+        """(4, 4) from the tracker's world to the map's frame."""
+        return np.eye(4) if self.upright is None else self.upright.T_upright_world
 
     def state(self, done: int) -> dict[str, NDArray[Any]]:
         """What ``restore`` needs after ``done`` frames, apart from the keyframes' images, which are on the disk
         then."""
-        own = {"done": done, "refined": self.refined, "keyframes": self.keyframes.checkpoint()}
-        return {**{name: np.array(value) for name, value in own.items()}, **self.tracker.state()}
+        own = {"done": done, "refined": self.refined, "keyframes": self.keyframes.checkpoint(), "origin": self.origin}
+        frame = {} if self.upright is None else {"upright": self.upright.to_array()}
+        return {**{name: np.array(value) for name, value in own.items()}, **frame, **self.tracker.state()}
 
     def restore(self, state: dict[str, NDArray[Any]]) -> int:
         """Continue from a ``state``, to the same map as without a stop. Returns the number of frames that were added.
         Reads keyframes from the capture: those on disk are compressed. Raises CaptureError if one is unreadable now."""
         done, self.refined = int(state.pop("done")), bool(state.pop("refined"))
-        checkpoint = str(state.pop("keyframes"))
+        checkpoint, self.origin = str(state.pop("keyframes")), state.pop("origin")
+        self.upright = UprightFrame.from_array(state.pop("upright")) if "upright" in state else None
         self.keyframes = Keyframes.resumed(self.keyframes.folder, checkpoint, self._read)
         self.tracker.restore(state, self._read)
         return done
 
     def trajectory(self) -> Trajectory:
         """Poses so far, one row per frame of the capture."""
-        return self.tracker.trajectory(self.capture.timestamps)
+        found = self.tracker.trajectory(self.capture.timestamps)
+        return replace(found, T_world_cam=self.T_map_world @ found.T_world_cam)
+
+    def submaps(self) -> list[Submap]:
+        """The connected components of the camera path: the mapped one first, in the map's frame; the others in their
+        own."""
+        found = self.tracker.submaps()
+        return [replace(each, T_submap_cam=self.T_map_world @ each.T_submap_cam) for each in found[:1]] + found[1:]
 
     def mapped(self, trajectory: Trajectory) -> Keyframes:
         """The mapped keyframes: those of the largest submap."""
@@ -192,6 +227,7 @@ class Mapper:
             self.posed(trajectory, carving.every),
             self.settings.occupancy,
             carving,
+            origin=self.origin,
             progress=progress.advance,
             least_scale=anchors.compute_least_scale(
                 self.settings.gaussians,

@@ -10,14 +10,22 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.transforms import invert
 from ..core.types import Gaussians, Occupancy, Trajectory
 from ..gaussians import rendered_views
 from ..language.encoders.base import Encoder
 from ..language.feature_codec import Codec
-from ..occupancy.gravity_frame import estimate_gravity_frame
-from ..occupancy.up_direction import estimate_up, turn_back
 from ..storage import map_files
-from ..storage.manifest import CaptureRecord, EncoderRecord, MapFacts, MapScale, SceneWords, matrix, vector
+from ..storage.manifest import (
+    UPRIGHT_FRAME,
+    CaptureRecord,
+    EncoderRecord,
+    MapFacts,
+    MapScale,
+    SceneWords,
+    Upright,
+    matrix,
+)
 from ..storage.work_folder import WorkFolder
 from ..storage.writer import MapParts, write_map
 from ..tracking.view_agreement import prepare_compared_view
@@ -42,12 +50,12 @@ def save(
     tracking_reason: str,
 ) -> None:
     """Write the map of a run into its work folder."""
-    capture, metric, submaps = mapper.capture, mapper.tracker.metric, mapper.tracker.submaps()
+    capture, metric, submaps = mapper.capture, mapper.tracker.metric, mapper.submaps()
     settings = mapper.settings
     if not metric:  # states how fine its Gaussians are, for projections on other lattices
         settings = settings.changed("gaussians", cell_size=mapper.cell_size)
     with work.timed("saving"):
-        facts = _facts(mapper, trajectory, gaussians, encoder, vocabulary)
+        facts = _facts(mapper, trajectory, encoder, vocabulary)
         views = list(zip(trajectory.keyframes.tolist(), mapper.views(trajectory), strict=True))
         measured = [views[row][1] for row in evenly(len(views), _MEASURED_VIEWS)]
         fidelity = rendered_views.measure_fidelity(gaussians, measured, mapper.rasterizer)
@@ -77,23 +85,19 @@ def save(
     write_map(work, parts)
 
 
-def _facts(
-    mapper: Mapper,
-    trajectory: Trajectory,
-    gaussians: Gaussians,
-    encoder: Encoder,
-    vocabulary: dict[str, Any] | None,
-) -> MapFacts:
-    capture = mapper.capture
-    turned = np.array([capture.turned(index) for index in trajectory.keyframes.tolist()], np.int8)
-    held = turn_back(trajectory.T_world_keyframe, turned)
+def _facts(mapper: Mapper, trajectory: Trajectory, encoder: Encoder, vocabulary: dict[str, Any] | None) -> MapFacts:
+    capture, upright = mapper.capture, mapper.upright
+    assert upright is not None  # refined
     return MapFacts(
         capture=CaptureRecord(path=absolute(capture.path), format=capture.format, frames=len(capture)),
-        frame=mapper.tracker.world,
+        frame=UPRIGHT_FRAME,
+        world=mapper.tracker.world,
         scale=_scale(mapper),
-        up=vector(estimate_up(held, gaussians.means)),
-        T_world_map=matrix(np.eye(4)),
-        T_gravity_map=matrix(estimate_gravity_frame(held, gaussians)),
+        up=(0.0, 0.0, 1.0),
+        upright=Upright(by=upright.by, off_deg=upright.off_deg, floor=upright.floor, walls=upright.walls),
+        T_world_map=matrix(invert(mapper.T_map_world)),
+        T_first_camera=matrix(invert(trajectory.T_world_cam[np.flatnonzero(trajectory.has_pose)[0]])),
+        T_gravity_map=matrix(np.eye(4)),
         encoder=EncoderRecord(name=encoder.name, dimension=encoder.dimension, state=encoder.text_state()),
         vocabulary=msgspec.convert(vocabulary, SceneWords) if vocabulary else None,
     )

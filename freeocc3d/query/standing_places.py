@@ -55,7 +55,9 @@ def standing_places(
         from ..occupancy.levels import make_uniform
 
         one = make_uniform(plain)
-    level, rows = resample_occupancy(one, T_gravity_map, np.array((0.0, 0.0, -0.5 * one.voxel_size)))
+    level, rows = one, np.arange(len(one.colors))
+    if not np.array_equal(T_gravity_map, np.eye(4)):
+        level, rows = resample_occupancy(one, T_gravity_map, np.array((0.0, 0.0, -0.5 * one.voxel_size)))
     if not len(level.voxels(OCCUPIED)):
         return [None] * len(regions)
     cells = _Cells(level)

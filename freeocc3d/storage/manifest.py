@@ -36,6 +36,8 @@ numbers lose their meaning."""
 _LEVELS, _ALMOST, _UNIT = 13, 1e-6, 1e-3
 _FILE = re.compile(r"(?:keyframes/)?(?!\.\.?$)[^/\\\0-\x1f]{1,200}")
 
+UPRIGHT_FRAME = "z up, the floor at z = 0, walls along x and y, meters"
+"""The frame of maps that stand upright, in words."""
 POSES = "camera to world"
 CODEC = "transform coding, 8, 4 and 2 bits a direction"
 
@@ -123,6 +125,18 @@ class SceneWords(msgspec.Struct, frozen=True, kw_only=True):
     names: dict[str, NameCount]
 
 
+class Upright(msgspec.Struct, frozen=True, kw_only=True):
+    """How sure the upright frame of a map is. by: what up comes from, the surest first: "floor", "level surfaces",
+    "walls" or "cameras".  off_deg: degrees from that up to the up of the walls, or of the cameras where there are none;
+    for the cameras alone, by how much they were rolled.  floor: whether z = 0 is a floor, or else the level of the
+    lowest points.  walls: whether x and y lie along walls, or else along the first camera's view."""
+
+    by: str
+    off_deg: float
+    floor: bool
+    walls: bool
+
+
 class Refined(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The map of larger voxels that this map refines. box: x0 y0 z0 x1 y1 z1 of the refined part, meters; None = the
     whole map."""
@@ -138,8 +152,15 @@ class MapFacts(msgspec.Struct, frozen=True, kw_only=True):
     frame: Annotated[str, _key("the frame of the map, in words")] = ""
     poses: Annotated[str, _key("the direction of the poses, in words")] = POSES
     scale: Annotated[MapScale, _key("the unit of length")] = MapScale(metric=True)
+    world: Annotated[str, _key("the world of T_world_map, in words")] = ""
     up: Annotated[Vector, _key("unit vector x y z that points up in the map's frame")]
-    T_world_map: Annotated[Matrix, _key("4 x 4, rigid, from the map's frame to the world of the capture's own poses")]
+    upright: Annotated[Upright | None, _key("how sure the upright frame is; earlier maps do not stand upright")] = None
+    T_world_map: Annotated[
+        Matrix, _key("4 x 4, rigid, from the map's frame to the world of the given or tracked poses")
+    ]
+    T_first_camera: Annotated[
+        Matrix | None, _key("4 x 4, rigid, from the map's frame to the first camera's: x right, y down, z forward")
+    ] = None
     T_gravity_map: Annotated[Matrix | None, _key("4 x 4, rigid, to the frame with z up and the floor at z = 0")] = None
     encoder: Annotated[EncoderRecord, _key("the encoder of the features")]
     codec: Annotated[str, _key("how features are packed, in words")] = CODEC
@@ -256,7 +277,7 @@ def _problem(manifest: Manifest) -> str:
         return "'up' is not a unit vector"
     if not _among(manifest.scale.factor, _FACTORS):
         return f"'scale.factor' is not a finite number between {_FACTORS[0]:g} and {_FACTORS[1]:g}"
-    for name in ("T_world_map", "T_gravity_map"):
+    for name in ("T_world_map", "T_gravity_map", "T_first_camera"):
         T = getattr(manifest, name)
         if T is not None and not (is_rigid(np.array(T)) and np.abs(np.array(T)).max() <= _FARTHEST):
             return f"'{name}' is not a rigid transform"

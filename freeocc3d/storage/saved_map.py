@@ -66,7 +66,7 @@ class SavedMap:
     def T_gravity_map(self) -> NDArray[np.float64]:
         """(4, 4) to the frame with z up and the floor at z = 0; estimated here for maps of earlier versions."""
         if self.manifest.T_gravity_map is None:
-            from ..occupancy.gravity_frame import estimate_gravity_frame
+            from ..tracking.upright.upright_frame import estimate_gravity_frame
 
             return estimate_gravity_frame(self.trajectory.T_world_keyframe, self.gaussians)
         return np.array(self.manifest.T_gravity_map, np.float64)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import Gaussians, Submap, Trajectory
-from ..occupancy.up_direction import estimate_up
+from ..tracking.upright.up_direction import estimate_up
 from .scene_rendering import BACKGROUND, choose_cut_height, turn_upright
 
 SIZE = 1500, 1000

@@ -9,6 +9,7 @@ import pytest
 from pipeline_runs import ROOM
 
 from freeocc3d.capture import open_capture
+from freeocc3d.core.transforms import invert
 from freeocc3d.core.types import OCCUPIED, Gaussians, Occupancy
 from freeocc3d.pipeline.mapper import Mapper
 from freeocc3d.settings import config
@@ -65,8 +66,29 @@ def test_gaussians_stay_at_their_anchors(layers) -> None:
     np.testing.assert_allclose(world, gaussians.means, atol=1e-4)
 
 
+def test_after_a_refinement_the_map_stands_upright(layers) -> None:
+    """In the world of the built-in room, z is up, and walls lie along x and y. These frames show a table, no floor."""
+    mapper = layers[-1][0]
+    mapper.refine()
+    upright, after, before = mapper.upright, mapper.trajectory(), mapper.tracker.trajectory(mapper.capture.timestamps)
+    assert upright is not None
+    assert (upright.by in ("floor", "level surfaces"), upright.floor, upright.walls) == (True, True, True)
+    posed = np.flatnonzero(before.has_pose)
+    moved = upright.T_upright_world @ before.T_world_cam[posed]
+    np.testing.assert_allclose(after.T_world_cam[posed], moved, atol=1e-9)
+    T_map_true = after.T_world_cam[posed] @ invert(np.stack([mapper.capture.pose(i) for i in posed.tolist()]))
+    assert np.abs(T_map_true[:, 2, :3] - (0, 0, 1)).max() < 0.02
+    assert np.abs(np.sort(np.abs(T_map_true[:, 0, :3])) - (0, 0, 1)).max() < 0.02
+    frames = mapper.submaps()[0].frames
+    np.testing.assert_allclose(mapper.submaps()[0].T_submap_cam, after.T_world_cam[frames], atol=1e-9)
+    z = mapper.anchor_gaussians().means[:, 2]
+    assert np.mean(np.abs(z) < 0.01) > 0.1  # the table
+
+
 def test_a_restored_mapper_goes_on_where_it_was(layers, tmp_path: Path) -> None:
     mapper = layers[-1][0]
+    mapper.refine()
     again = Mapper(mapper.settings, mapper.capture, mapper.keyframes.folder.parent)
     assert again.restore(mapper.state(MOMENTS[-1])) == MOMENTS[-1]
     np.testing.assert_array_equal(again.trajectory().T_world_cam, mapper.trajectory().T_world_cam)
+    np.testing.assert_array_equal(again.origin, mapper.origin)

@@ -148,7 +148,7 @@ def test_the_gravity_frame_is_saved_or_found_again(copy) -> None:
     assert manifest.pop("T_gravity_map") == saved_frame.tolist()
     (copy / "map.yaml").write_text(yaml.safe_dump(manifest))
     found = SavedMap.open(copy).T_gravity_map
-    np.testing.assert_allclose(found, saved_frame, atol=1e-3)
+    np.testing.assert_allclose(found, saved_frame, atol=5e-3)  # from Gaussians, not from depth images
     edit(copy, T_gravity_map=(2 * np.eye(4)).tolist())
     with pytest.raises(MapError, match="T_gravity_map"):
         _ = SavedMap.open(copy).T_gravity_map

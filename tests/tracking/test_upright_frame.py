@@ -1,11 +1,18 @@
-"""The gravity frame of rooms with a known floor, walls and cameras, in any frame."""
+"""The upright frame of rooms with a known floor, walls and cameras, in any frame."""
 
 import numpy as np
 import pytest
 from scenes import cameras, gaussians
 
 from freeocc3d.core.transforms import invert, is_rigid, quats_to_rotations, transform
-from freeocc3d.occupancy.gravity_frame import compute_first_camera_frame, estimate_floor_height, estimate_gravity_frame
+from freeocc3d.tracking.upright.surface_patches import SurfacePatches
+from freeocc3d.tracking.upright.upright_frame import (
+    UprightFrame,
+    compute_start_frame,
+    estimate_floor_height,
+    estimate_gravity_frame,
+    find_upright_frame,
+)
 
 
 def room(seed=0, table=1500, floor=3000, noise=0.004):
@@ -60,13 +67,59 @@ def test_a_table_larger_than_the_visible_floor_is_no_floor() -> None:
 def test_the_first_camera_is_the_origin_and_looks_along_x() -> None:
     scene, poses, _ = moved(room(), cameras(), 3)
     T_gravity_map = estimate_gravity_frame(poses, scene)
-    T = compute_first_camera_frame(T_gravity_map, poses[0])
+    T = compute_start_frame(T_gravity_map, poses[0])
     assert is_rigid(T)
     np.testing.assert_allclose(transform(T, poses[0][:3, 3]), 0, atol=1e-9)
     looks = T[:3, :3] @ poses[0][:3, 2]
     assert looks[0] > 0.79
     assert abs(looks[1]) < 1e-9
     np.testing.assert_allclose((T @ invert(T_gravity_map))[2, :3], (0, 0, 1), atol=1e-9)  # z stays up
+
+
+def shown(*sheets) -> SurfacePatches:
+    """Patches of sheets: each the (3,) corner and two (3,) sides of a rectangle, and its normal."""
+    points, normals = [], []
+    for corner, first, second in np.array(sheets, float):
+        steps = [np.arange(0.025, np.linalg.norm(side), 0.05) / np.linalg.norm(side) for side in (first, second)]
+        a, b = (grid.reshape(-1, 1) for grid in np.meshgrid(*steps))
+        points.append(corner + a * first + b * second)
+        normal = np.cross(first, second)
+        normals.append(np.tile(normal / np.linalg.norm(normal), (len(a), 1)))
+    return SurfacePatches(np.concatenate(points), np.concatenate(normals))
+
+
+FLOOR = (0, 0, 0), (4, 0, 0), (0, 6, 0)
+WALL_X, WALL_Y = ((0, 0, 0.5), (0, 6, 0), (0, 0, 2)), ((0, 0, 0.5), (0, 0, 2), (4, 0, 0))
+TABLE = (1, 1, 0.75), (1.5, 0, 0), (0, 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("sheets", "by", "floor", "walls"),
+    [
+        ((FLOOR, TABLE, WALL_X, WALL_Y), "floor", True, True),
+        ((WALL_X, WALL_Y), "walls", False, True),
+        ((WALL_X,), "cameras", False, True),
+        ((((0, 0, 2.5), (0, 6, 0), (4, 0, 0)), WALL_X), "level surfaces", False, True),
+        ((FLOOR,), "floor", True, False),
+    ],
+    ids=["room", "two walls", "one wall", "ceiling", "floor"],
+)
+def test_the_surest_evidence_decides(sheets, by, floor, walls) -> None:
+    """Cameras that are rolled by 2 degrees; what is level or upright corrects them."""
+    roll = np.eye(4)
+    roll[:2, :2] = ((np.cos(0.035), -np.sin(0.035)), (np.sin(0.035), np.cos(0.035)))
+    found = find_upright_frame(cameras() @ roll, shown(*sheets))
+    assert (found.by, found.floor, found.walls) == (by, floor, walls)
+    tilt = np.degrees(np.arccos(found.T_upright_world[2, 2]))
+    assert tilt < (0.1 if by != "cameras" else 3.0)
+    assert found.off_deg < 5
+    if floor:
+        assert abs(found.T_upright_world[2, 3]) < 0.01
+    if walls:
+        turn = np.degrees(np.arctan2(found.T_upright_world[1, 0], found.T_upright_world[0, 0]))
+        assert abs((turn + 45) % 90 - 45) < (0.1 if by != "cameras" else 2.0)
+    again = UprightFrame.from_array(found.to_array())
+    np.testing.assert_array_equal(again.T_upright_world, found.T_upright_world)
 
 
 def test_without_a_floor_or_anything_there_is_a_frame_still() -> None:

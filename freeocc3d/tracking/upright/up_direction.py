@@ -19,20 +19,33 @@ that nods from floor to ceiling without turning has a difference of 0.36."""
 
 
 def estimate_up(T_world_cam: NDArray[np.float64], points_world: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Returns the (3,) unit vector that points up in the world, from (K, 4, 4) poses and (N, 3) surface points.
+    """Returns the (3,) unit vector that points up in the world, from (K, 4, 4) poses and (N, 3) surface points: that of
+    ``estimate_camera_up``, turned by ``turn_to_levels``."""
+    if len(T_world_cam) == 0:
+        return np.array((0.0, -1.0, 0.0))
+    return turn_to_levels(estimate_camera_up(T_world_cam)[0], points_world)
+
+
+def estimate_camera_up(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Returns the (3,) unit vector that points up in the world, from (K, 4, 4) poses, K > 0, and by how many degrees
+    the cameras were rolled about it: the root mean square.
 
     People pitch cameras freely but hardly roll them, so the x axes are level. Up is the direction in which these axes
     vary least, on the side of -y. If a person held the camera sideways all the time and no metadata says so, the y axes
-    are level; the sign then follows from the fact that cameras look down more than up. At last, up turns by up to 10
-    degrees to where the heights of the surface points have the sharpest histogram, as on level surfaces.
+    are level; the sign then follows from the fact that cameras look down more than up.
     """
-    if len(T_world_cam) == 0:
-        return np.array((0.0, -1.0, 0.0))
     level_axes, mean_up = _held(T_world_cam)
     mean_up /= max(float(np.linalg.norm(mean_up)), _TINY)
     spread = level_axes.T @ level_axes / len(level_axes) + _ALL_ALIKE * (np.eye(3) - np.outer(mean_up, mean_up))
     up = np.linalg.eigh(spread)[1][:, 0]
     up = up if up @ mean_up >= 0 else -up
+    rolled = np.arcsin(np.clip(level_axes @ up, -1, 1))
+    return up, float(np.degrees(np.sqrt((rolled**2).mean())))
+
+
+def turn_to_levels(up: NDArray[np.float64], points_world: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Returns the (3,) ``up`` turned by up to 10 degrees to where the heights of (N, 3) surface points have the
+    sharpest histogram, as on level surfaces."""
     step = max(1, len(points_world) // _SAMPLES)
     points = np.asarray(points_world[::step], np.float64)
     for reach in _REACHES_DEG:

@@ -4,7 +4,7 @@ import numpy as np
 
 from freeocc3d.capture.readers.synthetic import camera_on_the_walk
 from freeocc3d.core.transforms import quats_to_rotations
-from freeocc3d.occupancy.up_direction import estimate_up, turn_back
+from freeocc3d.tracking.upright.up_direction import estimate_up, turn_back
 
 
 def turned(seed: int) -> np.ndarray:
