@@ -56,6 +56,20 @@ def prepare_captured_view(
     )
 
 
+def halve_view(view: CapturedView) -> CapturedView:
+    """The view at half its size, as ``prepare_captured_view`` reduces frames."""
+    camera, device = view.camera, view.color.device
+    size = max(1, camera.width // 2), max(1, camera.height // 2)
+    color = cv2.resize(view.color.cpu().numpy(), size, interpolation=cv2.INTER_AREA)
+    depth_m = cv2.resize(view.depth_m.cpu().numpy(), size, interpolation=cv2.INTER_NEAREST_EXACT)
+    return CapturedView(
+        torch.from_numpy(color).to(device),
+        torch.from_numpy(depth_m).to(device),
+        view.T_cam_world,
+        camera.resized(*size),
+    )
+
+
 def render_gaussians(gaussians: Gaussians, view: CapturedView, rasterizer: Rasterizer) -> Rendered:
     """Renders the Gaussians from the view's camera; not differentiable."""
     arrays = gaussians.means, gaussians.scales, gaussians.quats_wxyz, gaussians.opacities, gaussians.colors / 255.0

@@ -1,7 +1,7 @@
 """Projects Gaussians to splats in an image, and gradients back, compiled (equations: ``rasterizers/base.py``).
 
-A splat is a row of numbers: its pixel u, v; its conic a, b, c, the inverse of Sigma_2; opacity; the smallest exponent
-that reaches ALPHA_MIN; color; z. Its gradient is the same row without the exponent.
+A splat is a row of numbers: its pixel u, v; its conic a, b, c, the inverse of Sigma_2; opacity; color; z. Its gradient
+is a row of the same columns.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from ..core.compiling import njit
 from .rasterizers.base import ALPHA_MIN, BLUR, NEAR
 
-PIXEL_U, PIXEL_V, CONIC_A, CONIC_B, CONIC_C, OPACITY, LEAST, RED, Z = 0, 1, 2, 3, 4, 5, 6, 7, 10
+PIXEL_U, PIXEL_V, CONIC_A, CONIC_B, CONIC_C, OPACITY, RED, Z = 0, 1, 2, 3, 4, 5, 6, 9
 """Columns of a splat; green and blue follow red."""
 
-COLUMNS = 11
-GRADIENTS = 10
-"""Number of columns of a splat, and of its gradient."""
+COLUMNS = 10
+"""Number of columns of a splat."""
 
 DEALT = 64
 """Tiles and splats are dealt to so many loops, whatever the number of threads: neighbors take equally long."""
@@ -57,7 +56,7 @@ def project_splats(
     width: int,
     height: int,
 ) -> tuple[Array, NDArray[np.int32]]:
-    """(N, 11) splats, and (N, 4) the first and last column and the first and last row that each reaches; first > last:
+    """(N, 10) splats, and (N, 4) the first and last column and the first and last row that each reaches; first > last:
     none."""
     n = len(means)
     splats = np.empty((n, COLUMNS), np.float32)
@@ -111,7 +110,7 @@ def project_splats(
             -uv / determinant,
             uu / determinant,
         )
-        splats[g, OPACITY], splats[g, LEAST] = opacities[g], least
+        splats[g, OPACITY] = opacities[g]
         for i in range(3):
             splats[g, RED + i] = colors[g, i]
         splats[g, Z] = z
@@ -182,7 +181,7 @@ def _share_backward(
     d_colors: Array,
 ) -> None:
     """A share of ``project_backward``: every n-th splat."""
-    d = np.empty(GRADIENTS, np.float32)
+    d = np.empty(COLUMNS, np.float32)
     M = np.empty((2, 3), np.float32)
     C = np.empty((3, 3), np.float32)  # R Q: the principal axes in the camera's frame
     D = np.empty((3, 3), np.float32)  # dL/d(Q S)
@@ -190,11 +189,11 @@ def _share_backward(
         g = rows[s]
         d[:] = 0
         for place in places[first[s] : first[s + 1]]:
-            for i in range(GRADIENTS):
+            for i in range(COLUMNS):
                 d[i] += by_tile[place, i]
-        d_opacities[g] = d[5]
+        d_opacities[g] = d[OPACITY]
         for i in range(3):
-            d_colors[g, i] = d[6 + i]
+            d_colors[g, i] = d[RED + i]
         x = T[0, 0] * means[g, 0] + T[0, 1] * means[g, 1] + T[0, 2] * means[g, 2] + T[0, 3]
         y = T[1, 0] * means[g, 0] + T[1, 1] * means[g, 1] + T[1, 2] * means[g, 2] + T[1, 3]
         z = T[2, 0] * means[g, 0] + T[2, 1] * means[g, 1] + T[2, 2] * means[g, 2] + T[2, 3]
@@ -265,7 +264,7 @@ def _share_backward(
         # limits).
         cam_x = d[0] * fx / z
         cam_y = d[1] * fy / z
-        cam_z = d[9] - (d[0] * fx * x + d[1] * fy * y) / (z * z) - d_fz / (z * z)
+        cam_z = d[Z] - (d[0] * fx * x + d[1] * fy * y) / (z * z) - d_fz / (z * z)
         if x / z == a:
             cam_x += d_a / z
             cam_z -= d_a * x / (z * z)

@@ -139,8 +139,10 @@ class FittingOptions(TypedOptions, frozen=True):
 
     rasterizer: str = "cpu"
     """The renderer: "cpu" (compiled), "gsplat" (CUDA), or "reference" (plain PyTorch, slow)."""
-    passes: Annotated[int, Meta(ge=0, le=1000)] = 6
-    """Number of times that each keyframe is rendered and compared; 0 = keep the initial Gaussians."""
+    passes: Annotated[int, Meta(ge=0, le=1000)] = 4
+    """Number of times, at most, that keyframes are rendered and compared: at half the width, and the last time at the
+    full width. Where many show the same, some are left out. Passes end early if they improve other views no more. 0 =
+    keep the initial Gaussians."""
     means: Advanced[Literal["anchored", "free"]] = "anchored"
     """"anchored": means stay on the measured surface, and shapes stay near the initialization; "free": the images move
     every parameter, as in other systems (for comparison; makes occupancy worse)."""

@@ -77,3 +77,12 @@ def test_a_frame_that_is_reduced_keeps_its_shape_and_its_depths() -> None:
     assert set(view.depth_m.unique().tolist()) <= {2.0, 3.0}
     torch.testing.assert_close(view.T_cam_world[:3, 3], torch.tensor((-1.0, -2.0, -3.0)))
     assert rendered_views.prepare_captured_view(frame, T, 160, torch.device("cpu")).camera == CAMERA
+
+
+def test_a_halved_view_is_as_a_frame_reduced_to_that_width() -> None:
+    frame = wall_frame(2.0)
+    whole, half = (rendered_views.prepare_captured_view(frame, np.eye(4), w, torch.device("cpu")) for w in (160, 80))
+    found = rendered_views.halve_view(whole)
+    assert found.camera == half.camera
+    torch.testing.assert_close(found.color, half.color)
+    torch.testing.assert_close(found.depth_m, half.depth_m)

@@ -14,7 +14,6 @@ from freeocc3d.gaussians.splat_projection import (
     CONIC_A,
     CONIC_B,
     CONIC_C,
-    LEAST,
     OPACITY,
     PIXEL_U,
     PIXEL_V,
@@ -28,8 +27,8 @@ import hashlib
 import numpy as np
 from freeocc3d.gaussians.tile_compositing import composite, composite_backward, list_by_tile
 rng = np.random.default_rng(0)
-splats = rng.uniform(0.02, 0.3, (200, 11)).astype(np.float32)
-splats[:, :2], splats[:, 3], splats[:, 6] = rng.uniform(0, 60, (200, 2)), 0.01, -4
+splats = rng.uniform(0.02, 0.3, (200, 10)).astype(np.float32)
+splats[:, :2], splats[:, 3] = rng.uniform(0, 60, (200, 2)), 0.01
 first = np.clip(splats[:, :2] - 12, 0, 63).astype(np.int32)
 last = np.clip(splats[:, :2] + 12, 0, 63).astype(np.int32)
 box = np.stack((first[:, 0], last[:, 0], first[:, 1], last[:, 1]), axis=1)
@@ -83,7 +82,6 @@ def some_splats(seed: int) -> np.ndarray:
         splats[row, [CONIC_A, CONIC_B, CONIC_C]] = conic[0, 0], conic[0, 1], conic[1, 1]
     splats[:, OPACITY] = rng.uniform(0.05, 0.95, 24)
     splats[8:14, OPACITY] = 0.998
-    splats[:, LEAST] = np.log(ALPHA_MIN / splats[:, OPACITY])
     splats[:, RED : RED + 3] = rng.uniform(0, 1, (24, 3))
     splats[:, Z] = np.sort(rng.uniform(1, 5, 24))
     return splats
