@@ -1,8 +1,8 @@
 """Chooses the views to fit Gaussians to: few that together show every Gaussian several times.
 
 Keyframes overlap: where a scan lingers, dozens show the same surface, and most add nothing. A greedy multiple cover:
-the next view is the one that shows most Gaussians that fewer than ``TIMES`` of the chosen views show. The number of views
-grows with the surface, not with the frames.
+the next view is the one that shows most Gaussians that fewer than ``TIMES`` of the chosen views show. So the number of
+views grows with the surface, not with the frames.
 
 Source: V. Vazirani, Approximation Algorithms, Springer 2001, Sec. 13.2 (set multicover).
 """

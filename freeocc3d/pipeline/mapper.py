@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import Capture, read_ahead
+from ..capture import Capture
 from ..capture import base as capture_base
 from ..core.errors import FrameError, TrackingError
 from ..core.progress import Progress
@@ -32,6 +33,7 @@ from ..tracking.upright.lattice import find_lattice_origin
 from ..tracking.upright.surface_patches import find_surface_patches
 from ..tracking.upright.up_direction import turn_back
 from ..tracking.upright.upright_frame import UprightFrame, find_upright_frame
+from .frame_cache import FrameCache
 from .tracking_choice import choose_tracker
 
 _FINE = 0.01
@@ -62,6 +64,8 @@ class Mapper:
         """Whether all poses so far are consistent with each other."""
         self.upright: UprightFrame | None = None
         """The frame of the map, found by the last ``refine``. None = the tracker's world."""
+        stride = anchors.AnchoredCells(settings.gaussians, self.cell_size, np.zeros((0, 4, 4))).stride
+        self.cache = FrameCache(folder, self._read, stride)
         self.origin = np.zeros(3)
         """(3,) lower corner of voxel (0, 0, 0) in the map's frame, meters."""
 
@@ -83,6 +87,8 @@ class Mapper:
         frame = self.complete(frame)
         tracked = self.tracker.track(frame)
         self.refined = False
+        if tracked.T_world_cam is not None:
+            self.cache.keep(frame)
         if tracked.status == "keyframe":
             self.keyframes.append(frame)
         if tracked.T_world_cam is None:
@@ -145,22 +151,18 @@ class Mapper:
         return np.union1d(trajectory.keyframes, measured[::every] if every else [])
 
     def posed(self, trajectory: Trajectory, every: int) -> Iterator[PosedFrame]:
-        """Yields the frames of ``frames_used`` with their poses: keyframes as they were saved, the others from the
-        capture. Leaves out a frame that can no longer be decoded."""
-        keyframes, own = self.mapped(trajectory), trajectory.keyframes.tolist()
-        between = np.setdiff1d(self.frames_used(trajectory, every), own)
-        stream = read_ahead(self.capture, between.tolist())
-        try:
-            following = next(stream, None)
-            for row, (frame, T) in enumerate(zip(keyframes, trajectory.T_world_keyframe, strict=True)):
-                yield PosedFrame(frame, T, row)
-                while following is not None and (row + 1 == len(own) or following[0] < own[row + 1]):
-                    index, found = following
-                    if not isinstance(found, FrameError):
-                        yield PosedFrame(self.complete(found), trajectory.T_world_cam[index], row)
-                    following = next(stream, None)
-        finally:
-            stream.close()
+        """Yields the frames of ``frames_used`` with their poses, from the run's cache; without frames between them,
+        keyframes as they were saved. Leaves out a frame that can no longer be decoded."""
+        if not every:
+            posed = zip(self.mapped(trajectory), trajectory.T_world_keyframe, strict=True)
+            yield from (PosedFrame(frame, T, row) for row, (frame, T) in enumerate(posed))
+            return
+        indices = self.frames_used(trajectory, every).tolist()
+        rows = np.maximum(np.searchsorted(trajectory.keyframes, indices, side="right") - 1, 0).tolist()
+        with contextlib.closing(self.cache.frames(indices)) as frames:
+            for index, row, frame in zip(indices, rows, frames, strict=True):
+                if not isinstance(frame, FrameError):
+                    yield PosedFrame(frame, trajectory.T_world_cam[index], row)
 
     def anchor_gaussians(self, progress: Progress | None = None) -> Gaussians:
         """Layer 2 before fitting: Gaussians anchored at the surface that the mapped frames so far show."""
