@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.depth_sensors import AUTO, TIME_OF_FLIGHT, find_sensor
 from ..core.errors import CaptureError, FrameError
 from ..core.types import Frame, Intrinsics
 from .base import Capture, Options
@@ -133,7 +134,9 @@ class RgbdFrames(Capture):
         unsure = registration.depth(depth_m * (confidence == 1)) > 0
         depth_m = registration.depth(depth_m)
         times = unsure * np.float32(UNSURE_SIGMA - 1.0) + np.float32(1.0)
-        return depth_m, times * compute_sensor_sigma(depth_m)
+        # confidence comes from the LiDAR of phones
+        sensor = TIME_OF_FLIGHT if self.options.sensor == AUTO else find_sensor(self.options.sensor)
+        return depth_m, times * compute_sensor_sigma(depth_m, sensor)
 
 
 def _check_size(image: NDArray[Any], camera: Intrinsics, what: str) -> None:

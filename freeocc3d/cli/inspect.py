@@ -66,7 +66,7 @@ def _depth(found: Inspection) -> str:
     return (
         f"{depth.size[0]} x {depth.size[1]}, {unit_name(depth.unit)}: half of it is nearer than "
         f"{depth.median_m:.2g} m, 95 % nearer than {depth.far_m:.2g} m; {depth.coverage:.0%} of the pixels have depth "
-        "that is used"
+        f"that is used, with the noise of {depth.sensor.replace('_', ' ')}"
     )
 
 

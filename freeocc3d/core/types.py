@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .depth_sensors import STRUCTURED_LIGHT, DepthSensor
+
 BLOCK = 8
 """Voxels along each edge of a voxel block."""
 
@@ -56,7 +58,7 @@ class Frame:
     depth_m: (H, W) float32 meters, registered to ``color``'s pixels; 0 = no measurement.
     intrinsics: of both ``color`` and ``depth_m``, which have the same size.
     depth_sigma_m: (H, W) float32 standard deviation of ``depth_m``, meters, positive where ``depth_m`` is; None = the
-    sensor model applies (``depth_noise.compute_sensor_sigma``).
+    one of ``sensor`` applies (``depth_noise.look_up_sigma``).
     """
 
     index: int
@@ -65,6 +67,7 @@ class Frame:
     depth_m: NDArray[np.float32]
     intrinsics: Intrinsics
     depth_sigma_m: NDArray[np.float32] | None = None
+    sensor: DepthSensor = STRUCTURED_LIGHT
 
     def scaled(self, factor: float) -> Frame:
         """The frame with every length multiplied by ``factor``."""

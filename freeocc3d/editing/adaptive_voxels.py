@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from ..core.compiling import njit
 from ..core.depth_noise import compute_sensor_sigma
+from ..core.depth_sensors import STRUCTURED_LIGHT, DepthSensor, find_sensor
 from ..core.errors import MapError
 from ..core.hash_table import build_table, find_row, packed_key
 from ..core.progress import Progress
@@ -82,7 +83,8 @@ def build_adaptive(
     changing = _changing(gaussians.means, features)
     tree = cKDTree(gaussians.means) if len(gaussians) else None
     occupied = np.sort(pack_voxels(base.keys[(base.state == OCCUPIED).any(axis=1)]))
-    split = _detailed(occupied, gaussians, changing, base.origin, base.voxel_size) if count else occupied[:0]
+    sensor = find_sensor(settings.capture.sensor)
+    split = _detailed(occupied, gaussians, changing, base.origin, base.voxel_size, sensor) if count else occupied[:0]
     whole = ~np.isin(pack_voxels(base.keys), split)
     found: list[Gaussians] = []
     leaves: list[NDArray[np.int64]] = []
@@ -96,7 +98,7 @@ def build_adaptive(
         split = parts[:0]
         if level < count and tree is not None and len(made):
             nearest = np.asarray(tree.query(made.means, workers=-1)[1])
-            split = _detailed(parts, made, changing[nearest], base.origin, size)
+            split = _detailed(parts, made, changing[nearest], base.origin, size, sensor)
         found.append(made)
         leaves.append(np.setdiff1d(parts, split, assume_unique=True))
     if not found:
@@ -168,6 +170,7 @@ def _detailed(
     changing: NDArray[np.bool_],
     origin: NDArray[np.float64],
     voxel_size: float,
+    sensor: DepthSensor = STRUCTURED_LIGHT,
 ) -> NDArray[np.int64]:
     """The blocks, ascending packed keys, in which the surface is not flat or has several meanings.
 
@@ -185,7 +188,7 @@ def _detailed(
         for j in range(3):
             moments[:, i, j] = np.bincount(cube, local[:, i] * local[:, j]) / n - mean[:, i] * mean[:, j]
     off_plane = np.sqrt(np.maximum(np.linalg.eigvalsh(moments)[:, 0], 0.0))
-    noise = np.bincount(cube, compute_sensor_sigma(np.abs(gaussians.anchor_cam[:, 2]))) / n
+    noise = np.bincount(cube, compute_sensor_sigma(np.abs(gaussians.anchor_cam[:, 2]), sensor)) / n
     uneven = (n >= _FEWEST) & (off_plane > np.hypot(_UNEVEN * voxel_size, noise))
     uneven |= np.bincount(cube, changing) > 0
     uneven &= noise <= 0.5 * voxel_size  # smaller voxels would show the noise

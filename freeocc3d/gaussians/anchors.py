@@ -53,11 +53,13 @@ class AnchoredCells:
         self._T_world_keyframe = T_world_keyframe
         self._sums = CellSums(cell_size)
         self._compared = False
+        self._reach_m = 0.0  # the greatest depth of the added frames
 
     def add(self, posed: PosedFrame) -> None:
         """Adds a keyframe, or a frame between keyframes; the points of such a frame are anchored to its keyframe."""
         if not self._compared:
             self._compared = _refuse_tiny(self.cell_size, posed.frame)
+        self._reach_m = max(self._reach_m, float(posed.frame.depth_m.max(initial=0.0)))
         self._sums.add_frame(posed, self.stride(posed.frame), self.options.edge)
 
     def gaussians(self, frames: Iterable[PosedFrame]) -> Gaussians:
@@ -84,7 +86,7 @@ class AnchoredCells:
         """Moves the points of the cells to the surface that all depth maps show, and averages them by their new
         cells."""
         directions = cells.points - self._T_world_keyframe[cells.keyframe, :3, 3]
-        found = denoising.denoise(cells.points, directions, frames, self.options.edge)
+        found = denoising.denoise(cells.points, directions, frames, self.options.edge, self._reach_m)
         seen = found.weights > 0  # points that no image shows, because others cover their pixels, stay where they are
         moved = replace(
             cells,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.compiling import njit
-from ..core.depth_noise import compute_sigma_image, look_up_sigma, take_stated_sigma
+from ..core.depth_noise import compute_sigma_image, look_up_sigma, take_sigma
 from ..core.hash_table import build_table, cell_index, find_slot, packed_key
 from ..core.transforms import back_project, transform
 from ..core.types import PosedFrame
@@ -66,7 +66,7 @@ class CellSums:
         height, width = frame.depth_m.shape
         self._make_room(-(-height // step) * -(-width // step))
         self._used = _add_frame(
-            frame.depth_m, take_stated_sigma(frame), frame.color, step, edge, T,
+            frame.depth_m, take_sigma(frame), frame.color, step, edge, T,
             (camera.fx, camera.fy, camera.cx, camera.cy), keyframe, self.cell_size, self._used, *self._arrays(),
         )  # fmt: skip
 

@@ -10,6 +10,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from ..core.compiling import njit
+from ..core.depth_noise import compute_sensor_sigma, look_up_sigma, take_sigma
 from ..core.transforms import back_project, invert, transform
 from ..core.types import BLOCK, Frame
 from ..core.voxel_keys import unpack_voxels
@@ -104,10 +105,11 @@ class DepthEvidence:
         measured = reach[np.ix_(rows, columns)]
         v, u = np.nonzero(measured)
         pixels = np.stack((columns[u], rows[v]), axis=1)
-        spread = _SIGMAS * self.options.noise * measured[v, u] ** 2
         if frame.depth_sigma_m is not None:
-            spread = _SIGMAS * frame.depth_sigma_m[rows[v], columns[u]]
-        z = measured[v, u] + 0.5 * self.voxel_size + spread
+            sigma = frame.depth_sigma_m[rows[v], columns[u]]
+        else:
+            sigma = compute_sensor_sigma(measured[v, u], frame.sensor)
+        z = measured[v, u] + 0.5 * self.voxel_size + _SIGMAS * sigma
         points = transform(T_world_cam, back_project(pixels, z.astype(np.float32), camera).astype(np.float64))
         return find_blocks_along_rays(points, T_world_cam[:3, 3], self.origin, self.voxel_size)
 
@@ -152,10 +154,9 @@ class DepthEvidence:
             (T_cam_world[:3, :3] @ self.origin + T_cam_world[:3, 3]).astype(np.float32),
             np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32),
             frame.depth_m,
-            np.zeros((0, 0), np.float32) if frame.depth_sigma_m is None else frame.depth_sigma_m,
+            take_sigma(frame),
             np.float32(self.voxel_size),
             np.float32(self.options.margin * self.voxel_size),
-            np.float32(_SIGMAS * self.options.noise),
             np.uint16(change % (1 << 16)),  # adding 65535 subtracts one
             self._free,
             self._hits,
@@ -173,7 +174,6 @@ def _count(
     sigma_m: NDArray[np.float32],
     voxel_size: np.float32,
     margin: np.float32,
-    noise: np.float32,
     change: np.uint16,
     free: NDArray[np.uint16],
     hits: NDArray[np.uint16],
@@ -199,7 +199,7 @@ def _count(
             depth = depth_m[row, column]
             if depth == 0:
                 continue
-            spread = np.float32(_SIGMAS) * sigma_m[row, column] if len(sigma_m) else noise * z * z
+            spread = np.float32(_SIGMAS * look_up_sigma(sigma_m, row, column, abs(depth)))
             far = margin + spread
             if abs(depth) - z > far:
                 du, dv = int(fx * half / z), int(fy * half / z)

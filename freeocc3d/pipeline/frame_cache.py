@@ -14,7 +14,7 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.depth_sensors import DepthSensor
 from ..core.errors import FrameError
 from ..core.types import Frame, Intrinsics
 from .packed_depth import pack_depth, unpack_depth
@@ -46,6 +47,7 @@ class _Packed:
     intrinsics: Intrinsics
     sizes: tuple[int, int, int]
     units: tuple[float, float]
+    sensor: DepthSensor
     data: bytes
 
 
@@ -107,8 +109,7 @@ class FrameCache:
                 self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115, it stays open
             written = os.pwrite(self._file.fileno(), packed.data, self._bytes)
             if written == len(packed.data):
-                bare = _Packed(packed.index, packed.timestamp, packed.intrinsics, packed.sizes, packed.units, b"")
-                self._at[packed.index] = self._bytes, bare
+                self._at[packed.index] = self._bytes, replace(packed, data=b"")
                 self._bytes += written
 
     def _pack(self, frame: Frame) -> _Packed:
@@ -123,7 +124,7 @@ class FrameCache:
             sigma = pack_depth(np.maximum(_integers(known, sigma_units), least.astype(np.uint16)))
         sizes = len(depth), len(color), len(sigma)
         data = b"".join((depth.tobytes(), color, sigma.tobytes()))
-        return _Packed(frame.index, frame.timestamp, frame.intrinsics, sizes, (units, sigma_units), data)
+        return _Packed(frame.index, frame.timestamp, frame.intrinsics, sizes, (units, sigma_units), frame.sensor, data)
 
 
 def _unpack(packed: _Packed, data: bytes) -> Frame:
@@ -141,6 +142,7 @@ def _unpack(packed: _Packed, data: bytes) -> Frame:
         unpack_depth(depth, shape, 1 / packed.units[0]),
         camera,
         sigma_m,
+        packed.sensor,
     )
 
 

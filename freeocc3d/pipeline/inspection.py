@@ -21,6 +21,7 @@ from ..settings.config import Settings
 from ..tracking.rgbd.measured_pairs import measure_pairs
 from .calibration import estimate_unknown_focal, register_color
 from .checks import check_brightness, warn_of_camera
+from .sensor_choice import choose_sensor
 from .tracking_choice import choose_tracker
 
 _SAMPLES = 9
@@ -30,13 +31,14 @@ _POSES_LOOKED_AT = 200
 @dataclass(frozen=True)
 class DepthFacts:
     """Depth of sampled frames. unit: units per meter.  median_m, far_m: below which half and 95 % of it lie, meters.
-    coverage: share of the pixels with depth within ``capture.max_depth``."""
+    coverage: share of the pixels with depth within ``capture.max_depth``.  sensor: whose noise it has."""
 
     unit: float
     median_m: float
     far_m: float
     coverage: float
     size: tuple[int, int]
+    sensor: str
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Inspection:
             found = self.depth
             depth = {
                 "units_per_meter": found.unit, "median_m": round(found.median_m, 3), "p95_m": round(found.far_m, 3),
-                "coverage": round(found.coverage, 3), "size": list(found.size),
+                "coverage": round(found.coverage, 3), "size": list(found.size), "sensor": found.sensor,
             }  # fmt: skip
         return {
             "path": str(self.path), "format": self.format, "frames": self.frames, "color_size": list(self.size),
@@ -110,7 +112,7 @@ def inspect(path: str | Path, settings: Settings | None = None) -> Inspection:
         size=_stored_size(capture, frame_size),
         frame_size=frame_size,
         camera=camera,
-        depth=_describe_depth(capture, frames) if capture.has_depth else None,
+        depth=_describe_depth(capture, frames, settings) if capture.has_depth else None,
         seconds=_duration(capture),
         poses=_share_of_poses(capture),
         tracking=tracking or f"Tracking with {settings.tracking.backend}, as the options say.",
@@ -158,7 +160,7 @@ def _describe_camera(capture: Capture, frames: list[Frame]) -> tuple[str, list[N
     return f"not stated; the scan shows a focal length of {found.focal_px:.0f} px", [found.notice]
 
 
-def _describe_depth(capture: Capture, frames: list[Frame]) -> DepthFacts | None:
+def _describe_depth(capture: Capture, frames: list[Frame], settings: Settings) -> DepthFacts | None:
     sample = sample_depth(capture)
     if sample is None:  # not stored, but made
         measured = np.sort(
@@ -175,7 +177,8 @@ def _describe_depth(capture: Capture, frames: list[Frame]) -> DepthFacts | None:
     else:
         size = frames[0].depth_m.shape[1::-1]
     coverage = float(np.mean([(frame.depth_m > 0).mean() for frame in frames]))
-    return DepthFacts(unit, sample.quantile_m(0.5, unit), sample.quantile_m(0.95, unit), coverage, size)
+    sensor = choose_sensor(settings, capture)[0].capture.sensor
+    return DepthFacts(unit, sample.quantile_m(0.5, unit), sample.quantile_m(0.95, unit), coverage, size, sensor)
 
 
 def _duration(capture: Capture) -> float | None:

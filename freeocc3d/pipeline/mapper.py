@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..capture import Capture
 from ..capture import base as capture_base
+from ..core.depth_sensors import find_sensor
 from ..core.errors import FrameError, TrackingError
 from ..core.progress import Progress
 from ..core.types import Frame, Gaussians, Occupancy, PosedFrame, Submap, Trajectory
@@ -34,6 +35,7 @@ from ..tracking.upright.surface_patches import find_surface_patches
 from ..tracking.upright.up_direction import turn_back
 from ..tracking.upright.upright_frame import UprightFrame, find_upright_frame
 from .frame_cache import FrameCache
+from .sensor_choice import choose_sensor
 from .tracking_choice import choose_tracker
 
 _FINE = 0.01
@@ -47,9 +49,11 @@ class Mapper:
 
     def __init__(self, settings: Settings, capture: Capture, folder: Path):
         settings, _ = choose_tracker(settings, capture)
+        settings, _ = choose_sensor(settings, capture)
         self.settings = settings
         self.capture = capture
-        self.keyframes = Keyframes(folder / map_files.KEYFRAMES)
+        self.sensor = find_sensor(settings.capture.sensor)
+        self.keyframes = Keyframes(folder / map_files.KEYFRAMES, self.sensor)
         self.tracker: Tracker = settings.load_backend("tracking", capture)
         if self.tracker.needs_depth and not capture.has_depth:
             raise TrackingError(
@@ -126,7 +130,7 @@ class Mapper:
         done, self.refined = int(state.pop("done")), bool(state.pop("refined"))
         checkpoint, self.origin = str(state.pop("keyframes")), state.pop("origin")
         self.upright = UprightFrame.from_array(state.pop("upright")) if "upright" in state else None
-        self.keyframes = Keyframes.resumed(self.keyframes.folder, checkpoint, self._read)
+        self.keyframes = Keyframes.resumed(self.keyframes.folder, checkpoint, self._read, self.sensor)
         self.tracker.restore(state, self._read)
         return done
 
@@ -268,5 +272,5 @@ class Mapper:
         return self.complete(self.capture[index])
 
     def complete(self, frame: Frame) -> Frame:
-        """The frame with the camera as the tracker knows it, and with depth."""
-        return self.depth.complete(self.tracker.prepare_frame(frame))
+        """The frame with the camera as the tracker knows it, with depth, and with the sensor of this depth."""
+        return self.depth.complete(self.tracker.prepare_frame(replace(frame, sensor=self.sensor)))

@@ -30,6 +30,7 @@ from .checks import check, check_brightness
 from .mapper import Mapper
 from .run_stages import STAGES, Run
 from .saving import absolute
+from .sensor_choice import choose_sensor
 from .tracking_choice import GIVEN, choose_tracker
 
 _LOOKED_AT = 5  # frames
@@ -61,6 +62,8 @@ def reconstruct(
         resolved, reason = choose_tracker(resolved, opened)
         progress.note(reason)
         opened, resolved = _know_camera(opened, resolved, progress, work)
+        resolved, sensed = choose_sensor(resolved, opened)
+        progress.note(sensed)
         work.begin([absolute(opened.path), len(opened), __version__], resolved, progress)
         if not work.complete:
             with work.timed("calibration"):

@@ -16,8 +16,8 @@ OPTIONS: dict[str, str] = {
 }
 """Section (and backend) and old key -> new key."""
 
-REMOVED = {"fitting.window", "fitting.window_passes"}
-"""Options that had no effect; they are dropped."""
+REMOVED = {"carving.noise", "fitting.window", "fitting.window_passes"}
+"""Options that have no effect any more; they are dropped."""
 
 BACKENDS: dict[str, dict[str, str]] = {"language.encoders": {"colour": "color"}}
 """Folder of backends -> old name -> new name."""

@@ -49,6 +49,10 @@ class CaptureOptions(TypedOptions, frozen=True):
     """Read the capture's depth; false = use color only, even if the capture has depth."""
     depth_scale: Annotated[float, Meta(ge=0.001, le=1e6)] | None = None
     """Depth units per meter (1000 for millimeters); null = as the format or its files state."""
+    sensor: Literal["auto", "structured_light", "time_of_flight", "stereo"] = "auto"
+    """How the depth camera measures, which tells the noise of its depth where frames state none: "structured_light"
+    (Kinect v1, PrimeSense), "time_of_flight" (Kinect v2, Azure Kinect, LiDAR of phones) or "stereo" (RealSense D400).
+    "auto" = recognize it by the steps and the noise of the depth."""
     max_depth: Meters = 6.0
     """Depth beyond this many meters counts as not measured."""
     max_size: Annotated[int, Meta(ge=16, le=16384)] | None = 960
@@ -236,12 +240,10 @@ class CarvingOptions(TypedOptions, frozen=True):
 
     margin: Advanced[Factor] = 1.0
     """A depth map sees through a voxel if its depth exceeds that of the voxel's center by this many voxel edges (plus
-    the uncertainty of the depth)."""
-    noise: Advanced[Annotated[float, Meta(ge=0, le=0.1)]] = 0.0019
-    """Standard deviation of a depth divided by the depth squared, in 1/m, where the frame states no uncertainty. Three
-    standard deviations are added to the margin."""
-    hit: Advanced[Factor] = 0.85
-    """Log-odds that a depth map adds to the voxel in which it ends: OctoMap's value, a probability of 0.7."""
+    three standard deviations of the depth)."""
+    hit: Advanced[Factor] = 3.2
+    """Log-odds that a depth map adds to the voxel in which it ends: eight times ``miss``, because most depth maps see
+    past the center of a voxel that a surface fills in part. OctoMap's value of 0.85 loses 0.1 points of IoU."""
     miss: Advanced[Factor] = 0.4
     """Log-odds that a depth map subtracts from a voxel that it sees through: OctoMap's value, a probability of 0.4."""
     min_free: PositiveInt = 1

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..core.atomic_files import replace_text, sync
 from ..core.checksums import hash_bytes, hash_file
+from ..core.depth_sensors import STRUCTURED_LIGHT, DepthSensor
 from ..core.errors import MapError
 from ..core.image_files import ImageFileError, WrongSizeError, read_image
 from ..core.regular_files import read_bytes
@@ -37,10 +38,14 @@ _Center = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 
 
 class Keyframes(Sequence[Frame]):
-    """The keyframes in a folder, in order; ``self[row]`` decodes one. Raises MapError for a missing or broken file."""
+    """The keyframes in a folder, in order; ``self[row]`` decodes one. Raises MapError for a missing or broken file.
 
-    def __init__(self, folder: Path):
+    sensor: that of the decoded frames.
+    """
+
+    def __init__(self, folder: Path, sensor: DepthSensor = STRUCTURED_LIGHT):
         self.folder = folder
+        self.sensor = sensor
         self._entries: list[dict[str, float]] = []
         self._checksums: dict[str, str] = {}  # of the images that this object wrote
         self._unsynced: list[Path] = []
@@ -97,7 +102,7 @@ class Keyframes(Sequence[Frame]):
 
     def only(self, frames: NDArray[np.integer]) -> Keyframes:
         """The keyframes among the given frames of the capture, in the same folder."""
-        chosen = Keyframes(self.folder)
+        chosen = Keyframes(self.folder, self.sensor)
         chosen._check = self._check
         wanted = set(frames.tolist())
         chosen._entries = [entry for entry in self._entries if int(entry["frame"]) in wanted]
@@ -111,12 +116,14 @@ class Keyframes(Sequence[Frame]):
         return json.dumps({"entries": self._entries, "checksums": self._checksums})
 
     @classmethod
-    def resumed(cls, folder: Path, checkpoint: str, read: Callable[[int], Frame]) -> Keyframes:
+    def resumed(
+        cls, folder: Path, checkpoint: str, read: Callable[[int], Frame], sensor: DepthSensor = STRUCTURED_LIGHT
+    ) -> Keyframes:
         """The keyframes of a ``checkpoint``. Images that are missing or damaged are written again.
 
         read: gives a frame of the capture as ``append`` got it. Raises OSError, and what ``read`` raises.
         """
-        kept, stated = cls(folder), json.loads(checkpoint)
+        kept, stated = cls(folder, sensor), json.loads(checkpoint)
         kept._entries, kept._checksums = stated["entries"], stated["checksums"]
         folder.mkdir(parents=True, exist_ok=True)
         for entry in kept._entries:
@@ -174,7 +181,7 @@ class Keyframes(Sequence[Frame]):
         depth_m = self._read_units(entry, 1) / np.float32(_UNITS_PER_METER)
         sigma_m = self._read_units(entry, 2) / np.float32(_SIGMA_UNITS_PER_METER) if _SIGMA in entry else None
         rgb = cv2.cvtColor(color, cv2.COLOR_BGR2RGB)
-        return Frame(index, entry["timestamp"], rgb, depth_m, _camera(entry), sigma_m)
+        return Frame(index, entry["timestamp"], rgb, depth_m, _camera(entry), sigma_m, self.sensor)
 
     def _read_units(self, entry: dict[str, float], image: int) -> NDArray[np.float32]:
         units = self._decoded(entry, image, cv2.IMREAD_UNCHANGED)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.depth_sensors import find_sensor
 from ..core.errors import FreeOccError, MapError
 from ..core.regular_files import stored_path
 from ..core.tum_files import read_tum
@@ -152,6 +153,7 @@ class SavedMap:
 
         self.files.path(f"{KEYFRAMES}/{INDEX}")
         loaded = Keyframes.load(self.path / KEYFRAMES, lambda path: self.files.path(f"{KEYFRAMES}/{path.name}"))
+        loaded.sensor = find_sensor(self.settings.capture.sensor)
         if loaded.frames != list(self.manifest.keyframes):
             raise MapError(f"{self.path} is damaged: {MANIFEST} and the folder {KEYFRAMES} list different keyframes.")
         return loaded

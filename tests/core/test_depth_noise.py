@@ -1,22 +1,30 @@
-"""The noise of depth: an image's own, or the sensor's usual noise; the same by pixel and by image."""
+"""The noise of depth: an image's own, or that of its sensor; the same by pixel and by image."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scenes import wall_frame, with_sigma
 
-from freeocc3d.core.depth_noise import AXIAL_NOISE, compute_sigma_image, look_up_sigma, take_stated_sigma
-from freeocc3d.occupancy import carve
+from freeocc3d.core.depth_noise import compute_sensor_sigma, compute_sigma_image, look_up_sigma, take_sigma
+from freeocc3d.core.depth_sensors import SENSORS, STEREO, STRUCTURED_LIGHT, TIME_OF_FLIGHT, find_sensor
 
 
-@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("stated", [None, *SENSORS])
 def test_a_pixel_has_the_standard_deviation_of_the_image(stated) -> None:
     frame = wall_frame(2.0, seed=3)
-    frame = with_sigma(frame) if stated else frame
-    image, own = compute_sigma_image(frame), take_stated_sigma(frame)
+    frame = with_sigma(frame) if stated is None else replace(frame, sensor=SENSORS[stated])
+    image, own = compute_sigma_image(frame), take_sigma(frame)
     for row, column in np.random.default_rng(0).integers(0, frame.depth_m.shape, (50, 2)):
         found = look_up_sigma(own, row, column, frame.depth_m[row, column])
         np.testing.assert_allclose(found, image[row, column], rtol=1e-6)
 
 
-def test_carving_takes_the_growth_of_the_same_model() -> None:
-    assert carve.Options().noise == AXIAL_NOISE[1]
+def test_sensors_have_the_noise_of_their_sources() -> None:
+    z = np.array([1.0, 2.0, 4.0])
+    kinect_v2 = 1e-3 * (1.5 - 0.5 * z + 0.3 * z**2)
+    np.testing.assert_allclose(compute_sensor_sigma(z, TIME_OF_FLIGHT), kinect_v2, rtol=0.01)
+    subpixel, focal, baseline = 0.08, 425, 0.05
+    np.testing.assert_allclose(compute_sensor_sigma(z, STEREO) - 5e-4, subpixel * z**2 / (focal * baseline), rtol=0.02)
+    assert find_sensor("auto") is STRUCTURED_LIGHT
+    assert find_sensor("stereo") is STEREO

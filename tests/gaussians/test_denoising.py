@@ -32,15 +32,15 @@ def test_the_kernel_agrees_with_plain_numpy(own_sigma: bool) -> None:
     points = np.random.default_rng(1).uniform((-1, -1, 1.5), (1, 1, 2.5), (4000, 3))
     directions = np.random.default_rng(2).normal((0, 0, 0.3), 1, points.shape)  # some were measured from behind
     looks = posed(frames, poses)
-    found = denoising.denoise(points, directions, looks, 0.15)
-    parts = [denoising.look_reference(points, directions, look, 0.15) for look in looks]
-    offset, weight, through = (sum(part[i].astype(float) for part in parts) for i in range(3))
+    found = denoising.denoise(points, directions, looks, 0.15, 2.1)
+    parts = [denoising.look_reference(points, directions, look, 0.15, 2.1) for look in looks]
+    offset, weight, through, blank = (sum(part[i].astype(float) for part in parts) for i in range(4))
     shown = sum((part[1] > 0).astype(int) for part in parts)
     assert 800 < np.count_nonzero(weight) < 3500
     np.testing.assert_allclose(found.weights, weight, rtol=1e-5)
     expected = points + offset / np.where(weight > 0, weight, 1)[:, None]
     np.testing.assert_allclose(found.points, expected, atol=1e-6)
-    np.testing.assert_array_equal(found.kept, through <= np.maximum(shown, 1))
+    np.testing.assert_array_equal(found.kept, denoising.are_surfaces(shown, through, blank))
     best = np.argmax([part[1] for part in parts], axis=0)
     np.testing.assert_array_equal(found.keyframe, np.where(weight > 0, best, -1))
 
@@ -61,11 +61,45 @@ def test_what_most_images_see_through_is_left_out_and_what_none_shows_stays() ->
     poses = np.tile(np.eye(4), (3, 1, 1))
     floating, on_the_wall, behind_the_camera, behind_the_wall = (0, 0, 1.0), (0, 0, 2.005), (0, 0, -1.0), (0, 0, 2.5)
     points = np.array([floating, on_the_wall, behind_the_camera, behind_the_wall])
-    found = denoising.denoise(points, points, posed(frames, poses), 0.05)
+    found = denoising.denoise(points, points, posed(frames, poses), 0.05, 2.0)
     np.testing.assert_array_equal(found.kept, [False, True, True, True])
     np.testing.assert_array_equal(found.weights > 0, [False, True, False, False])
     np.testing.assert_allclose(found.points[1], (0, 0, 2.0), atol=1e-6)
     np.testing.assert_array_equal(found.points[2:], points[2:])
+
+
+@pytest.mark.parametrize(
+    ("shown", "through", "blank", "kept"),
+    [
+        (1, 0, 3, True),  # few others could have shown it
+        (1, 0, 4, False),  # shown once of five times
+        (2, 0, 20, True),  # a dark thing, perhaps
+        (2, 0, 50, False),
+        (6, 0, 500, True),  # something without depth often hides it
+        (6, 7, 0, False),
+        (0, 0, 0, True),
+    ],
+)
+def test_a_point_is_kept_by_what_all_frames_show(shown: int, through: int, blank: int, kept: bool) -> None:
+    counts = (np.array([count], np.int32) for count in (shown, through, blank))
+    assert denoising.are_surfaces(*counts).tolist() == [kept]
+
+
+def test_specks_behind_a_pane_and_a_passer_by_are_left_out_and_what_is_behind_a_dark_thing_stays() -> None:
+    frames = [wall_frame(2.0, n) for n in range(60)]
+    for n, frame in enumerate(frames):
+        frame.depth_m[:, :30] = 0  # a pane, with a speck in another place of each third frame
+        if n % 3 == 0:
+            frame.depth_m[10 + n // 3, 4:8] = 3.0
+        if n < 20:
+            frame.depth_m[:, -30:] = 1.0  # somebody stands there, and leaves
+        if n >= 8:
+            frame.depth_m[30:40, 40:50] = 0  # a dark thing is put before the wall
+    g = lifted(frames, np.tile(np.eye(4), (60, 1, 1)), 0.04)
+    np.testing.assert_allclose(g.means[:, 2], 2.0, atol=0.02)
+    pixels = np.rint(g.means[:, :2] / g.means[:, 2:] * (CAMERA.fx, CAMERA.fy) + (CAMERA.cx, CAMERA.cy)).astype(int)
+    assert ((pixels >= (41, 31)) & (pixels < (49, 39))).all(axis=1).any()
+    assert (pixels[:, 0] > CAMERA.width - 25).any()
 
 
 def test_the_two_sides_of_a_board_stay_apart() -> None:
@@ -73,7 +107,7 @@ def test_the_two_sides_of_a_board_stay_apart() -> None:
     behind[2, 3] = 4.04  # looks back at a board of 4 cm, whose other side is 2 m away
     looks = posed([wall_frame(2.0, 0), wall_frame(2.0, 1)], np.stack((front, behind)))
     points = np.array([(0.1, 0.1, 2.003), (0.1, 0.1, 2.037)])
-    found = denoising.denoise(points, np.array([(0, 0, 1.0), (0, 0, -1.0)]), looks, 0.05)
+    found = denoising.denoise(points, np.array([(0, 0, 1.0), (0, 0, -1.0)]), looks, 0.05, 2.0)
     np.testing.assert_allclose(found.points[:, 2], (2.0, 2.04), atol=1e-6)
 
 
@@ -92,7 +126,7 @@ def test_a_frame_between_keyframes_is_anchored_to_the_one_it_hangs_on() -> None:
 
 def test_nothing_to_look_at_changes_nothing() -> None:
     points = np.array([(0.0, 0.0, 2.0)])
-    found = denoising.denoise(points, points, iter(()), 0.05)
+    found = denoising.denoise(points, points, iter(()), 0.05, 2.0)
     np.testing.assert_array_equal(found.points, points)
     assert found.keyframe[0] == -1
 
@@ -102,7 +136,7 @@ def test_a_pixel_without_depth_says_nothing_however_near_the_point_is(z: float) 
     frame = wall_frame(2.0)
     frame.depth_m[:] = 0
     points = np.array([(0.0, 0.0, z)])
-    found = denoising.denoise(points, points, posed([frame], [np.eye(4)]), 0.15)
+    found = denoising.denoise(points, points, posed([frame], [np.eye(4)]), 0.15, 6.0)
     assert found.weights.tolist() == [0.0]
     assert found.keyframe.tolist() == [-1]
     np.testing.assert_array_equal(found.points, points)

@@ -7,6 +7,7 @@ import pytest
 from scenes import CAMERA, wall_frame
 
 from freeocc3d.core import voxel_keys
+from freeocc3d.core.depth_noise import compute_sensor_sigma
 from freeocc3d.core.transforms import project
 from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.occupancy import carve
@@ -166,9 +167,8 @@ def count_plainly(frame: Frame, T, centers, voxel_size: float, options: carve.Op
         return np.where(inside, found, 0.0), inside
 
     here, inside = depth_at(row, column)
-    spread = 3 * options.noise * z**2
-    if frame.depth_sigma_m is not None:
-        spread = 3 * frame.depth_sigma_m[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(float)
+    sigma = compute_sensor_sigma(np.abs(depth)) if frame.depth_sigma_m is None else frame.depth_sigma_m
+    spread = 3 * sigma[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(float)
     far = options.margin * voxel_size + spread
     du, dv = (camera.fx * half / safe).astype(int), (camera.fy * half / safe).astype(int)
     looked = ahead & inside & (here != 0)
@@ -190,7 +190,7 @@ def test_every_voxel_is_counted_as_the_definition_says(seed: int, sigma: bool, n
     turn = np.array(((0.8, 0.0, 0.6), (0.36, 0.8, -0.48), (-0.48, 0.6, 0.64)))
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = turn, (0.1, -0.2, 0.3)
-    options = carve.Options(no_return=no_return, margin=0.7, noise=0.004)
+    options = carve.Options(no_return=no_return, margin=0.7)
     frame = patchwork(seed, sigma)
     free, hits, centers = evidence_of(frame, T, options)
     if no_return:
@@ -258,9 +258,8 @@ def test_visible_blocks_hold_every_voxel_that_an_image_says_something_about() ->
 def test_log_odds_are_the_sensor_models_and_noise_widens_it() -> None:
     options = carve.Options()
     free, hits = np.array([[4, 0, 2]], np.uint16), np.array([[0, 3, 1]], np.uint16)
-    np.testing.assert_allclose(carve.compute_log_odds(free, hits, options), [[-1.6, 2.55, 0.05]], rtol=1e-5)
-    logit = np.log(0.7 / 0.3), np.log(0.4 / 0.6)
-    np.testing.assert_allclose((options.hit, -options.miss), logit, atol=0.01)
+    np.testing.assert_allclose(carve.compute_log_odds(free, hits, options), [[-1.6, 9.6, 2.4]], rtol=1e-5)
+    np.testing.assert_allclose(-options.miss, np.log(0.4 / 0.6), atol=0.01)
     thickness = []
     for depth in (1.0, 6.0):
         evidence = carve.DepthEvidence(np.zeros(3), 0.08, options)

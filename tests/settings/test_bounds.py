@@ -73,7 +73,7 @@ def test_every_device_is_checked(name: str, kind: Any) -> None:
 @pytest.mark.parametrize(
     "override",
     [
-        "gaussians.gamma=1e30", "gaussians.gamma=1000", "carving.noise=1e9", "carving.noise=100",
+        "gaussians.gamma=1e30", "gaussians.gamma=1000", "carving.hit=1e9", "carving.hit=200",
         "occupancy.voxel_size=1e-9", "occupancy.voxel_size=1e99", "occupancy.voxel_size=1e300", "occupancy.cutoff=1e4",
         "capture.synthetic.width=1000000", "capture.synthetic.height=9223372036854775808", "capture.synthetic.seed=-1",
         "fitting.passes=1000000", "language.color.stride=2147483648", "fitting.reference.device=''",

@@ -211,8 +211,8 @@ def test_fingerprint_survives_the_round_trip_through_a_file(tmp_path: Path) -> N
 
 def test_numbers_may_be_written_without_a_point(tmp_path: Path) -> None:
     path = write(tmp_path / "c.yaml", "occupancy: {voxel_size: 1e-2}\n")
-    assert config.load(path, ["carving.noise=2e-3"]).occupancy.voxel_size == 0.01
-    assert config.load(path, ["carving.noise=2e-3"]).carving.noise == 0.002
+    assert config.load(path, ["carving.miss=2e-1"]).occupancy.voxel_size == 0.01
+    assert config.load(path, ["carving.miss=2e-1"]).carving.miss == 0.2
 
 
 def test_a_backend_that_is_not_chosen_is_checked_even_if_its_package_is_not_installed() -> None:
@@ -280,22 +280,22 @@ def test_a_saved_configuration_is_read_without_what_it_does_not_choose(tmp_path:
 def test_numbers_of_an_older_map_are_brought_into_range(tmp_path: Path) -> None:
     path = write(
         tmp_path / "c.yaml",
-        "carving: {noise: 2, min_free: 0, margin: 1}\ntracking: {stereo: {size: 1}}\noccupancy: {finest: null}\n",
+        "carving: {miss: 200, min_free: 0, margin: 1}\ntracking: {stereo: {size: 1}}\noccupancy: {finest: null}\n",
     )
     with pytest.raises(ConfigError, match=r"'tracking\.stereo\.size' must be from 64"):
         config.load(path)
     for settings in (config.load_saved(path), config.load_saved(path, ["occupancy.threshold=0.4"])):
-        assert (settings.carving.noise, settings.carving.min_free, settings.carving.margin) == (0.1, 1, 1.0)
+        assert (settings.carving.miss, settings.carving.min_free, settings.carving.margin) == (100, 1, 1.0)
         assert settings.stereo.size > 1
         assert {notice.code for notice in settings.notices} == {"option-clamped"}
         assert [notice.text.split("'")[1] for notice in settings.notices] == [
             "tracking.stereo.size",
-            "carving.noise",
+            "carving.miss",
             "carving.min_free",
         ]
-        assert "was 2, which is out of range: 0.1 is used" in settings.notices[1].text
-    for wrong in ("noise: x", "noise: .nan", "noise: [2]", "noise: true"):
-        with pytest.raises(ConfigError, match=r"'carving\.noise' must be"):
+        assert "was 200, which is out of range: 100 is used" in settings.notices[1].text
+    for wrong in ("miss: x", "miss: .nan", "miss: [2]", "miss: true"):
+        with pytest.raises(ConfigError, match=r"'carving\.miss' must be"):
             config.load_saved(write(tmp_path / "d.yaml", f"carving: {{{wrong}}}\n"))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.compiling import njit
-from ...core.depth_noise import NOT_STATED
+from ...core.depth_noise import take_sigma
 from ...core.types import Frame, Intrinsics
 from .dense_residuals import Surface
 
@@ -49,8 +49,8 @@ class AlignmentView:
     """A frame, prepared for alignment.
 
     intrinsics: of the (h, w) images.  points: (h, w, 3) float32, camera frame, meters; 0 without a surface.
-    normals: (h, w, 3) float32 unit.  sigma_m: (h, w) float32 standard deviations of the depth, meters, or
-    ``NOT_STATED``.  gray: intensities 0…1, float32, at full, half and quarter size.
+    normals: (h, w, 3) float32 unit.  sigma_m: (h, w) float32 standard deviations of the depth, meters, or the sensor's
+    coefficients (``depth_noise.take_sigma``).  gray: intensities 0…1, float32, at full, half and quarter size.
     """
 
     intrinsics: Intrinsics
@@ -95,9 +95,10 @@ def prepare_alignment_view(frame: Frame) -> AlignmentView:
 
 
 def _average_sigma(frame: Frame, step: int) -> NDArray[np.float32]:
-    """(h, w) mean stated sigma, meters, of the pixels with a depth in each square of ``step`` pixels; 0 without any."""
+    """(h, w) mean stated sigma, meters, of the pixels with a depth in each square of ``step`` pixels; 0 without any. If
+    none is stated, the sensor's coefficients."""
     if frame.depth_sigma_m is None:
-        return NOT_STATED
+        return take_sigma(frame)
     h, w = frame.depth_m.shape[0] // step, frame.depth_m.shape[1] // step
     known = (frame.depth_m > 0)[: h * step, : w * step].reshape(h, step, w, step)
     sigma = frame.depth_sigma_m[: h * step, : w * step].reshape(h, step, w, step)

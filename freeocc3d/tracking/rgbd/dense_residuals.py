@@ -59,8 +59,8 @@ class Surface(NamedTuple):
     """The parts of a view that the residuals use.
 
     points: (h, w, 3) camera frame, meters; z = 0 without a surface.  normals: (h, w, 3) unit.  sigma_m: (h, w)
-    standard deviations of the points' depth, meters, or ``depth_noise.NOT_STATED``.  gray: intensities 0…1 of the same
-    view, its size times a power of two smaller.
+    standard deviations of the points' depth, meters, or the sensor's coefficients (``depth_noise.take_sigma``).  gray:
+    intensities 0…1 of the same view, its size times a power of two smaller.
     """
 
     points: NDArray[np.float32]
