@@ -22,11 +22,11 @@ help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
 
 quick: setup lint  ## style, types and the fast tests, in less than two minutes
-	$(BIN)/python -m pytest -n 2 --dist loadfile -q $(QUICK)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q $(QUICK)
 
 test: setup lint  ## style, types and all tests, which build the documentation
 	@sh tools/test_clients.sh
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: setup
 	$(BIN)/ruff check .
@@ -55,6 +55,9 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 		{ echo "freeocc3d needs Python 3.11 or 3.12: run 'make PYTHON=python3.12 $(MAKECMDGOALS)'"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@echo "Compiling kernels, once, for about a minute"
+	@made=$$(mktemp -d) && { $(BIN)/freeocc3d demo --frames 12 -o $$made/demo >$$made/log 2>&1 || tail -3 $$made/log >&2; }; \
+		rm -rf $$made
 	@touch $@
 
 # Libraries that the wheels of open3d (libusb, libgomp) and pyvista (EGL, GL) load but do not contain.

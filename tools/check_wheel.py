@@ -18,7 +18,7 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SOURCES = ("freeocc3d", "configs", "setup.cfg", "pyproject.toml", "README.md", "LICENSE")
-FRAMES = 40
+FRAMES = 12
 PICTURES = ("map.png", "query_red_cup.png", "query_blue_chair.png", "query_green_plant.png")
 
 

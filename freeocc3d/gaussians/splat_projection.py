@@ -139,7 +139,7 @@ def project_backward(
     fx, fy = pinhole[0], pinhole[1]
     for share in prange(DEALT):
         _share_backward(
-            share,
+            np.int64(share),  # of the same type in every thread, or the function is compiled twice
             means,
             scales,
             quats,

@@ -15,7 +15,7 @@ from freeocc3d.core.progress import Progress
 from freeocc3d.storage import work_folder
 from freeocc3d.storage.work_folder import WorkFolder
 
-FEW = {**ROOM, "capture": {**ROOM["capture"], "stop": 6}}
+FEW = {"capture": {**ROOM["capture"], "stop": 6}, "fitting": {"passes": 0}}
 
 
 class Killed(BaseException):
