@@ -40,7 +40,9 @@ class _FrameLog(msgspec.Struct):
 
 
 class _Rendering(msgspec.Struct):
+    psnr_measured: float | None = None
     depth_l1_m: float | None = None
+    covered: float | None = None
 
 
 class _Measure(msgspec.Struct):
@@ -89,7 +91,10 @@ def _problem(report: _Report) -> str:
         ("frame_log.confidence", log.confidence),
         ("seconds", list(report.seconds.values())),
         ("color_focal", [report.color_focal]),
+        ("rendering", msgspec.structs.astuple(report.rendering or _Rendering())),
+        ("check", [measure.value for measure in (report.check.measures if report.check else {}).values()]),
     ):
+        values = [value for value in values if value is not None]
         if not np.isfinite(np.array(values, np.float64)).all():
             return f"'{name}' holds a number that is not finite"
     return "" if 0.1 <= report.color_focal <= 10 else "'color_focal' is not between 0.1 and 10"

@@ -440,7 +440,8 @@ def _everything() -> str:
 def _uses() -> list[tuple[float, str, Callable[[], str]]]:
     """Weight, name, and a function that uses the map ``map`` in the present folder and returns the answer."""
     commands: list[tuple[float, str]] = [
-        (3, "info map"), (3, "info map --json"), (4, "query map red wall --json"), (1, "query map --classes"),
+        (3, "info map"), (3, "info map --json"), (2, "check map --json"), (4, "query map red wall --json"),
+        (1, "query map --classes"),
         (3, "query map chair red --json --views"), (0.1, "query map red --html out --overwrite"),
         (1, "query map --class red --class wall --json"), (1, "query map red --near wall --json"),
         (0.5, "query map wall --on floor --pick largest --ply out --overwrite"),

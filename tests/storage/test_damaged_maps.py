@@ -144,10 +144,13 @@ REPORTS: dict[str, Callable[[dict[str, Any]], Any]] = {
     **{f"without {key}": lambda said, key=key: {k: v for k, v in said.items() if k != key} for key in (
         "seconds", "frames", "warnings", "peak_memory_bytes", "frame_log")},
     **{f"{key} a list": lambda said, key=key: {**said, key: [said]} for key in (
-        "seconds", "frames", "warnings", "peak_memory_bytes", "frame_log", "color_focal", "submaps", "rendering")},
+        "seconds", "frames", "warnings", "peak_memory_bytes", "frame_log", "color_focal", "submaps", "rendering",
+        "check")},
     "a negative count": lambda said: {**said, "frames": {"lost": -1}},
     "a huge number": lambda said: {**said, "peak_memory_bytes": 10**400},
     "a focal length of nothing": lambda said: {**said, "color_focal": 0},
+    "an infinite measure": lambda said: {
+        **said, "check": {"verdict": "good", "measures": {"step": {"value": float("inf"), "unit": "m", "count": 1}}}},
     "no time": lambda said: {**said, "seconds": {"tracking": float("nan")}},
     "a warning of numbers": lambda said: {**said, "warnings": [{"code": 3, "text": 4}]},
     "a submap without ends": lambda said: {**said, "submaps": [{"frames": 3}]},
