@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -155,3 +156,20 @@ def test_points_without_depth_or_too_near_add_nothing() -> None:
     H, g = np.zeros((6, 6)), np.zeros(6)
     assert orb_features.add_reprojection(points, np.zeros((3, 2), np.float32), np.eye(4), 400.0, H, g) == (2, 1)
     assert H[3, 3] == pytest.approx((400 / 0.11) ** 2, rel=1e-5)
+
+
+@pytest.mark.parametrize(("few", "many"), [(1, 40), (150, 130)])
+def test_matches_are_those_of_opencv(few: int, many: int) -> None:
+    """Descriptors of few bits that differ, so that many distances are equal."""
+    rng = np.random.default_rng(0)
+    base = rng.integers(0, 256, (60, 32), np.uint8)
+    flips = [np.packbits(rng.random((n, 256)) < 0.06, axis=1) for n in (few, many)]
+    a, b = (
+        orb_features.OrbFeatures(np.zeros((len(flip), 2), np.float32), base[rng.integers(0, 60, len(flip))] ^ flip)
+        for flip in flips
+    )
+    found = orb_features.match_binary(a, b)
+    asked = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(a.descriptors, b.descriptors)
+    expected = [(m.queryIdx, m.trainIdx) for m in asked if m.distance < 64]
+    assert sorted(map(tuple, found.tolist())) == sorted(expected)
+    assert len(found)

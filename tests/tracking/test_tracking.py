@@ -13,7 +13,13 @@ from freeocc3d.settings import registry
 from freeocc3d.tracking import pose_graph
 from freeocc3d.tracking.base import Tracker
 from freeocc3d.tracking.given_poses import GivenTracker
-from freeocc3d.tracking.overlap import DepthView, measure_mutual_overlap, measure_overlap, sample_points
+from freeocc3d.tracking.overlap import (
+    DepthView,
+    measure_mutual_overlap,
+    measure_overlap,
+    measure_overlap_reference,
+    sample_points,
+)
 from freeocc3d.tracking.pose_graph import Edge
 from freeocc3d.tracking.records import Records
 
@@ -276,3 +282,18 @@ def test_poses_of_a_chain_stay_for_it_has_no_error_to_spread() -> None:
     for few, chain in ((poses, edges), (poses[:2], edges[:1] * 3)):
         for found, pose in zip(pose_graph.optimize(list(few), chain), few, strict=True):
             np.testing.assert_array_equal(found, pose)
+
+
+def test_the_compiled_overlap_is_that_of_numpy() -> None:
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(1.8, 2.2, (24, 32)).astype(np.float32)
+    depth[:6] = 0
+    view = DepthView(depth, Intrinsics(32, 24, 20.0, 21.0, 15.3, 11.8), np.zeros((0, 3), np.float32))
+    points = rng.uniform((-2, -2, -1), (2, 2, 3), (500, 3)).astype(np.float32)
+    for turn in (0.0, 0.4, 2.0):
+        T = np.eye(4)
+        T[:3, :3] = [(np.cos(turn), 0, np.sin(turn)), (0, 1, 0), (-np.sin(turn), 0, np.cos(turn))]
+        T[:3, 3] = (0.1, -0.2, 0.3)
+        found = measure_overlap(points, T, view)
+        assert found == measure_overlap_reference(points, T, view)
+        assert 0 < found < 1

@@ -34,7 +34,7 @@ class KeyframeView:
 def sample_surface(view: AlignmentView) -> DepthView:
     """A sparse sample of a view's surface, to measure overlap."""
     sample = view.points[_OVERLAP_STEP // 2 :: _OVERLAP_STEP, _OVERLAP_STEP // 2 :: _OVERLAP_STEP].reshape(-1, 3)
-    return DepthView(view.points[..., 2], view.intrinsics, sample[sample[:, 2] > 0])
+    return DepthView(np.ascontiguousarray(view.points[..., 2]), view.intrinsics, sample[sample[:, 2] > 0])
 
 
 def prepare_keyframe_view(frame: Frame, view: AlignmentView | None = None) -> KeyframeView:
