@@ -156,6 +156,7 @@ def _add_frame(  # type: ignore[no-untyped-def]
     used, table, rows, keys, sums, pixels, best, best_keyframe, footprint,
 ):  # fmt: skip
     fx, fy, cx, cy = camera
+    row, before = 0, np.int64(-1)
     for v in range(0, depth_m.shape[0], step):
         for u in range(0, depth_m.shape[1], step):
             depth = np.float64(depth_m[v, u])
@@ -166,7 +167,10 @@ def _add_frame(  # type: ignore[no-untyped-def]
             wy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * depth + T[1, 3]
             wz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * depth + T[2, 3]
             i, j, k = cell_index(wx / cell_size), cell_index(wy / cell_size), cell_index(wz / cell_size)
-            row, used = _row_of(packed_key(i, j, k), used, table, rows, keys)
+            key = packed_key(i, j, k)
+            if key != before:  # neighbors are mostly in one cell
+                row, used = _row_of(key, used, table, rows, keys)
+                before = key
             sigma = look_up_sigma(sigma_m, v, u, depth)
             w = 1.0 / (sigma * sigma)
             sums[row, 0] += w

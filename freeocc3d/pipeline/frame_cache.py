@@ -22,10 +22,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.depth_sensors import DepthSensor
 from ..core.errors import FrameError
-from ..core.types import Frame, Intrinsics
-from .packed_depth import pack_depth, unpack_depth
+from ..core.types import Frame
+from .packed_depth import MOST_UNITS, pack_depth, unpack_depth
 
 _MOST_BYTES = 1 << 30
 """Of the cache's file: some 3000 frames of 640 x 480. Later frames are read from the capture."""
@@ -34,20 +33,19 @@ _UNITS = 1000.0, 5000.0
 """Units per meter that stored depth usually has: if one of them represents a depth exactly, it is used."""
 _FINEST = 8000.0
 """Units per meter otherwise; an eighth of a millimeter is a small part of any sensor's noise."""
-_MOST_UNITS = np.iinfo(np.uint16).max
+_LEAST_M = 1e-3  # avoids division by the largest depth of an image without any
 _JPEG_QUALITY = 95
+_NO_COLOR = np.zeros((0, 0, 3), np.uint8)
 
 
 @dataclass(frozen=True)
 class _Packed:
-    """A frame as bytes. sizes: of the parts depth, color and standard deviation (0 = it has none)."""
+    """A frame as bytes. bare: the frame without its arrays.  sizes: of the parts depth, color and standard deviation (0
+    = it has none).  units: per meter, of depth and standard deviation."""
 
-    index: int
-    timestamp: float
-    intrinsics: Intrinsics
+    bare: Frame
     sizes: tuple[int, int, int]
     units: tuple[float, float]
-    sensor: DepthSensor
     data: bytes
 
 
@@ -72,15 +70,16 @@ class FrameCache:
             self._waiting.popleft().result()
         self._waiting.append(self._writer.submit(lambda: self._write(self._pack(frame))))
 
-    def frames(self, indices: Iterable[int]) -> Generator[Frame | FrameError]:
-        """The frames of these indices in this order, read ahead on another thread; an error for a broken one."""
+    def frames(self, indices: Iterable[int], color: bool = True) -> Generator[Frame | FrameError]:
+        """The frames of these indices in this order, read ahead on another thread; an error for a broken one. color:
+        false = their colors are left out, an empty array."""
         while self._waiting:
             self._waiting.popleft().result()
         pending: deque[Future[Frame | FrameError]] = deque()
         reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frame-cache")
         try:
             for index in indices:
-                pending.append(reader.submit(self._frame, index))
+                pending.append(reader.submit(self._frame, index, color))
                 if len(pending) > _AHEAD:
                     yield pending.popleft().result()
             while pending:
@@ -88,77 +87,70 @@ class FrameCache:
         finally:
             reader.shutdown(wait=True, cancel_futures=True)
 
-    def _frame(self, index: int) -> Frame | FrameError:
+    def _frame(self, index: int, color: bool) -> Frame | FrameError:
         if index in self._at:
             place, packed = self._at[index]
             assert self._file is not None
-            return _unpack(packed, os.pread(self._file.fileno(), sum(packed.sizes), place))
+            return _unpack(packed, os.pread(self._file.fileno(), sum(packed.sizes), place), color)
         try:
             packed = self._pack(self._read(index))
         except FrameError as error:
             return error.with_traceback(None)
         self._write(packed)
-        return _unpack(packed, packed.data)
+        return _unpack(packed, packed.data, color)
 
     def _write(self, packed: _Packed) -> None:
         """Writes a frame, if there is room. A full disk is no error: the frame will be read from the capture."""
-        if packed.index in self._at or self._bytes + len(packed.data) > _MOST_BYTES:
+        if packed.bare.index in self._at or self._bytes + len(packed.data) > _MOST_BYTES:
             return
         with contextlib.suppress(OSError):
             if self._file is None:
                 self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115, it stays open
             written = os.pwrite(self._file.fileno(), packed.data, self._bytes)
             if written == len(packed.data):
-                self._at[packed.index] = self._bytes, replace(packed, data=b"")
+                self._at[packed.bare.index] = self._bytes, replace(packed, data=b"")
                 self._bytes += written
 
     def _pack(self, frame: Frame) -> _Packed:
-        units = _choose_units(frame.depth_m)
-        depth = pack_depth(_integers(frame.depth_m, units))
+        depth, units = _pack_finely(frame.depth_m)
         color = _encode_color(frame.color, self._shrink(frame))
         sigma, sigma_units = np.zeros(0, np.uint8), 0.0
         if frame.depth_sigma_m is not None:
-            known = np.where(frame.depth_m > 0, frame.depth_sigma_m, np.float32(0))
-            sigma_units = min(_FINEST, _MOST_UNITS / max(float(known.max(initial=0)), 1e-3))
-            least = np.where(frame.depth_m > 0, np.float32(1), np.float32(0))  # 0 would weigh infinitely
-            sigma = pack_depth(np.maximum(_integers(known, sigma_units), least.astype(np.uint16)))
+            least = np.float32(1 / _FINEST)  # 0 would weigh infinitely
+            sigma_m = np.where(frame.depth_m > 0, np.maximum(frame.depth_sigma_m, least), np.float32(0))
+            sigma, sigma_units = _pack_finely(sigma_m)
         sizes = len(depth), len(color), len(sigma)
         data = b"".join((depth.tobytes(), color, sigma.tobytes()))
-        return _Packed(frame.index, frame.timestamp, frame.intrinsics, sizes, (units, sigma_units), frame.sensor, data)
+        bare = replace(frame, color=_NO_COLOR, depth_m=np.zeros((0, 0), np.float32), depth_sigma_m=None)
+        return _Packed(bare, sizes, (units, sigma_units), data)
 
 
-def _unpack(packed: _Packed, data: bytes) -> Frame:
-    camera = packed.intrinsics
-    shape = camera.height, camera.width
-    depth, color, sigma = np.split(np.frombuffer(data, np.uint8), np.cumsum(packed.sizes)[:2])
-    bgr = cv2.imdecode(color, cv2.IMREAD_COLOR)
-    if bgr.shape[:2] != shape:
-        bgr = cv2.resize(bgr, shape[::-1], interpolation=cv2.INTER_LINEAR)
-    sigma_m = unpack_depth(sigma, shape, 1 / packed.units[1]) if len(sigma) else None
-    return Frame(
-        packed.index,
-        packed.timestamp,
-        cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr),
-        unpack_depth(depth, shape, 1 / packed.units[0]),
-        camera,
-        sigma_m,
-        packed.sensor,
+def _unpack(packed: _Packed, data: bytes, color: bool) -> Frame:
+    shape = packed.bare.intrinsics.height, packed.bare.intrinsics.width
+    depth, jpeg, sigma = np.split(np.frombuffer(data, np.uint8), np.cumsum(packed.sizes)[:2])
+    return replace(
+        packed.bare,
+        color=_decode_color(jpeg, shape) if color else _NO_COLOR,
+        depth_m=unpack_depth(depth, shape, 1 / packed.units[0]),
+        depth_sigma_m=unpack_depth(sigma, shape, 1 / packed.units[1]) if len(sigma) else None,
     )
 
 
-def _choose_units(depth_m: NDArray[np.float32]) -> float:
-    """Units per meter that represent the depth exactly, or else finely."""
-    largest = max(float(depth_m.max(initial=0)), 1e-3)
+def _decode_color(jpeg: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    bgr = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+    if bgr.shape[:2] != shape:
+        bgr = cv2.resize(bgr, shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB, dst=bgr), np.uint8)
+
+
+def _pack_finely(values_m: NDArray[np.float32]) -> tuple[NDArray[np.uint8], float]:
+    """Bytes of values in meters, in units that represent them exactly, or else finely, and units per meter."""
+    most = MOST_UNITS / max(float(values_m.max(initial=0)), _LEAST_M)
     for units in _UNITS:
-        if largest * units <= _MOST_UNITS:
-            again = _integers(depth_m, units).astype(np.float32) * np.float32(1 / units)
-            if np.array_equal(again, depth_m):
-                return units
-    return min(_FINEST, _MOST_UNITS / largest)
-
-
-def _integers(values_m: NDArray[np.float32], units: float) -> NDArray[np.uint16]:
-    return np.rint(values_m * np.float32(units)).clip(0, _MOST_UNITS).astype(np.uint16)
+        packed, exact = pack_depth(values_m, min(units, most))
+        if exact:
+            return packed, min(units, most)
+    return pack_depth(values_m, min(_FINEST, most))[0], min(_FINEST, most)
 
 
 def _encode_color(color: NDArray[np.uint8], shrink: int) -> bytes:

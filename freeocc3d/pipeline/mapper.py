@@ -154,16 +154,17 @@ class Mapper:
         measured = np.flatnonzero(np.isin(trajectory.status, ("keyframe", "tracked", "relocalised")))
         return np.union1d(trajectory.keyframes, measured[::every] if every else [])
 
-    def posed(self, trajectory: Trajectory, every: int) -> Iterator[PosedFrame]:
-        """Yields the frames of ``frames_used`` with their poses, from the run's cache; without frames between them,
-        keyframes as they were saved. Leaves out a frame that can no longer be decoded."""
+    def posed(self, trajectory: Trajectory, every: int, color: bool = True) -> Iterator[PosedFrame]:
+        """Yields the frames of ``frames_used`` with their poses, from the run's cache, and without their colors if
+        ``color`` is false; without frames between them, keyframes as they were saved. Leaves out a frame that can no
+        longer be decoded."""
         if not every:
             posed = zip(self.mapped(trajectory), trajectory.T_world_keyframe, strict=True)
             yield from (PosedFrame(frame, T, row) for row, (frame, T) in enumerate(posed))
             return
         indices = self.frames_used(trajectory, every).tolist()
         rows = np.maximum(np.searchsorted(trajectory.keyframes, indices, side="right") - 1, 0).tolist()
-        with contextlib.closing(self.cache.frames(indices)) as frames:
+        with contextlib.closing(self.cache.frames(indices, color)) as frames:
             for index, row, frame in zip(indices, rows, frames, strict=True):
                 if not isinstance(frame, FrameError):
                     yield PosedFrame(frame, trajectory.T_world_cam[index], row)
@@ -177,14 +178,14 @@ class Mapper:
         cells = anchors.AnchoredCells(options, self.cell_size, trajectory.T_world_keyframe)
         done = itertools.count(1)
 
-        def frames() -> Iterator[PosedFrame]:
-            for posed in self.posed(trajectory, options.every):
+        def frames(color: bool) -> Iterator[PosedFrame]:
+            for posed in self.posed(trajectory, options.every, color):
                 yield posed
                 progress.advance(next(done))
 
-        for posed in frames():
+        for posed in frames(color=True):
             cells.add(posed)
-        return cells.gaussians(frames())
+        return cells.gaussians(frames(color=False))
 
     def fit_gaussians(self, gaussians: Gaussians, progress: Progress | None = None) -> Gaussians:
         """Layer 2 fitted to the images of all mapped keyframes so far."""
@@ -230,7 +231,7 @@ class Mapper:
         return build.build_occupancy(
             gaussians,
             features,
-            self.posed(trajectory, carving.every),
+            self.posed(trajectory, carving.every, color=False),
             self.settings.occupancy,
             carving,
             origin=self.origin,

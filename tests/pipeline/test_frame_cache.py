@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scenes import wall_frame, with_sigma
 
+from freeocc3d.core.depth_sensors import STEREO
 from freeocc3d.core.errors import FrameError
 from freeocc3d.core.types import Frame
 from freeocc3d.pipeline import frame_cache
@@ -45,8 +46,13 @@ def test_packed_depth_comes_back_and_is_that_of_numpy(case: str) -> None:
         "zeros": np.zeros((13, 17)),
         "constant": np.full((13, 17), 65535),
     }[case].astype(np.uint16)
-    packed = pack_depth(values)
-    np.testing.assert_array_equal(packed, pack_reference(values))
+    for units, asked in ((4.0, True), (1.0, False)):
+        packed, exact = pack_depth(values * np.float32(0.25), units)
+        expected, expected_exact = pack_reference(values * np.float32(0.25), units)
+        np.testing.assert_array_equal(packed, expected)
+        assert exact == expected_exact
+        assert exact == (asked or case == "zeros")
+    packed, _ = pack_depth(values * np.float32(0.25), 4.0)
     np.testing.assert_array_equal(unpack_depth(packed, values.shape, 0.25), values.astype(np.float32) * 0.25)
 
 
@@ -68,11 +74,15 @@ def test_frames_come_back_in_the_asked_order_with_depth_as_it_was(tmp_path, unit
 
 
 def test_depth_of_any_unit_and_its_deviations_come_back_to_fractions_of_a_millimeter(tmp_path) -> None:
-    made = with_sigma(replace(frame(0), depth_m=frame(0).depth_m * np.float32(0.9137)), 0.001, 0.3)
+    made = with_sigma(replace(frame(0), depth_m=frame(0).depth_m * np.float32(0.9137), sensor=STEREO), 0.001, 0.3)
     cache, _ = opened(tmp_path, [made], shrink=2)
     cache.keep(made)
     (found,) = cache.frames([0])
     assert found.color.shape == made.color.shape
+    assert found.sensor is STEREO
+    (without,) = cache.frames([0], color=False)
+    assert not without.color.size
+    np.testing.assert_array_equal(without.depth_m, found.depth_m)
     measured = made.depth_m > 0
     np.testing.assert_array_equal(found.depth_m > 0, measured)
     assert np.abs(found.depth_m - made.depth_m).max() < 1e-4

@@ -117,6 +117,11 @@ def fit_planes(
     points = np.zeros((h, w, 3), np.float32)
     normals = np.zeros((h, w, 3), np.float32)
     stride = 2 if window >= 4 else 1
+    inverse_m = np.zeros((H, W))  # 0 without a depth; each is used in many windows
+    for v in range(H):
+        for u in range(W):
+            if depth_m[v, u] > 0:
+                inverse_m[v, u] = 1.0 / depth_m[v, u]
     for i in range(h):
         v0 = i * step + 0.5 * (step - 1)
         for j in range(w):
@@ -126,9 +131,9 @@ def fit_planes(
             for v in range(i * step, min(i * step + step, H)):
                 for u in range(j * step, min(j * step + step, W)):
                     d = (u - u0) ** 2 + (v - v0) ** 2
-                    if depth_m[v, u] > 0 and d < best:
+                    if inverse_m[v, u] > 0 and d < best:
                         best = d
-                        near = 1.0 / depth_m[v, u]
+                        near = inverse_m[v, u]
             if near == 0.0:
                 continue
             a, b, c = near, 0.0, 0.0
@@ -140,11 +145,10 @@ def fit_planes(
                 for v in range(max(0, int(v0) - window + 1), min(H, int(v0) + window + 1), stride):
                     dv = v - v0
                     for u in range(max(0, int(u0) - window + 1), min(W, int(u0) + window + 1), stride):
-                        z = depth_m[v, u]
-                        if z <= 0:
+                        inverse = inverse_m[v, u]
+                        if inverse == 0:
                             continue
                         du = u - u0
-                        inverse = 1.0 / z
                         if abs(inverse - (a + b * du + c * dv)) > allowed:
                             continue
                         n += 1.0
