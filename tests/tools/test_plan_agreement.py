@@ -19,6 +19,8 @@ def test_who_knows_a_cell_decides_over_what_agreement_is() -> None:
     assert found["agree_of_truth"] == pytest.approx(4 / 7)
     assert found["free_called_occupied"] == pytest.approx(1 / 5)
     assert found["occupied_called_free"] == pytest.approx(1 / 2)
+    assert found["obstacles_invented"] == pytest.approx(1 / 5)
+    assert found["obstacles_lost"] == 0  # one of ours is beside
     assert found["free_in_one_piece"] == pytest.approx(2 / 3)  # the obstacle shuts one of three off
 
 

@@ -4,6 +4,9 @@ The plan is the output of ``export --format nav2``. The same rule makes the trut
 capture's ground truth, at the centers of the plan's cells. Three figures differ in the cells that they count: those
 that both plans know, all that the truth knows, and those of these that the capture's depth images reach. The last two
 differ where the truth comes from depth that the capture does not hold: without noise, and beyond the sensor's range.
+
+The cells of the plan and of the truth do not lie on each other, so a wall one cell thick in both may lie in two cells
+that only overlap. So obstacles without one of the other plan in the same cell or beside it are counted once more.
 """
 
 from __future__ import annotations
@@ -80,6 +83,9 @@ def agreement(plan: Any, true: Any, measured: Any) -> Figures:
     both = known & (plan != UNKNOWN)
     told = known & (measured != UNKNOWN)
     free = (plan == FREE) & (true == FREE)
+    around = np.ones((3, 3), bool)
+    invented = (true == FREE) & (plan == OCCUPIED) & ~ndimage.binary_dilation(true == OCCUPIED, around)
+    lost = (true == OCCUPIED) & (plan == FREE) & ~ndimage.binary_dilation(plan == OCCUPIED, around)
     regions = ndimage.label(plan == FREE)[0]
     largest = regions == np.bincount(regions.ravel())[1:].argmax() + 1
     return {
@@ -91,6 +97,8 @@ def agreement(plan: Any, true: Any, measured: Any) -> Figures:
         "agree_of_truth": float(same[known].mean()),
         "free_called_occupied": float((plan[known & (true == FREE)] == OCCUPIED).mean()),
         "occupied_called_free": float((plan[known & (true == OCCUPIED)] == FREE).mean()),
+        "obstacles_invented": float(invented[true == FREE].mean()),
+        "obstacles_lost": float(lost[true == OCCUPIED].mean()),
         "free_in_one_piece": float(largest[free].mean()),
     }
 
@@ -138,5 +146,7 @@ def plan_lines(figures: Figures) -> list[Line]:
         ("  of all cells that the truth knows", percent["agree_of_truth"], "90 %"),
         ("  the truth's free cells that are called occupied", percent["free_called_occupied"], "0 %"),
         ("  the truth's occupied cells that are called free", percent["occupied_called_free"], "0 %"),
+        ("  of the truth's free cells: called occupied, with no obstacle beside", percent["obstacles_invented"], "0 %"),
+        ("  of the truth's occupied cells: called free, with none of ours beside", percent["obstacles_lost"], "0 %"),
         ("  free cells that are connected, through doors", percent["free_in_one_piece"], "100 %"),
     ]

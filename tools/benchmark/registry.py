@@ -116,6 +116,12 @@ MEASUREMENTS = {
         lines="self_check:check_lines",
         map_of=OURS,
     ),
+    "air": Measurement(
+        "what moving people, panes and mixed edges, put into the depth, leave in the air of the map",
+        "capture",
+        "air:measure_air",
+        table="air:tabulate_air",
+    ),
     "poses_from_color": Measurement(
         "poses from color alone: placed images, ATE and seconds, and those of pycolmap's pipeline at its defaults",
         "capture",
