@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from ..core.errors import FreeOccError
 from ..core.sampling import spread_evenly
-from ..core.types import OCCUPIED, Frame, Occupancy
+from ..core.types import OCCUPIED, Frame, Gaussians, Occupancy
 from ..gaussians import rendered_views
+from ..gaussians.rasterizers.base import Rasterizer
+from ..gaussians.rendered_views import CapturedView
 from ..settings import registry
 from ..storage.saved_map import SavedMap
 from ..tracking import view_agreement
@@ -28,6 +30,7 @@ VERDICTS = "good", "fair", "poor"
 
 _HELD_OUT = 12  # most frames between keyframes that are rendered
 _SAME_COLOR = 6.0  # largest mean difference of gray values between a keyframe and its frame in the capture, 0…255
+_SOLID = 0.5  # least alpha of a pixel that Gaussians cover
 _DIGITS = 5
 
 
@@ -151,7 +154,7 @@ def check_map(scan_map: SavedMap) -> MapCheck:
     """All measures of a saved map: from its folder, and from frames between its keyframes if its capture is still
     there. Raises MapError for a damaged map."""
     report, trajectory = scan_map.report, scan_map.trajectory
-    views = [view_agreement.prepare_compared_view(frame) for frame in scan_map.keyframes]
+    views = view_agreement.prepare_compared_views(scan_map.keyframes)
     held = [closure[2] for submap in report.get("submaps", []) for closure in submap["closures"]]
     checked = check_agreement(views, trajectory.T_world_keyframe, scan_map.occupancy, held)
     rendering = report.get("rendering") or {}
@@ -195,11 +198,12 @@ def _why_no_revisits(agreement: Agreement) -> str:
 
 
 def _render_held_out(scan_map: SavedMap) -> tuple[float | None, int, str]:
-    """PSNR in dB where depth is measured, over frames between keyframes, how many, and why there is no value."""
+    """PSNR in dB where depth is measured, over frames between keyframes, how many, and why there is no value. Of frames
+    without depth, the pixels that Gaussians cover are compared."""
     trajectory, keyframes = scan_map.trajectory, scan_map.keyframes
-    between = np.setdiff1d(np.flatnonzero(trajectory.has_pose), trajectory.keyframes)
+    between = np.flatnonzero(np.isin(trajectory.status, ("tracked", "relocalised")))
     if not len(between):
-        return None, 0, "All frames with a pose are keyframes, so no frame is held out from fitting."
+        return None, 0, "All frames that were tracked are keyframes, so no frame is held out from fitting."
     chosen = between[spread_evenly(len(between), _HELD_OUT)].tolist()
     try:
         capture = scan_map.capture
@@ -210,8 +214,15 @@ def _render_held_out(scan_map: SavedMap) -> tuple[float | None, int, str]:
         return None, 0, f"No held-out frames are rendered: {error}"
     rasterizer, width = registry.load("gaussians.rasterizers", "cpu").load(), scan_map.settings.fitting.width
     rendered = [rendered_views.prepare_captured_view(frame, T, width, rasterizer.device) for frame, T in frames]
-    found = rendered_views.measure_fidelity(scan_map.gaussians, rendered, rasterizer)
-    return found.psnr_measured if found.psnr_measured is not None else found.psnr, len(frames), ""
+    if not capture.has_depth:
+        rendered = [_with_rendered_depth(scan_map.gaussians, view, rasterizer) for view in rendered]
+    return rendered_views.measure_fidelity(scan_map.gaussians, rendered, rasterizer).psnr_measured, len(frames), ""
+
+
+def _with_rendered_depth(gaussians: Gaussians, view: CapturedView, rasterizer: Rasterizer) -> CapturedView:
+    """The view with a depth where Gaussians cover it, so that these pixels are compared."""
+    rendered = rendered_views.render_gaussians(gaussians, view, rasterizer)
+    return dataclasses.replace(view, depth_m=rendered.depth * (rendered.alpha >= _SOLID))
 
 
 def _same_image(read: Frame, kept: Frame) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -193,7 +193,7 @@ class Mapper:
         progress.stage("fitting", options.passes * len(trajectory.keyframes))
         if options.passes == 0 or not len(gaussians):
             return gaussians
-        views = self.views(trajectory)
+        views = self.views(trajectory, range(len(trajectory.keyframes)))
         made = fitting.fit_gaussians(gaussians, views, self.rasterizer, options, options.passes, progress.advance)
         return anchors.anchor_in_place(made, trajectory.T_world_keyframe) if options.means == "free" else made
 
@@ -205,11 +205,11 @@ class Mapper:
             usual = min(usual, _FINE * capture_base.NOMINAL_DEPTH)
         return float(self.settings.gaussians.cell_size or usual)
 
-    def views(self, trajectory: Trajectory) -> list[rendered_views.CapturedView]:
-        """The keyframes as they are rendered and compared."""
+    def views(self, trajectory: Trajectory, rows: Iterable[int]) -> list[rendered_views.CapturedView]:
+        """Some of the keyframes as they are rendered and compared."""
         device, width = self.rasterizer.device, self.settings.fitting.width
-        posed = zip(self.mapped(trajectory), trajectory.T_world_keyframe, strict=True)
-        return [rendered_views.prepare_captured_view(frame, T, width, device) for frame, T in posed]
+        keyframes, T = self.mapped(trajectory), trajectory.T_world_keyframe
+        return [rendered_views.prepare_captured_view(keyframes[row], T[row], width, device) for row in rows]
 
     def build_features(
         self, gaussians: Gaussians, encoder: Encoder, progress: Progress | None = None

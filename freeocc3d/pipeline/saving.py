@@ -28,7 +28,7 @@ from ..storage.manifest import (
 )
 from ..storage.work_folder import WorkFolder
 from ..storage.writer import MapParts, write_map
-from ..tracking.view_agreement import prepare_compared_view
+from ..tracking.view_agreement import prepare_compared_views
 from ..viewer import render_pictures, trajectory_picture
 from .map_check import check_agreement
 from .mapper import Mapper
@@ -56,18 +56,19 @@ def save(
         settings = settings.changed("gaussians", cell_size=mapper.cell_size)
     with work.timed("saving"):
         facts = _facts(mapper, trajectory, encoder, vocabulary)
-        views = list(zip(trajectory.keyframes.tolist(), mapper.views(trajectory), strict=True))
-        measured = [views[row][1] for row in evenly(len(views), _MEASURED_VIEWS)]
+        count = len(trajectory.keyframes)
+        measured = mapper.views(trajectory, evenly(count, _MEASURED_VIEWS))
         fidelity = rendered_views.measure_fidelity(gaussians, measured, mapper.rasterizer)
     with work.timed("check"):
         held = [agrees for submap in submaps for agrees in submap.held.tolist()]
-        compared = [prepare_compared_view(frame) for frame in mapper.mapped(trajectory)]
+        compared = prepare_compared_views(mapper.mapped(trajectory))
         checked = check_agreement(compared, trajectory.T_world_keyframe, occupancy, held).summary()
 
     def draw(folder: Path) -> None:
         path, up = folder / map_files.PATH_PICTURE, np.array(facts.up)
         trajectory_picture.write_path_picture(path, submaps, trajectory, gaussians, up, capture.path, metric)
-        shown = [views[row] for row in evenly(len(views), render_pictures.SHOWN)]
+        rows = evenly(count, render_pictures.SHOWN)
+        shown = list(zip(trajectory.keyframes[rows].tolist(), mapper.views(trajectory, rows), strict=True))
         picture = folder / map_files.RENDER_PICTURE
         render_pictures.write_render_picture(picture, gaussians, shown, mapper.rasterizer, capture.path, metric)
 

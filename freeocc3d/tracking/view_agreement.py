@@ -14,6 +14,7 @@ looked elsewhere in between, add the errors of poses.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from ..core.depth_noise import compute_sigma_image
 from ..core.sampling import spread_evenly
+from ..core.threads import count_threads
 from ..core.transforms import back_project, invert, project, transform
 from ..core.types import Frame, Intrinsics
 
@@ -37,7 +39,7 @@ LEAST_OVERLAP, ELSEWHERE = 0.25, 0.1
 """Shares of a view: two views are compared if they have at least the first in common, and the camera looked elsewhere
 in between if some view there shares less than the second with one of the two."""
 
-MOST_PAIRS = 300
+MOST_PAIRS = 200
 """Pairs of each kind that are compared, evenly chosen: enough for a median, in a fraction of a second."""
 
 _COLUMNS, _OVERLAP_COLUMNS = 80, 12  # sampled points along a row, of a pair and for overlaps
@@ -108,6 +110,12 @@ def prepare_compared_view(frame: Frame) -> ComparedView:
         width, height, camera.fx / step, camera.fy / step, (camera.cx - first) / step, (camera.cy - first) / step
     )
     return ComparedView(depth_m, sigma_m, np.asarray(gray, np.uint8), small)
+
+
+def prepare_compared_views(frames: Sequence[Frame]) -> list[ComparedView]:
+    """``prepare_compared_view`` for frames that are decoded when they are taken, by all threads."""
+    with ThreadPoolExecutor(count_threads()) as pool:
+        return list(pool.map(lambda row: prepare_compared_view(frames[row]), range(len(frames))))
 
 
 class Compared(NamedTuple):
