@@ -22,7 +22,7 @@ def export(
         typer.Option(
             "--frame",
             metavar="FRAME",
-            help="map, gravity (z up, floor at 0) or first-camera (z up, origin at that camera).",
+            help="gravity (z up, floor at 0), map, start (z up, origin at the first camera) or first-camera (its own).",
             show_default="the format's own",
         ),
     ] = None,

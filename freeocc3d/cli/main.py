@@ -28,6 +28,7 @@ from .reconstruct import reconstruct
 from .refine import refine
 from .scale import scale
 from .stopping import Stopping
+from .upright import upright
 from .view import view
 
 
@@ -65,7 +66,21 @@ def _options(
         raise typer.Exit
 
 
-for _command in (demo, inspect, reconstruct, query, view, info, check, export, refine, scale, evaluate, ground_truth):
+for _command in (
+    demo,
+    inspect,
+    reconstruct,
+    query,
+    view,
+    info,
+    check,
+    export,
+    refine,
+    scale,
+    upright,
+    evaluate,
+    ground_truth,
+):
     app.command()(_command)
 app.command("list")(list_backends)
 app.add_typer(models.app, name="models")

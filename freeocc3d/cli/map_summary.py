@@ -36,6 +36,9 @@ def summary_document(loaded: Map) -> dict[str, Any]:
         "voxels": {"occupied": counts.voxels.occupied, "free": counts.voxels.free},
         "metric": loaded.metric,
         "scale": to_builtins(manifest.scale),
+        "up": list(manifest.up),
+        "upright": to_builtins(manifest.upright),
+        "T_first_camera": None if loaded.T_first_camera is None else loaded.T_first_camera.tolist(),
         "voxel_size_m": manifest.voxel_size_m,
         "finest_voxel_m": manifest.finest_m,
         "refined": to_builtins(manifest.refined),
@@ -64,6 +67,7 @@ def summary_text(loaded: Map) -> str:
         *([_refined_text(said["refined"])] if said["refined"] else []),
         f"gaussians  {said['gaussians']:,}",
         _voxels_text(said),
+        _upright_text(said["upright"]),
         *([] if said["scale"]["by"] == "sensor" else [_scale_text(said["scale"])]),
         f"encoder    {said['encoder']}, which knows {said['encoder_knows']}",
         *([_vocabulary_text(said["vocabulary"])] if said["vocabulary"] else []),
@@ -98,6 +102,16 @@ def _voxels_text(said: dict[str, Any]) -> str:
     unit = "m" if said["metric"] else "units"
     edges = f"edge {largest:.3g} {unit}" if largest == smallest else f"edges {largest:.3g} to {smallest:.3g} {unit}"
     return f"voxels     {said['voxels']['occupied']:,} occupied, {said['voxels']['free']:,} free, {edges}"
+
+
+def _upright_text(upright: dict[str, Any] | None) -> str:
+    if upright is None:
+        return "upright    no: an earlier map, in the frame of its first camera or poses (see freeocc3d upright)"
+    floor = "the floor at z = 0" if upright["floor"] else "no floor is seen"
+    walls = "walls along x and y" if upright["walls"] else "x along the first view"
+    rolled = f"which were rolled by {upright['off_deg']:.1f} degrees"
+    off = rolled if upright["by"] == "cameras" else f"{upright['off_deg']:.1f} degrees from that of the cameras"
+    return f"upright    z up by the {upright['by']}, {off}; {floor}, {walls}"
 
 
 def _scale_text(scale: dict[str, Any]) -> str:

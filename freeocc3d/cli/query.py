@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ..query.regions import Region
     from ..query.scan_map import Map
     from ..query.word_query import QueryResult
+    from .query_answers import AnswerFrame
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,10 @@ class Answer:
     """What comes out."""
 
     as_json: Json = False
+    frame: Annotated[
+        str,
+        typer.Option("--frame", metavar="FRAME", help="Frame of printed places: map, start, first-camera or gravity."),
+    ] = "map"
     views: Annotated[
         bool,
         flag("--views", "With --json: add keyframes that show a region, and where to stand to see it."),
@@ -229,13 +234,29 @@ def _write_files(loaded: Map, results: list[QueryResult], answer: Answer) -> Non
 def _answer(map_path: Path, loaded: Map, results: Sequence[QueryResult], answer: Answer) -> str:
     from .query_answers import answers_document, answers_text
 
+    frame = _frame(loaded, answer.frame)
     if answer.as_json:
         from .region_details import describe_regions
 
-        more = describe_regions(loaded, results, answer.views)
-        return json.dumps(answers_document(map_path, results, more, loaded.metric))
+        more = describe_regions(loaded, results, answer.views, frame.T_frame_map)
+        return json.dumps(answers_document(map_path, results, more, loaded.metric, frame))
     unit = "" if loaded.metric else "\nThe map's scale is unknown, so lengths are not meters (see freeocc3d scale)."
-    return answers_text(results, loaded.metric) + unit
+    return answers_text(results, loaded.metric, frame) + unit
+
+
+def _frame(loaded: Map, name: str) -> AnswerFrame:
+    """The frame of that name. Raises FreeOccError."""
+    import numpy as np
+
+    from ..query.moved_regions import region_mover
+    from .query_answers import AnswerFrame
+
+    if name == "map":
+        return AnswerFrame(name, np.eye(4), lambda region: region)
+    from ..export.export_frames import to_frame
+
+    T_frame_map = to_frame(loaded, name)
+    return AnswerFrame(name, T_frame_map, region_mover(loaded.occupancy, T_frame_map))
 
 
 def _answer_lines(loaded: Map, question: Question, answer: Answer) -> None:

@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from .. import __version__
 from ..query.regions import Region
 from ..query.word_query import QueryResult
+
+
+@dataclass(frozen=True)
+class AnswerFrame:
+    """The frame of the printed places. name: of the frame.  T_frame_map: (4, 4).  move: gives a region in it."""
+
+    name: str
+    T_frame_map: NDArray[np.float64]
+    move: Callable[[Region], Region]
 
 
 def answers_document(
@@ -16,20 +29,24 @@ def answers_document(
     results: Sequence[QueryResult],
     more: Callable[[Region], dict[str, Any]] | None = None,
     metric: bool = True,
+    frame: AnswerFrame | None = None,
 ) -> dict[str, Any]:
-    """Plain values: meters (if ``metric``) in the map frame, fractions 0 to 1. more: returns further keys of a
-    region."""
+    """Plain values: meters (if ``metric``) in the frame, by default the map's, fractions 0 to 1. more: returns further
+    keys of a region."""
+    move = (lambda region: region) if frame is None else frame.move
     return {
         "version": __version__,
         "map": str(map_path),
         "metric": metric,
+        "frame": "map" if frame is None else frame.name,
+        "T_frame_map": np.eye(4).tolist() if frame is None else frame.T_frame_map.tolist(),
         "results": [
             {
                 "word": result.word,
                 "matched": result.matched,
                 "understood": result.understood,
                 "note": result.note,
-                "regions": [_region(region) | (more(region) if more else {}) for region in result.regions],
+                "regions": [_region(move(region)) | (more(region) if more else {}) for region in result.regions],
             }
             for result in results
         ],
@@ -49,8 +66,10 @@ def _region(region: Region) -> dict[str, Any]:
     }
 
 
-def answers_text(results: Sequence[QueryResult], metric: bool = True) -> str:
-    """A table for people, in meters and liters, or in the map's units if not ``metric``."""
+def answers_text(results: Sequence[QueryResult], metric: bool = True, frame: AnswerFrame | None = None) -> str:
+    """A table for people, in meters and liters, or in the map's units if not ``metric``, in the map's frame by
+    default."""
+    move = (lambda region: region) if frame is None else frame.move
     length, volume, per_unit3, digits = ("m", "l", 1000, 1) if metric else ("units", "units^3", 1, 5)
     lines = []
     for result in results:
@@ -60,7 +79,7 @@ def answers_text(results: Sequence[QueryResult], metric: bool = True) -> str:
         if count:
             columns = f"{f'centroid ({length})':23}  {f'size ({length})':19}  {f'volume ({volume})':>10}"
             lines.append(f"   #  score  conf.  {columns}  voxels")
-        for number, region in enumerate(result.regions, start=1):
+        for number, region in enumerate(map(move, result.regions), start=1):
             x, y, z = region.centroid
             dx, dy, dz = region.box_max - region.box_min
             lines.append(

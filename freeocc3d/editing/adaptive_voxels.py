@@ -93,7 +93,7 @@ def build_adaptive(
             break
         size = base.voxel_size / 2**level
         region = Blocks(split, base.origin, 2 * BLOCK * size)
-        made = lift_gaussians(posed, region, size, settings, T_world_keyframe, progress)
+        made = lift_gaussians(posed, region, size, settings, T_world_keyframe, base.origin, progress)
         parts = np.sort(pack_voxels(levels.subdivide_keys(unpack_voxels(split))))
         split = parts[:0]
         if level < count and tree is not None and len(made):

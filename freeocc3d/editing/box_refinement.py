@@ -75,7 +75,8 @@ def refine_box(
 ) -> Map:
     """Write a map of a box of another map, with voxels of ``voxel_size`` meters, to the folder ``output``.
 
-    The box is widened to whole blocks of 8 voxels. Raises FreeOccError if the box is empty or too large, if no keyframe
+    The box is widened to whole blocks of 8 voxels, and down so that z = 0 is the middle of a layer if the map stands
+    upright. Raises FreeOccError if the box is empty or too large, if no keyframe
     sees a surface in it, or if the folder exists.
     """
     progress = progress or Progress()
@@ -84,6 +85,8 @@ def refine_box(
             f"Voxels of {voxel_size:g} m are not possible: choose a size from {SMALLEST_VOXEL_M:g} m to the map's own "
             f"{scan_map.manifest.voxel_size_m:g} m."
         )
+    if scan_map.manifest.upright is not None:
+        box = _on_floor(box, voxel_size)
     blocks = tuple(math.ceil(edge - 1e-6) for edge in (box.high - box.low) / (BLOCK * voxel_size))
     if math.prod(blocks) > _MOST_BLOCKS:
         edge = BLOCK * voxel_size * _MOST_BLOCKS ** (1 / 3)
@@ -100,7 +103,7 @@ def refine_box(
             for row, frame in enumerate(seeing):
                 yield PosedFrame(frame, poses[row], row)
 
-        gaussians = lift_gaussians(posed, box, voxel_size, settings, poses, progress)
+        gaussians = lift_gaussians(posed, box, voxel_size, settings, poses, box.low, progress)
         if not len(gaussians):
             raise MapError(f"No keyframe of {scan_map.path} shows a surface in the box: choose another box.")
         features = lift_features_again(scan_map, seeing, poses, gaussians, settings, progress)
@@ -128,6 +131,13 @@ def refine_box(
         )  # fmt: skip
         write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)
+
+
+def _on_floor(box: Box, voxel_size: float) -> Box:
+    """The box with its lower face half a voxel above or below a multiple of voxels from z = 0."""
+    low = box.low.astype(np.float64)
+    low[2] = (math.floor(low[2] / voxel_size + 0.5 + 1e-6) - 0.5) * voxel_size
+    return Box(low, box.high)
 
 
 def read_settings(scan_map: Map) -> Settings:
@@ -171,16 +181,17 @@ def lift_gaussians(
     voxel_size: float,
     settings: Settings,
     T_world_keyframe: NDArray[np.float64],
+    origin: NDArray[np.float64],
     progress: Progress,
 ) -> Gaussians:
     """Layer 2 of a part of space, in cells of half a voxel, from keyframes with (K, 4, 4) poses.
 
-    posed: yields the keyframes at each call.
+    posed: yields the keyframes at each call.  origin: (3,) a corner of voxels.
     """
     options = settings.gaussians.changed(cell_size=None, pixel_stride=None)  # both follow the voxels
     margin = AROUND * voxel_size
     progress.stage("gaussians", len(T_world_keyframe))
-    cells = anchors.AnchoredCells(options, 0.5 * voxel_size, T_world_keyframe)
+    cells = anchors.AnchoredCells(options, 0.5 * voxel_size, T_world_keyframe, origin)
     for done, look in enumerate(posed(), 1):
         pixels, points = _points(look.frame, look.T_world_cam, cells.stride(look.frame))
         outside = pixels[~space.contains(points, margin)]

@@ -19,13 +19,10 @@ from numpy.typing import NDArray
 
 from ..capture import associate, read_trajectory
 from ..core.errors import FreeOccError, MapError
-from ..core.sampling import spread_evenly
 from ..core.transforms import back_project, transform
-from ..core.types import Gaussians, Submap, Trajectory
+from ..core.types import Gaussians, Trajectory
 from ..core.warnings import read_notices
-from ..gaussians import rendered_views
 from ..query.scan_map import Map, load_map
-from ..settings import registry
 from ..settings.config import Settings
 from ..storage import map_files
 from ..storage.manifest import Manifest, MapScale, matrix, vector
@@ -33,7 +30,7 @@ from ..storage.work_folder import WorkFolder
 from ..storage.writer import MapParts, write_changed_map
 from ..tracking.trajectory_alignment import Poses, align_trajectories, read_poses, select_estimated_poses
 from ..tracking.upright.upright_frame import find_flat_gaussians, find_upright_frame
-from ..viewer import render_pictures, trajectory_picture
+from .map_redrawing import draw_pictures
 
 _NEAR_PX = 6
 _MOST_DEPTH_M = 65.535  # what 16 bits of millimeters hold
@@ -67,7 +64,7 @@ def scale_map(scan_map: Map, factor: float, by: str, output: str | Path, *, over
             trajectory=trajectory,
             keyframes=scan_map.keyframes,
             depth_factor=factor,
-            draw=lambda folder: _draw(scan_map, folder, trajectory, gaussians, factor),
+            draw=lambda folder: draw_pictures(scan_map, folder, trajectory, gaussians, scan_map.up, factor),
         )
         write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)
@@ -235,26 +232,3 @@ def _manifest(scan_map: Map, factor: float, by: str) -> Manifest:
         low, high = vector(factor * np.array(box[:3])), vector(factor * np.array(box[3:]))
         changes["refined"] = msgspec.structs.replace(said.refined, box=(*low, *high))
     return msgspec.structs.replace(said, **changes)
-
-
-def _draw(scan_map: Map, folder: Path, trajectory: Trajectory, gaussians: Gaussians, factor: float) -> None:
-    """Draw the pictures again, since they state lengths. The map holds only the mapped submap."""
-    capture = Path(scan_map.manifest.capture.path)
-    frames = np.flatnonzero(trajectory.has_pose).astype(np.int32)
-    closures = [closure for submap in scan_map.report.get("submaps", [])[:1] for closure in submap["closures"]]
-    ends = np.array([closure[:2] for closure in closures], np.int32).reshape(-1, 2)
-    held = np.array([closure[2] for closure in closures], bool)
-    submap = Submap(frames, trajectory.T_world_cam[frames], trajectory.keyframes, ends, held)
-    trajectory_picture.write_path_picture(
-        folder / map_files.PATH_PICTURE, [submap], trajectory, gaussians, scan_map.up, capture
-    )
-    rasterizer = registry.load("gaussians.rasterizers", "cpu").load()
-    width = scan_map.settings.fitting.width
-    keyframes = scan_map.keyframes
-    shown = []
-    for row in spread_evenly(len(keyframes), render_pictures.SHOWN):
-        frame = keyframes[row]
-        frame = frame.scaled(factor)
-        view = rendered_views.prepare_captured_view(frame, trajectory.T_world_keyframe[row], width, rasterizer.device)
-        shown.append((int(trajectory.keyframes[row]), view))
-    render_pictures.write_render_picture(folder / map_files.RENDER_PICTURE, gaussians, shown, rasterizer, capture)

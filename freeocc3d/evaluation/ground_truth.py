@@ -17,8 +17,8 @@ from .embodiedocc import load_global_package
 from .true_occupancy import GroundTruth
 
 _NAMES = (
-    "labels", "classes", "frames_mask", "origin", "voxel_size", "occupancy", "T_world_map", "means", "scales",
-    "quats_wxyz", "opacities", "semantics",
+    "labels", "classes", "frames_mask", "origin", "voxel_size", "occupancy", "T_world_map", "T_frame_map", "means",
+    "scales", "quats_wxyz", "opacities", "semantics",
 )  # fmt: skip
 _MOST_BYTES, _FARTHEST = (1 << 30) + (1 << 22), 1e9
 

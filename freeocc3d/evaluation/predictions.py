@@ -7,7 +7,7 @@ centers. Only a finished grid is resampled.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..capture import associate
 from ..core.errors import FreeOccError
-from ..core.transforms import is_rigid
+from ..core.transforms import invert, is_rigid
 from ..core.types import BLOCK, OCCUPIED, UNKNOWN, Gaussians, PosedFrame
 from ..core.voxel_keys import unpack_voxels
 from ..gaussians import anchors
@@ -137,12 +137,13 @@ def predict_from_frames(
 
 
 def predict_from_grid(
-    path: Path, alignment: TrajectoryAlignment, truth: GroundTruth, classes: ClassMap
+    path: Path, alignment: TrajectoryAlignment, truth: GroundTruth, classes: ClassMap, with_trajectory: bool = False
 ) -> tuple[Prediction, str]:
     """Returns the prediction of a finished voxel grid at the truth's voxel centers, and a sentence if the lattices
     differ.
 
-    path: an NPZ of ``export --format npz``, or of a ground truth. Raises FreeOccError: damaged, another voxel size.
+    path: an NPZ of ``export --format npz``, or of a ground truth.  with_trajectory: whether the alignment is that of
+    the trajectory that the grid was made with. Raises FreeOccError: damaged, another voxel size.
     """
     arrays = read_grid_arrays(path)
     origin, size = read_lattice(arrays, path)
@@ -161,10 +162,7 @@ def predict_from_grid(
     ):
         raise FreeOccError(f"{path} must hold 'occupancy' or 'labels', whole numbers (X, Y, Z).")
     points = alignment.to_estimate(truth.centers())
-    T = arrays.get("T_world_map", np.eye(4))
-    if T.dtype.kind != "f" or not is_rigid(T.astype(np.float64)):
-        raise FreeOccError(f"'T_world_map' of {path} is not a rigid transform.")
-    T = T.astype(np.float64)
+    T = _placed_grid(arrays, with_trajectory, path)
     inside_grid = ((points - T[:3, 3]) @ T[:3, :3] - origin) / size
     index = np.floor(inside_grid).astype(np.int64)
     inside = ((index >= 0) & (index < grid.shape)).all(axis=-1)
@@ -194,6 +192,18 @@ def predict_from_grid(
     predicted = np.zeros(truth.shape, np.uint8)
     predicted[inside] = table[labels[at]]
     return Prediction(occupied, np.where(occupied, predicted, 0).astype(np.uint8)), note
+
+
+def _placed_grid(arrays: Mapping[str, NDArray[np.generic]], with_trajectory: bool, path: Path) -> NDArray[np.float64]:
+    """Returns the (4, 4) transform from a grid's frame to that of its trajectory, which is the map's for the grid of a
+    map, or to the world of given poses. Raises FreeOccError."""
+    for name in ("T_world_map", "T_frame_map"):
+        T = arrays.get(name, np.eye(4))
+        if T.dtype.kind != "f" or not is_rigid(T.astype(np.float64)):
+            raise FreeOccError(f"'{name}' of {path} is not a rigid transform.")
+    if with_trajectory and "T_frame_map" in arrays:
+        return np.asarray(invert(arrays["T_frame_map"].astype(np.float64)))
+    return np.asarray(arrays.get("T_world_map", np.eye(4)), np.float64)
 
 
 def _scaled(scan_map: Map, alignment: TrajectoryAlignment) -> Iterator[PosedFrame]:

@@ -76,7 +76,7 @@ def score_map(
         except FreeOccError:
             if how != "none":
                 raise
-    alignment = TrajectoryAlignment.identity() if poses is None else align_trajectories(estimated, poses, how)
+    alignment = _in_world(scan_map) if poses is None or how == "none" else align_trajectories(estimated, poses, how)
     predicted, note = predictions.predict_from_map(scan_map, settings, alignment, truth, classes)
     notes = [*([note] if note else []), *([] if poses is None else describe_few_matches(estimated, poses))]
     if not scan_map.metric and how != "sim3":
@@ -138,9 +138,11 @@ def score_grid(
     poses: Poses | None = None,
     how: str = "se3",
 ) -> ScoredScene:
-    """Scores a finished voxel grid. A grid without a trajectory is already in the true frame."""
+    """Scores a finished voxel grid. A grid without a trajectory is already in the true frame.
+
+    trajectory: the one that the grid was made with; for the grid of a map, the map's."""
     alignment, errors = _aligned(trajectory, poses, how if trajectory is not None else "none", path)
-    predicted, note = predictions.predict_from_grid(path, alignment, truth, classes)
+    predicted, note = predictions.predict_from_grid(path, alignment, truth, classes, trajectory is not None)
     return _other(path, truth, predicted, alignment, errors, trajectory, poses, [note] if note else [])
 
 
@@ -190,6 +192,12 @@ def _up(truth: GroundTruth, poses: Poses | None) -> NDArray[np.float64]:
     if poses is None:
         return np.array((0.0, 0.0, 1.0))
     return estimate_up(poses.T_world_cam, truth.centers()[(truth.labels > 0) & (truth.labels != UNKNOWN)])
+
+
+def _in_world(scan_map: Map) -> TrajectoryAlignment:
+    """Returns the map's own ``T_world_map``: to the world of given poses, and of the first keyframe without any."""
+    T_world_map = np.array(scan_map.manifest.T_world_map, np.float64)
+    return TrajectoryAlignment(1.0, T_world_map[:3, :3], T_world_map[:3, 3])
 
 
 def _own_poses(scan_map: Map) -> Poses:

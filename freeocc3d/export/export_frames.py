@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,10 +17,11 @@ from ..query.scan_map import Map
 from ..settings.option_types import Finite, converted
 from ..settings.typed_options import TypedOptions
 
-Frame = Literal["map", "gravity", "first-camera"]
-"""The map's frame; z up with the floor at z = 0 and the walls along x and y; z up with the first camera at the origin
-and its view along x."""
-UprightFrame = Literal["gravity", "first-camera"]
+Frame = Literal["map", "gravity", "start", "first-camera"]
+"""The map's frame; z up with the floor at z = 0 and the walls along x and y, which is the map's own frame unless it was
+made before maps stood upright; z up with the first camera at the origin and its view along x, as robots start; the
+first camera's own: x right, y down, z forward."""
+UprightFrame = Literal["gravity", "start"]
 """The frames in which z points up."""
 Box = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
@@ -45,8 +46,9 @@ class VoxelOptions(BoxOptions, frozen=True):
     """The frame of the written voxels, and the part of the map to write."""
 
     frame: Frame = "gravity"
-    """"gravity" (z up, floor at 0), "first-camera" (z up, first camera at the origin) or "map". Voxels keep their
-    places only in the map's frame; the other frames resample them."""
+    """"gravity" (z up, floor at 0: the map's own frame if it stands upright), "map", "start" (z up, first camera at the
+    origin) or "first-camera" (its own: x right, y down, z forward). Voxels keep their places only in the map's own
+    frame; other frames resample them."""
 
 
 @dataclass(frozen=True)
@@ -54,20 +56,26 @@ class PlacedVoxels:
     """Voxels in a frame.
 
     occupancy: in coordinates of the frame, without features unless it is the map's own.  rows: (V,) for each occupied
-    voxel, the row of the map's occupied voxel that it stands for.  T_frame_map: (4, 4).  metric: whether lengths are
-    meters.
+    voxel, the row of the map's occupied voxel that it stands for.  T_frame_map: (4, 4).  up: (3,) in the frame.
+    metric: whether lengths are meters.
     """
 
     occupancy: Occupancy
     rows: NDArray[np.int64]
     frame: str
     T_frame_map: NDArray[np.float64]
+    up: NDArray[np.float64]
     metric: bool
 
     @property
     def unit(self) -> str:
         """The unit of lengths, in words."""
         return "meters" if self.metric else "units of unknown length"
+
+    @property
+    def is_upright(self) -> bool:
+        """Whether z points up."""
+        return self.frame in get_args(UprightFrame) or bool(self.up[2] > 1 - 1e-9)
 
     def described(self) -> dict[str, Any]:
         """Returns what a reader of an export must know about its frame, as plain values."""
@@ -76,7 +84,7 @@ class PlacedVoxels:
             "T_frame_map": self.T_frame_map.tolist(),
             "voxel_size_m": self.occupancy.finest,
             "metric": self.metric,
-            "up": "z" if self.frame != "map" else "see the map's 'up'",
+            "up": "z" if self.is_upright else self.up.tolist(),
         }
 
 
@@ -90,11 +98,12 @@ def to_frame(scan_map: Map, frame: str) -> NDArray[np.float64]:
         return scan_map.T_gravity_map
     from ..tracking.upright.upright_frame import compute_start_frame
 
-    trajectory = scan_map.trajectory
-    posed = np.flatnonzero(trajectory.has_pose)
-    if not len(posed):
+    T_first_camera = scan_map.T_first_camera
+    if T_first_camera is None:
         raise ExportError("The map has no camera pose, so there is no first camera: use --frame gravity.")
-    return compute_start_frame(scan_map.T_gravity_map, trajectory.T_world_cam[posed[0]])
+    if frame == "first-camera":
+        return T_first_camera
+    return compute_start_frame(scan_map.T_gravity_map, invert(T_first_camera))
 
 
 def place_voxels(
@@ -106,13 +115,13 @@ def place_voxels(
 ) -> PlacedVoxels:
     """Returns the map's voxels in a frame.
 
-    In the map's frame, voxels keep their places, and so in the gravity frame of a map that stands upright. In another
-    frame, they are resampled on a lattice of the map's (largest) voxel size. They are also resampled if ``one_size``
-    asks for it, or if ``origin`` is not on the map's lattice.
+    In the map's own frame, voxels keep their places. In another frame, they are resampled on a lattice of the map's
+    (largest) voxel size, and cut to one size if ``one_size`` asks for it.
 
     origin: (3,) lower corner of some voxel, in the frame; by default the map's lattice in the map's frame, else z = 0
-    lies in the middle of a layer of voxels.  box: x0, y0, z0, x1, y1, z1 in the frame; voxels with centers outside of
-    it become unknown. Raises ExportError if nothing is known, or nothing in the box.
+    lies in the middle of a layer of voxels. In the map's own frame, the frame then moves by at most half a voxel, so
+    that voxels still need no resampling: ``T_frame_map`` holds the move.  box: x0, y0, z0, x1, y1, z1 in the frame;
+    voxels with centers outside of it become unknown. Raises ExportError if nothing is known, or nothing in the box.
     """
     there = _placed(scan_map, frame, origin, one_size)
     return _within(there, np.array(box).reshape(2, 3)) if box is not None else there
@@ -122,19 +131,24 @@ def _placed(scan_map: Map, frame: str, origin: ArrayLike | None, one_size: bool)
     from ..occupancy.levels import make_uniform
     from ..occupancy.resampling import resample_occupancy
 
-    occupancy, T = scan_map.occupancy, to_frame(scan_map, frame)
+    occupancy, T = scan_map.occupancy, to_frame(scan_map, frame).copy()
     if not len(occupancy.keys):
         raise ExportError("The map has no known voxels to write.")
-    own = np.array_equal(T, np.eye(4)) and _on_lattice(occupancy, origin)
-    if own and not (one_size and occupancy.deepest):
-        return PlacedVoxels(occupancy, np.arange(len(occupancy.colors)), frame, T, scan_map.metric)
+    up = T[:3, :3] @ scan_map.up
+    if np.array_equal(T, np.eye(4)):
+        T[:3, 3] = np.zeros(3) if origin is None else _to_lattice(occupancy, np.asarray(origin, np.float64))
+        own = occupancy.replace(origin=occupancy.origin + T[:3, 3])
+        if not (one_size and occupancy.deepest):
+            return PlacedVoxels(own, np.arange(len(own.colors)), frame, T, up, scan_map.metric)
+        plain = own.replace(features=np.zeros((len(own.colors), 0), np.float16))
+        one = make_uniform(plain)
+        return PlacedVoxels(one, _nearest(plain, one), frame, T, up, scan_map.metric)
     plain = occupancy.replace(features=np.zeros((len(occupancy.colors), 0), np.float16))
     one = make_uniform(plain) if occupancy.deepest else plain
-    if own:
-        return PlacedVoxels(one, _nearest(plain, one), frame, T, scan_map.metric)
     at = (0.0, 0.0, -0.5 * one.voxel_size) if origin is None else origin
     new, rows = resample_occupancy(one, T, np.asarray(at, np.float64))
-    return PlacedVoxels(new, _nearest(plain, one)[rows] if occupancy.deepest else rows, frame, T, scan_map.metric)
+    rows = _nearest(plain, one)[rows] if occupancy.deepest else rows
+    return PlacedVoxels(new, rows, frame, T, up, scan_map.metric)
 
 
 def _within(there: PlacedVoxels, corners: NDArray[np.float64]) -> PlacedVoxels:
@@ -160,7 +174,7 @@ def _within(there: PlacedVoxels, corners: NDArray[np.float64]) -> PlacedVoxels:
         state=state[blocks],
         **{name: getattr(occupancy, name)[blocks] for name in ("keys", "probability", "free", "hits")},
     )
-    return PlacedVoxels(part, there.rows[kept], there.frame, there.T_frame_map, there.metric)
+    return replace(there, occupancy=part, rows=there.rows[kept])
 
 
 def find_floor_z(scan_map: Map, T_frame_map: NDArray[np.float64]) -> float:
@@ -180,11 +194,10 @@ def find_world(scan_map: Map, T_frame_map: NDArray[np.float64]) -> NDArray[np.fl
     return np.asarray(np.array(scan_map.manifest.T_world_map, np.float64) @ invert(T_frame_map))
 
 
-def _on_lattice(occupancy: Occupancy, origin: ArrayLike | None) -> bool:
-    if origin is None:
-        return True
-    off = (occupancy.origin - np.asarray(origin)) / occupancy.finest
-    return bool(np.abs(off - np.rint(off)).max() < 1e-3)
+def _to_lattice(occupancy: Occupancy, origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the (3,) least move that makes ``origin`` a corner of voxels of the smallest size; down, if halfway."""
+    off = (occupancy.origin - origin) / occupancy.finest
+    return np.asarray((np.ceil(off - 0.5 - 1e-6) - off) * occupancy.finest)
 
 
 def _nearest(occupancy: Occupancy, one: Occupancy) -> NDArray[np.int64]:

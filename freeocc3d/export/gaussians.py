@@ -20,10 +20,9 @@ class Options(TypedOptions, frozen=True):
     """Frame and orientation. NAME.json next to the file holds the transform from the map."""
 
     upright: bool = True
-    """Turn the frame so that up is -y, as viewers of such files expect; false = keep the frame's axes. In the map's
-    frame these are the first camera's: view along +z, y down."""
+    """Turn the frame so that up is -y, as viewers of such files expect; false = keep the frame's axes."""
     frame: Frame = "map"
-    """"map", "gravity" (floor at 0) or "first-camera" (first camera at the origin)."""
+    """"map", "gravity" (floor at 0), "start" (z up, first camera at the origin) or "first-camera" (its own)."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> None:
@@ -36,7 +35,8 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         raise ExportError("The map has no Gaussians to write.")
     T_file_map = to_frame(scan_map, options.frame)
     if options.upright:
-        up = scan_map.up if options.frame == "map" else np.array((0.0, 0.0, 1.0))
+        own = options.frame in ("map", "first-camera")
+        up = T_file_map[:3, :3] @ scan_map.up if own else np.array((0.0, 0.0, 1.0))
         turn = np.eye(4)
         turn[:3, :3] = _to_minus_y(up)
         T_file_map = turn @ T_file_map

@@ -34,7 +34,7 @@ class Options(TypedOptions, frozen=True):
     words: tuple[str, ...] = ()
     """Words to ask, as in [sofa, chair]; none = all words that the map's encoder or a scene vocabulary names."""
     frame: UprightFrame = "gravity"
-    """"gravity" (walls along x and y) or "first-camera" (first camera at the origin, its view along x)."""
+    """"gravity" (walls along x and y) or "start" (z up, first camera at the origin, its view along x)."""
 
 
 def write(scan_map: Map, path: Path, options: Options) -> list[str]:

@@ -48,7 +48,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
     colors[:, :3] = np.repeat(_linear(choose_colors(scan_map, there, options.color))[rows], 4, axis=0)
     turned = np.eye(4)
     turned[:3, :3] = (_Z_UP_TO_Y_UP @ scan_map.T_gravity_map @ invert(there.T_frame_map))[:3, :3]
-    to_y_up = turned if options.frame == "map" else _Z_UP_TO_Y_UP
+    to_y_up = _Z_UP_TO_Y_UP if there.is_upright else turned
     body = b"".join(part.tobytes() for part in (positions.astype("<f4"), colors, triangles.astype("<u4")))
     described = json.dumps(_described(there, positions, colors, triangles, to_y_up, len(body))).encode("utf-8")
     described += b" " * (-len(described) % 4)

@@ -36,7 +36,7 @@ class PlanOptions(BoxOptions, frozen=True):
     """The heights of obstacles, and what counts as free."""
 
     frame: UprightFrame = "gravity"
-    """"gravity" (walls along x and y) or "first-camera" (first camera at the origin, its view along x)."""
+    """"gravity" (walls along x and y) or "start" (z up, first camera at the origin, its view along x)."""
     min_height: Annotated[float, Meta(ge=-1000, le=1000)] = 0.1
     """Least height of an obstacle above the floor, meters. The robot drives over lower things."""
     max_height: Annotated[float, Meta(gt=0, le=1000)] = 1.8

@@ -6,11 +6,13 @@ Keys of the dense form (`form=dense`), over the box of all known voxels:
     labels (X, Y, Z) uint8: 0 free, k = classes[k - 1], len(classes) + 1 = occupied by an unknown class, 255 unknown
     classes (C,) names, C = 0 without a vocabulary; no more than 253, so that every label fits into a byte
     origin (3,) lower corner of voxel (0, 0, 0), meters; voxel_size meters; frame, the name of the arrays' frame;
-    T_world_map (4, 4) from the arrays' frame to the map's world
+    T_frame_map (4, 4) from the map's frame to the arrays'; T_world_map (4, 4) from the arrays' frame to the world of
+    the map's manifest, that of given poses
 Keys of the sparse form: voxels (V, 3) int32 indices, state (V,) uint8 as above, probability (V,), labels (V,), classes,
-origin, voxel_size, frame, T_world_map. In both forms, voxel (i, j, k) covers origin + [i, i + 1) * voxel_size. In a map
-of several voxel sizes, voxel_size is the smallest. In the dense form, a larger voxel fills all cells that it covers.
-The sparse form then also has edges (V,) int32: voxel (i, j, k) covers origin + [i, i + edge) * voxel_size.
+origin, voxel_size, frame, T_frame_map, T_world_map. In both forms, voxel (i, j, k) covers origin + [i, i + 1) *
+voxel_size. In a map of several voxel sizes, voxel_size is the smallest. In the dense form, a larger voxel fills all
+cells that it covers. The sparse form then also has edges (V,) int32: voxel (i, j, k) covers origin + [i, i + edge) *
+voxel_size.
 """
 
 from __future__ import annotations
@@ -51,6 +53,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         "voxel_size": np.float64(there.occupancy.finest),
         "frame": np.array(options.frame),
         "T_world_map": find_world(scan_map, there.T_frame_map),
+        "T_frame_map": there.T_frame_map,
         "classes": np.array(classes, np.str_),
     }
     with path.open("wb") as stream:

@@ -36,7 +36,7 @@ class Options(TypedOptions, frozen=True):
     form: Literal["colmap", "nerfstudio"] = "colmap"
     """"colmap" or "nerfstudio"."""
     frame: Frame = "gravity"
-    """"gravity" (z up, floor at 0), "first-camera" (z up, first camera at the origin) or "map"."""
+    """"gravity" (z up, floor at 0), "map", "start" (z up, first camera at the origin) or "first-camera" (its own)."""
     points: Annotated[int, Meta(ge=0, le=100_000_000)] = 100_000
     """Greatest number of points for the start of training: evenly spread means of Gaussians."""
 

@@ -5,7 +5,7 @@
     /octomap_binary    octomap_msgs/Octomap: free and occupied space
     /camera_path       nav_msgs/Path: x right, y down, z forward
     /map_info          std_msgs/String: JSON with the class names by label, the frame and the unit
-    /tf_static         map -> scan, the map's own frame
+    /tf_static         map -> scan, the map's own frame; map -> octree, which is at most half a voxel away
 
 All topics are latched (transient local). A name that ends in .mcap gives one file, for Foxglove; any other a folder of
 rosbag2, which `ros2 bag play` plays and Foxglove opens too. Source: rosbag2's metadata, mcap.dev/spec.
@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import ExportError
+from ..core.transforms import invert
 from ..query.scan_map import Map
 from .export_frames import VoxelOptions
 from .nav2 import PlanOptions, make_plan
 from .octomap import encode_binary, make_tree
-from .ros_messages import load_types, make_cloud, make_grid, make_octomap, make_path, make_text, make_transform
+from .ros_messages import load_types, make_cloud, make_grid, make_octomap, make_path, make_text, make_transforms
 
 REQUIRES: tuple[str, ...] = ("rosbags",)
 
@@ -31,6 +32,9 @@ ENDINGS = (".mcap", "")
 
 SCAN_FRAME = "scan"
 """Name of the map's own frame."""
+OCTREE_FRAME = "octree"
+"""Name of the octree's frame. Its nodes lie at multiples of the voxel, those of a map with the floor inside a layer do
+not."""
 
 _TIME_NS = 10**9  # of all messages: a bag's players take 0 for a mistake
 
@@ -51,11 +55,13 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
         "/map": make_grid(plan.cells, plan.grid, plan.floor_z),
         "/occupied_voxels": make_cloud(there.occupancy, scan_map.labels()[there.rows]),
         "/map_info": make_text(json.dumps({"classes": names, **there.described()})),
-        "/tf_static": make_transform(there.T_frame_map, SCAN_FRAME),
     }
+    frames = {SCAN_FRAME: there.T_frame_map}
     if options.octomap:
         placed, tree = make_tree(scan_map, VoxelOptions(frame=options.frame, box=options.box))
-        messages["/octomap_binary"] = make_octomap(encode_binary(tree), placed.occupancy.finest)
+        frames[OCTREE_FRAME] = there.T_frame_map @ invert(placed.T_frame_map)
+        messages["/octomap_binary"] = make_octomap(encode_binary(tree), placed.occupancy.finest, OCTREE_FRAME)
+    messages["/tf_static"] = make_transforms(frames)
     posed = scan_map.trajectory.has_pose
     if posed.any():
         T_frame_cam = there.T_frame_map @ scan_map.trajectory.T_world_cam[posed]

@@ -6,6 +6,7 @@ Sources: nav_msgs, sensor_msgs, geometry_msgs and tf2_msgs of ROS 2 Humble; octo
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -104,22 +105,26 @@ def _offset(name: str) -> int:
     return int(fields[name][1])
 
 
-def make_octomap(nodes: bytes, resolution: float) -> Any:
-    """A binary Octomap of the nodes of a .bt, which follow its line "data"."""
+def make_octomap(nodes: bytes, resolution: float, frame: str) -> Any:
+    """A binary Octomap, in a named frame, of the nodes of a .bt, which follow its line "data"."""
     data = np.frombuffer(nodes, np.int8)
-    return _new(OCTOMAP, header=_header(), binary=True, id="OcTree", resolution=float(resolution), data=data)
+    return _new(OCTOMAP, header=_header(frame=frame), binary=True, id="OcTree", resolution=float(resolution), data=data)
 
 
-def make_transform(T_map_child: NDArray[np.float64], child: str) -> Any:
-    """A TFMessage of one transform."""
-    x, y, z = T_map_child[:3, 3].tolist()
-    moved = _new(
-        "geometry_msgs/msg/Transform",
-        translation=_new("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-        rotation=_rotation(T_map_child),
-    )
-    stamped = _new("geometry_msgs/msg/TransformStamped", header=_header(), child_frame_id=child, transform=moved)
-    return _new("tf2_msgs/msg/TFMessage", transforms=[stamped])
+def make_transforms(frames: Mapping[str, NDArray[np.float64]]) -> Any:
+    """A TFMessage of frames by name: each (4, 4) ``T_map_child``."""
+    stamped = []
+    for child, T_map_child in frames.items():
+        x, y, z = T_map_child[:3, 3].tolist()
+        moved = _new(
+            "geometry_msgs/msg/Transform",
+            translation=_new("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=_rotation(T_map_child),
+        )
+        stamped.append(
+            _new("geometry_msgs/msg/TransformStamped", header=_header(), child_frame_id=child, transform=moved)
+        )
+    return _new("tf2_msgs/msg/TFMessage", transforms=stamped)
 
 
 def make_path(T_map_cam: NDArray[np.float64], timestamps: NDArray[np.float64]) -> Any:

@@ -47,11 +47,21 @@ class AnchoredCells:
     and keyframe 4 each, color 3, feature 4).
     """
 
-    def __init__(self, options: Options, cell_size: float, T_world_keyframe: NDArray[np.float64]):
+    def __init__(
+        self,
+        options: Options,
+        cell_size: float,
+        T_world_keyframe: NDArray[np.float64],
+        voxel_origin: NDArray[np.float64] | None = None,
+    ):
+        """voxel_origin: (3,) a corner of voxels, which hold walls in their middle. Cells begin half a cell from it, so
+        that they hold the same walls in their middle, and half a cell below the floor at z = 0. None = at the world's
+        origin."""
         self.options = options
         self.cell_size = cell_size
+        self._origin = None if voxel_origin is None else np.array((*voxel_origin[:2], -cell_size)) + 0.5 * cell_size
         self._T_world_keyframe = T_world_keyframe
-        self._sums = CellSums(cell_size)
+        self._sums = CellSums(cell_size, self._origin)
         self._compared = False
         self._reach_m = 0.0  # the greatest depth of the added frames
 
@@ -95,7 +105,7 @@ class AnchoredCells:
             best=np.where(seen, found.best, cells.best),
             keyframe=np.where(seen, found.keyframe, cells.keyframe),
         )
-        sums = CellSums(self.cell_size)
+        sums = CellSums(self.cell_size, self._origin)
         sums.add(moved[found.kept])
         return sums.cells()
 

@@ -46,10 +46,14 @@ class Cells:
 
 
 class CellSums:
-    """Sums measurements; ``cells`` returns their means. Memory: 88 bytes per cell, and 24 to 48 for the hash table."""
+    """Sums measurements; ``cells`` returns their means. Memory: 88 bytes per cell, and 24 to 48 for the hash table.
 
-    def __init__(self, cell_size: float):
+    cell_size: edge of the cells, meters.  origin: (3,) a corner of cells, world, meters; the world's by default.
+    """
+
+    def __init__(self, cell_size: float, origin: NDArray[np.float64] | None = None):
         self.cell_size = cell_size
+        self.origin = np.zeros(3) if origin is None else origin
         self._used = 0
         self._table, self._rows = build_table(np.zeros(0, np.int64), 0)
         self._key = np.zeros(0, np.int64)
@@ -65,6 +69,8 @@ class CellSums:
         camera = frame.intrinsics
         height, width = frame.depth_m.shape
         self._make_room(-(-height // step) * -(-width // step))
+        T = T.copy()
+        T[:3, 3] -= self.origin  # sums are relative to the origin
         self._used = _add_frame(
             frame.depth_m, take_sigma(frame), frame.color, step, edge, T,
             (camera.fx, camera.fy, camera.cx, camera.cy), keyframe, self.cell_size, self._used, *self._arrays(),
@@ -73,8 +79,9 @@ class CellSums:
     def add(self, cells: Cells) -> None:
         """Adds means to the cells that contain them, with all their measurements."""
         self._make_room(len(cells))
+        points = cells.points - self.origin
         self._used = _add_cells(
-            cell_keys(cells.points, self.cell_size), cells.points, cells.colors, cells.weights, cells.pixels,
+            cell_keys(points, self.cell_size), points, cells.colors, cells.weights, cells.pixels,
             cells.best, cells.keyframe, cells.footprint, self._used, *self._arrays(),
         )  # fmt: skip
 
@@ -84,7 +91,7 @@ class CellSums:
         sums = self._sums[rows]
         return Cells(
             self._key[rows],
-            sums[:, 1:4] / sums[:, :1],
+            self.origin + sums[:, 1:4] / sums[:, :1],
             sums[:, 4:] / sums[:, :1],
             sums[:, 0],
             self._pixels[rows],

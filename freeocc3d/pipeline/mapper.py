@@ -108,8 +108,8 @@ class Mapper:
         cameras = [camera for _, camera in keyframes.views()]
         patches = find_surface_patches(zip(map(keyframes.depth_m, range(len(keyframes))), cameras, poses, strict=True))
         self.upright = find_upright_frame(turn_back(poses, turned), patches)
-        voxel_size = self.settings.occupancy.voxel_size
-        self.origin = find_lattice_origin(patches.moved(self.upright.T_upright_world), voxel_size)
+        options, upright = self.settings.occupancy, patches.moved(self.upright.T_upright_world)
+        self.origin = find_lattice_origin(upright, options.voxel_size, options.finest is not None)
         self.refined = True
 
     @property
@@ -175,7 +175,7 @@ class Mapper:
         trajectory = self.trajectory()
         options = self.settings.gaussians
         progress.stage("gaussians", 2 * len(self.frames_used(trajectory, options.every)))
-        cells = anchors.AnchoredCells(options, self.cell_size, trajectory.T_world_keyframe)
+        cells = anchors.AnchoredCells(options, self.cell_size, trajectory.T_world_keyframe, self.origin)
         done = itertools.count(1)
 
         def frames(color: bool) -> Iterator[PosedFrame]:

@@ -24,6 +24,7 @@ def report_of(
         "frames": {str(s): int(n) for s, n in zip(status, count, strict=True)},
         "broken": {str(index): text for index, text in work.broken.items()},
         "warnings": [notice.to_dict() for notice in work.warnings],
+        "upright": None if mapper.upright is None else mapper.upright.evidence(),
         "color_focal": getattr(mapper.capture, "color_focal", 1.0),
         "tracking": {"backend": mapper.settings.tracking.backend, "reason": tracking_reason},
         "submaps": [

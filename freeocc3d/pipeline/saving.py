@@ -95,7 +95,7 @@ def _facts(mapper: Mapper, trajectory: Trajectory, encoder: Encoder, vocabulary:
         world=mapper.tracker.world,
         scale=_scale(mapper),
         up=(0.0, 0.0, 1.0),
-        upright=Upright(by=upright.by, off_deg=upright.off_deg, floor=upright.floor, walls=upright.walls),
+        upright=Upright(**upright.evidence()),
         T_world_map=matrix(invert(mapper.T_map_world)),
         T_first_camera=matrix(invert(trajectory.T_world_cam[np.flatnonzero(trajectory.has_pose)[0]])),
         T_gravity_map=matrix(np.eye(4)),

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..core.depth_sensors import find_sensor
 from ..core.errors import FreeOccError, MapError
 from ..core.regular_files import stored_path
+from ..core.transforms import invert
 from ..core.tum_files import read_tum
 from ..core.types import Gaussians, Occupancy, Trajectory
 from ..settings import registry
@@ -55,7 +56,7 @@ class SavedMap:
 
     @property
     def up(self) -> NDArray[np.float64]:
-        """(3,) unit vector that points up in the map's frame, estimated from the cameras' attitude."""
+        """(3,) unit vector that points up in the map's frame: z, unless the map was made before maps stood upright."""
         return np.array(self.manifest.up, np.float64)
 
     @property
@@ -65,12 +66,21 @@ class SavedMap:
 
     @functools.cached_property
     def T_gravity_map(self) -> NDArray[np.float64]:
-        """(4, 4) to the frame with z up and the floor at z = 0; estimated here for maps of earlier versions."""
+        """(4, 4) to the frame with z up and the floor at z = 0: the map's own, unless it was made before maps stood
+        upright. Estimated here for the earliest maps."""
         if self.manifest.T_gravity_map is None:
             from ..tracking.upright.upright_frame import estimate_gravity_frame
 
             return estimate_gravity_frame(self.trajectory.T_world_keyframe, self.gaussians)
         return np.array(self.manifest.T_gravity_map, np.float64)
+
+    @property
+    def T_first_camera(self) -> NDArray[np.float64] | None:
+        """(4, 4) to the frame of the first camera with a pose: x right, y down, z forward. None without a pose."""
+        if self.manifest.T_first_camera is not None:
+            return np.array(self.manifest.T_first_camera, np.float64)
+        posed = np.flatnonzero(self.trajectory.has_pose)
+        return np.asarray(invert(self.trajectory.T_world_cam[posed[0]])) if len(posed) else None
 
     @functools.cached_property
     def settings(self) -> Settings:

@@ -93,7 +93,7 @@ def test_mistakes_with_configurations_and_outputs(tmp_path, room) -> None:
     "command",
     [
         [], ["demo"], ["reconstruct"], ["query"], ["view"], ["info"], ["check"], ["export"], ["refine"], ["scale"],
-        ["evaluate"], ["ground-truth"], ["list"], ["models"], ["models", "pull"], ["models", "export"],
+        ["upright"], ["evaluate"], ["ground-truth"], ["list"], ["models"], ["models", "pull"], ["models", "export"],
         ["models", "list"], ["models", "verify"],
     ],
     ids=" ".join,

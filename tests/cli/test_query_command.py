@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from command_line import refused, run
 
@@ -29,21 +30,40 @@ def test_query_json_says_how_regions_stand_and_on_request_which_keyframes_show_t
     assert "--json" in run("query", room, "red", "--views", code=2).stderr
 
 
+def test_places_in_the_first_cameras_frame(room) -> None:
+    """Boxes there hold the same voxels, and are level no more; centroids move as the manifest says."""
+    told = run("info", room, "--json").stdout
+    T = np.array(json.loads(told)["T_first_camera"])
+    own, first = (
+        json.loads(run("query", room, "red", "--json", "--frame", frame).stdout) for frame in ("map", "first-camera")
+    )
+    assert (own["frame"], first["frame"]) == ("map", "first-camera")
+    np.testing.assert_allclose(first["T_frame_map"], T, atol=1e-6)
+    for here, there in zip(own["results"][0]["regions"], first["results"][0]["regions"], strict=True):
+        np.testing.assert_allclose(T[:3, :3] @ here["centroid"] + T[:3, 3], there["centroid"], atol=2e-4)
+        assert (np.array(there["box_min"]) < there["centroid"]).all()
+        assert (np.array(there["box_max"]) > there["centroid"]).all()
+        assert here["oriented_box"] == there["oriented_box"]
+    assert first["results"][0]["regions"][0]["centroid"] != own["results"][0]["regions"][0]["centroid"]
+    assert run("query", room, "red", "--frame", "start").stdout != run("query", room, "red").stdout
+    assert "start or first-camera" in refused("query", room, "red", "--frame", "robot")
+
+
 def test_query_with_conditions_on_places(room) -> None:
     def corners(*arguments: object) -> list[list[float]]:
         document = json.loads(run("query", room, *arguments, "--json").stdout)
         return [region["box_min"] for region in document["results"][0]["regions"]]
 
-    every = corners("red")
+    every = corners("yellow")
     assert len(every) > 1
-    assert len(corners("red", "--pick", "largest")) == 1
-    assert corners("red", "--within", -99, -99, -99, 99, 99, 99, "--near", "white:99") == every
-    assert "none is on 'unicorn'" in run("query", room, "red", "--on", "unicorn").stdout
-    assert "excluded" in refused("query", room, "red", "--not", "red")
-    assert "exclude the rest with --not WORD" in refused("query", room, "not red")
-    assert corners("a photo of a red thing.") == every
-    assert "lies outside" in refused("query", room, "red", "--within", 98, 98, 98, 99, 99, 99)
-    assert "largest, highest" in refused("query", room, "red", "--pick", "nicest")
+    assert len(corners("yellow", "--pick", "largest")) == 1
+    assert corners("yellow", "--within", -99, -99, -99, 99, 99, 99, "--near", "white:99") == every
+    assert "none is on 'unicorn'" in run("query", room, "yellow", "--on", "unicorn").stdout
+    assert "excluded" in refused("query", room, "yellow", "--not", "yellow")
+    assert "exclude the rest with --not WORD" in refused("query", room, "not yellow")
+    assert corners("a photo of a yellow thing.") == every
+    assert "lies outside" in refused("query", room, "yellow", "--within", 98, 98, 98, 99, 99, 99)
+    assert "largest, highest" in refused("query", room, "yellow", "--pick", "nicest")
 
 
 def test_interactive_answers_every_line_and_survives_what_it_cannot_answer(room) -> None:

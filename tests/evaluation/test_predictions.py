@@ -73,7 +73,8 @@ def test_a_similarity_of_map_and_lattice_changes_nothing(room: Any) -> None:
 def test_a_map_on_its_own_lattice_is_the_map(room: Any) -> None:
     voxels = room.occupancy.occupied_voxels()
     low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
-    on_lattice = of_room(room, TrajectoryAlignment.identity(), lattice(low * 0.08, shape=tuple(high - low)))
+    origin = room.occupancy.origin + low * 0.08
+    on_lattice = of_room(room, TrajectoryAlignment.identity(), lattice(origin, shape=tuple(high - low)))
     expected = np.zeros(tuple(high - low), bool)
     expected[tuple((voxels - low).T)] = True
     # The map was carved by every frame, the score is by its keyframes: few voxels are contradicted by one alone.
@@ -307,7 +308,11 @@ def test_an_export_is_scored_like_the_map_it_shows(room: Any, tmp_path: Path) ->
     origin = np.load(tmp_path / "room.npz")["origin"]
     shape = np.load(tmp_path / "room.npz")["occupancy"].shape
     claimed, _ = predictions.predict_from_grid(
-        tmp_path / "room.npz", TrajectoryAlignment.identity(), lattice(origin, shape=shape), NO_CLASSES
+        tmp_path / "room.npz",
+        TrajectoryAlignment.identity(),
+        lattice(origin, shape=shape),
+        NO_CLASSES,
+        with_trajectory=True,
     )
     assert claimed.occupied.sum() == len(room.occupancy.occupied_voxels())
 

@@ -20,6 +20,7 @@ def map_of(occupancy, labels=None):
     labels = np.zeros(len(occupancy.occupied_voxels()), np.uint8) if labels is None else np.uint8(labels)
     return SimpleNamespace(
         metric=True,
+        up=np.array((0.0, 0.0, 1.0)),
         occupancy=occupancy,
         manifest=tiny_manifest(),
         vocabulary=["cup", "table"],

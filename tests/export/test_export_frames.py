@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from exported_maps import SPACE, VOXELS, map_of
+from exported_maps import CAMERA_TO_UP, SPACE, VOXELS, map_of
 from scenes import occupancy_of
 
 from freeocc3d.core.errors import ConfigError, ExportError
@@ -16,13 +16,38 @@ def test_a_voxel_ahead_below_and_right_is_there_in_each_frame() -> None:
     scan_map = map_of(occupancy_of(VOXELS, free=SPACE))
     center = scan_map.occupancy.centers(scan_map.occupancy.occupied_voxels())
     np.testing.assert_array_equal(place_voxels(scan_map, "map").occupancy.keys, scan_map.occupancy.keys)
-    for frame, height in (("gravity", 1.52), ("first-camera", 0.0)):
+    for frame, height in (("gravity", 1.52), ("start", 0.0)):
         there = place_voxels(scan_map, frame)
         expected = np.stack((center[:, 2], -center[:, 0], height - center[:, 1]), axis=1)
         np.testing.assert_allclose(transform(there.T_frame_map, center), expected, atol=1e-9)
         found = there.occupancy.centers(there.occupancy.occupied_voxels())
         assert len(found) == 3
         assert np.abs(found - expected[there.rows]).max() <= 0.05 + 1e-6
+
+
+def test_the_first_cameras_own_frame_looks_along_z() -> None:
+    """The pose of a level camera, at 1.52 m, that looks along x."""
+    scan_map = map_of(occupancy_of(VOXELS, free=SPACE), np.eye(4))
+    scan_map.trajectory.T_world_cam[1], scan_map.up = CAMERA_TO_UP, np.array((0.0, 0.0, 1.0))
+    there = place_voxels(scan_map, "first-camera")
+    np.testing.assert_allclose(there.T_frame_map @ CAMERA_TO_UP, np.eye(4), atol=1e-9)
+    assert there.described()["up"] == [0, -1, 0]
+    np.testing.assert_allclose(place_voxels(scan_map, "start").up, (0, 0, 1))
+
+
+@pytest.mark.parametrize("frame", ["map", "gravity"])
+def test_voxels_of_an_upright_map_keep_their_places(frame) -> None:
+    """Also on the lattice of a tree, whose frame then moves, the floor's layer to below 0."""
+    occupancy = occupancy_of(VOXELS, free=SPACE).replace(origin=np.array((-0.03, -0.06, -0.05)))
+    scan_map = map_of(occupancy, np.eye(4))
+    there = place_voxels(scan_map, frame)
+    np.testing.assert_array_equal(there.T_frame_map, np.eye(4))
+    np.testing.assert_array_equal(there.occupancy.origin, occupancy.origin)
+    moved = place_voxels(scan_map, frame, origin=(0, 0, 0))
+    np.testing.assert_array_equal(moved.occupancy.keys, occupancy.keys)
+    np.testing.assert_allclose(moved.T_frame_map[:3, 3], (0.03, -0.04, -0.05), atol=1e-9)
+    np.testing.assert_allclose(moved.occupancy.origin, (0, -0.1, -0.1), atol=1e-9)
+    assert set(scan_map.T_gravity_map.ravel()) == {0, 1}
 
 
 def test_an_npz_in_another_frame_says_where_it_is(tmp_path) -> None:
@@ -76,7 +101,7 @@ def test_a_map_of_several_sizes_is_brought_to_the_largest() -> None:
 
 def test_bad_frames_are_reported(tmp_path) -> None:
     scan_map = map_of(occupancy_of(VOXELS))
-    with pytest.raises(ConfigError, match="map, gravity or first-camera, got 'robot'"):
+    with pytest.raises(ConfigError, match="map, gravity, start or first-camera, got 'robot'"):
         export_map(scan_map, "npz", tmp_path / "a.npz", {"frame": "robot"})
     with pytest.raises(ExportError, match="no known voxels"):
         place_voxels(map_of(occupancy_of([])), "gravity")

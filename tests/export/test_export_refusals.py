@@ -132,7 +132,7 @@ def test_a_name_that_is_none_has_its_nearest(tmp_path, keyframes, kind, name) ->
         export_map(whole(room()[0], keyframes), kind[:-1], tmp_path / name)
 
 
-@pytest.mark.parametrize("frame", ["gravity", "first-camera"])
+@pytest.mark.parametrize("frame", ["gravity", "start"])
 @pytest.mark.parametrize(("kind", "name"), CASES)
 def test_maps_of_several_sizes_go_through_every_exporter(tmp_path, keyframes, kind, name, frame) -> None:
     scan_map = whole(of_several_sizes(), keyframes, CAMERA_TO_UP)

@@ -52,7 +52,7 @@ def test_words_are_those_asked_for(tmp_path) -> None:
     scan_map.vocabulary = []
     with pytest.raises(ExportError, match="give words"):
         export_map(scan_map, "geojson", tmp_path / "b.geojson")
-    with pytest.raises(ConfigError, match="must be gravity or first-camera"):
+    with pytest.raises(ConfigError, match="must be gravity or start"):
         export_map(scan_map, "geojson", tmp_path / "b.geojson", {"frame": "map"})
 
 

@@ -20,7 +20,7 @@ from freeocc3d.occupancy.surface_faces import find_exposed_faces
 trimesh = pytest.importorskip("trimesh")
 
 
-@pytest.mark.parametrize("frame", ["gravity", "map", "first-camera"])
+@pytest.mark.parametrize("frame", ["gravity", "map", "start"])
 def test_faces_stand_upright_where_the_frame_has_them(tmp_path, frame) -> None:
     scan_map = map_of(occupancy_of(VOXELS, free=SPACE))
     export_map(scan_map, "glb", tmp_path / "map.glb", {"frame": frame})

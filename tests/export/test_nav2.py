@@ -33,7 +33,7 @@ def test_heights_are_above_the_floor_in_the_first_cameras_frame(tmp_path) -> Non
     scan_map = map_of(occupancy, Z_UP)
     T = np.array([(1.0, 0, 0, 0), (0, 0, 1, 2.3), (0, -1, 0, 1.5), (0, 0, 0, 1)])  # x right, looks along y, at 1.5 m
     scan_map.trajectory.T_world_cam[1] = T
-    export_map(scan_map, "nav2", tmp_path / "map.yaml", {"max_height": 1.7, "frame": "first-camera"})
+    export_map(scan_map, "nav2", tmp_path / "map.yaml", {"max_height": 1.7, "frame": "start"})
     data, resolution, origin = map_server(tmp_path / "map.yaml")
     x, y = -0.33 + 4.5 * 0.1, 2.0 + 6.5 * 0.1  # of the wall: ahead, and to the right
     column, row = np.floor((np.array((y - 2.3, -x)) - origin) / resolution).astype(int)
@@ -63,7 +63,7 @@ def test_free_share_and_inflation(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"frame": "map"}, "must be gravity or first-camera, got 'map'"),
+        ({"frame": "map"}, "must be gravity or start, got 'map'"),
         ({"min_height": 2.0}, r"below 'nav2\.max_height'"),
         ({"min_free": 1.5}, "from 0 to 1"),
         ({"inflation": -1.0}, "from 0 to 1000"),

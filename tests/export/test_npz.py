@@ -13,7 +13,7 @@ from freeocc3d.export import export_map
 def exported(tmp_path, words, labels, options=None):
     """What is read back of a map of two voxels with that vocabulary and those labels."""
     scan_map = SimpleNamespace(
-        metric=True,
+        metric=True, up=np.array((0.0, 0.0, 1.0)),
         occupancy=occupancy_of([(-1, 0, 0), (0, 0, 0)]), manifest=tiny_manifest(),
         vocabulary=words, labels=lambda: np.array(labels, np.uint8),
     )  # fmt: skip

@@ -105,6 +105,7 @@ def test_the_cloud_holds_the_occupied_voxels(messages: dict[str, Any]) -> None:
 def test_the_octree_is_that_of_the_bt_file(messages: dict[str, Any], tmp_path: Path) -> None:
     export_map(map_of(room()[0], Z_UP), "octomap", tmp_path / "room.bt")
     tree = messages["/octomap_binary"]
+    assert tree.header.frame_id == "octree"
     assert (tree.binary, tree.id, tree.resolution) == (True, "OcTree", pytest.approx(0.1))
     assert np.array(tree.data, np.int8).tobytes() == (tmp_path / "room.bt").read_bytes().split(b"data\n", 1)[1]
 
@@ -121,8 +122,10 @@ def test_frames_and_the_camera_path(tmp_path: Path) -> None:
         map_with_times(occupancy, CAMERA_TO_UP), "ros2bag", tmp_path / "bag", {"max_height": 100, "min_height": -100}
     )
     messages = read_with_rosbags(tmp_path / "bag")
-    (stamped,) = messages["/tf_static"].transforms
+    stamped, octree = messages["/tf_static"].transforms
     assert (stamped.header.frame_id, stamped.child_frame_id) == ("map", "scan")
+    assert (octree.header.frame_id, octree.child_frame_id) == ("map", "octree")
+    np.testing.assert_allclose(matrix(octree.transform.rotation, octree.transform.translation), np.eye(4), atol=1e-9)
     np.testing.assert_allclose(
         matrix(stamped.transform.rotation, stamped.transform.translation), CAMERA_TO_UP, atol=1e-9
     )

@@ -15,6 +15,7 @@ from manifests import tiny_manifest
 from scenes import occupancy_of
 from vdb_files import read_vdb_plainly
 
+from freeocc3d.core.transforms import invert
 from freeocc3d.core.types import FREE, OCCUPIED, Occupancy
 from freeocc3d.query.regions import Region
 
@@ -22,9 +23,18 @@ CAMERA_TO_UP = np.array([(0.0, 0, 1, 0), (-1, 0, 0, 0), (0, -1, 0, 1.52), (0, 0,
 """A level camera at 1.52 m: x right, y down, z forward to x forward, y left, z up."""
 
 
+class MapInMemory(SimpleNamespace):
+    """What exporters use of a map."""
+
+    @property
+    def T_first_camera(self):
+        posed = np.flatnonzero(self.trajectory.has_pose)
+        return invert(self.trajectory.T_world_cam[posed[0]]) if len(posed) else None
+
+
 def map_of(occupancy: Occupancy, T_gravity_map=CAMERA_TO_UP):
     poses = np.stack([np.full((4, 4), np.nan), np.eye(4)])
-    return SimpleNamespace(
+    return MapInMemory(
         metric=True,
         occupancy=occupancy,
         manifest=tiny_manifest(),

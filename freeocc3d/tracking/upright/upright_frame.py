@@ -67,9 +67,13 @@ class UprightFrame:
     floor: bool
     walls: bool
 
+    def evidence(self) -> dict[str, Any]:
+        """How sure the frame is, as plain values."""
+        return {name: value for name, value in vars(self).items() if name != "T_upright_world"}
+
     def to_array(self) -> NDArray[np.str_]:
         """The frame as a plain array, for saving."""
-        return np.array(json.dumps({**vars(self), "T_upright_world": self.T_upright_world.tolist()}))
+        return np.array(json.dumps({**self.evidence(), "T_upright_world": self.T_upright_world.tolist()}))
 
     @classmethod
     def from_array(cls, array: NDArray[Any]) -> UprightFrame:
