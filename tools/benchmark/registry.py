@@ -165,6 +165,12 @@ MEASUREMENTS = {
         "equal_maps:measure_equal_maps",
         lines="equal_maps:equal_maps_lines",
     ),
+    "budget": Measurement(
+        "seconds of a run by stage, against decoding alone; and with every third frame, for many keyframes",
+        "capture",
+        "budget:measure_budget",
+        lines="budget:budget_lines",
+    ),
     "earlier_tree": Measurement(
         "seconds of reconstruct and of a cold query over those of the tree of --before",
         "earlier",
