@@ -25,12 +25,17 @@ _LABELS = {
     "seen_through": "occupied voxels that frames see through",
     "unmeasured": "occupied voxels in which no depth ends",
     "closures_refused": "loop closures that the poses contradict",
+    "distortion": "smooth error of depth across the image",
     "psnr_held_out": "rendered frames between keyframes",
     "psnr_keyframes": "rendered keyframes",
     "rendered": "measured pixels that Gaussians cover",
     "posed": "used frames that have a pose",
 }
-_RELATIVE = {"step": "of the depth", "revisit": "x the step's for its distances"}
+_RELATIVE = {
+    "step": "of the depth",
+    "revisit": "x the step's for its distances",
+    "distortion": "of the depth",
+}
 
 
 def check(
@@ -129,4 +134,4 @@ def _compared(name: str, value: float) -> str:
         return f"{value:.1f} dB"
     if name.endswith("gray"):
         return f"{value:.1f} of 255"
-    return f"{100 * value:.{2 if name == 'step' else 1}f} %"
+    return f"{100 * value:.{2 if name in ('step', 'distortion') else 1}f} %"

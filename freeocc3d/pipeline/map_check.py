@@ -30,6 +30,7 @@ VERDICTS = "good", "fair", "poor"
 
 _HELD_OUT = 12  # most frames between keyframes that are rendered
 _SAME_COLOR = 6.0  # largest mean difference of gray values between a keyframe and its frame in the capture, 0…255
+_LEAST_PAIRS = 10  # revisits that tell a smooth error of the sensor
 _SOLID = 0.5  # least alpha of a pixel that Gaussians cover
 _DIGITS = 5
 
@@ -52,6 +53,7 @@ LIMITS = {
     "seen_through": Limits(0.0, 0.02, 0.03, 0.10),
     "unmeasured": Limits(0.02, 0.16, 0.2, 0.4),
     "closures_refused": Limits(0.0, 0.0, 0.1, 0.3),
+    "distortion": Limits(0.0003, 0.005, 0.006, 0.02),
     "psnr_held_out": Limits(18.0, 28.0, 17.0, 14.0),
     "psnr_keyframes": Limits(18.0, 28.0, 17.0, 14.0),
     "rendered": Limits(0.98, 1.0, 0.95, 0.8),
@@ -63,9 +65,8 @@ LIMITS = {
 class Measure:
     """One measure. name: see ``LIMITS``.  value: None = it cannot be told.  unit: ``m`` (the map's unit of length if
     its scale is unknown), ``share``, ``gray`` (0…255) or ``dB``.  compared: the value as ``usual`` is stated, which for
-    lengths is a share of the median depth (``step``), or in standard deviations of the noise a multiple of the step's
-    (``revisit``).  count: of what
-    it is the median, the mean or the share."""
+    lengths is a share of the median depth (``step``, ``distortion``), or in standard deviations of the noise a multiple
+    of the step's (``revisit``).  count: of what it is the median, the mean or the share."""
 
     name: str
     value: float | None
@@ -161,6 +162,7 @@ def check_map(scan_map: SavedMap) -> MapCheck:
     held_out, frames, note = _render_held_out(scan_map)
     posed = trajectory.has_pose[trajectory.status != "unused"]
     more = (
+        _measure_distortion(checked, trajectory.T_world_keyframe),
         Measure("psnr_held_out", held_out, "dB", held_out, frames),
         Measure("psnr_keyframes", rendering.get("psnr_measured"), "dB", rendering.get("psnr_measured"), len(views)),
         Measure("rendered", rendering.get("covered"), "share", rendering.get("covered"), len(views)),
@@ -168,6 +170,17 @@ def check_map(scan_map: SavedMap) -> MapCheck:
     )
     notes = tuple(text for text in (_why_no_revisits(checked.agreement), note) if text)
     return dataclasses.replace(checked, measures=checked.measures + more, notes=notes)
+
+
+def _measure_distortion(checked: MapCheck, T_world_keyframe: NDArray[np.float64]) -> Measure:
+    """How much the sensor's depth errs from one part of its image to another, at the median depth."""
+    views, pairs = checked.views, checked.agreement.revisits
+    depth = _median_depth(views)
+    if depth is None or len(pairs) < _LEAST_PAIRS:
+        return Measure("distortion", None, "m", None, len(pairs))
+    found = view_agreement.measure_distortion(views, T_world_keyframe, pairs)
+    half_range = view_agreement.distortion_range(found, views[0].camera, depth)
+    return Measure("distortion", half_range, "m", half_range / depth, len(pairs))
 
 
 def _medians(pairs: Sequence[PairAgreement]) -> tuple[float | None, ...]:

@@ -27,6 +27,7 @@ from ..core.sampling import spread_evenly
 from ..core.threads import count_threads
 from ..core.transforms import back_project, invert, project, transform
 from ..core.types import Frame, Intrinsics
+from .rgbd.dense_residuals import GEMAN_MCCLURE
 
 WIDTH = 160
 """Approximate columns of a compared view, pixels. Depth is picked, so that few pixels tell as much; and a thousand
@@ -48,6 +49,8 @@ _LEAST_POINTS = 100  # of a compared pair
 _ASIDE = 2  # pixels from a point to those that give its normal: far enough that noise does not turn it around
 _SMOOTH = 0.1  # largest relative difference of their depths
 _SAME_SURFACE = 0.04  # largest relative difference of the four depths around a point, which lie on one surface
+_DISTORTION_COLUMNS, _REWEIGHTED = 32, 6  # sampled points along a row, and sweeps, for the sensor's distortion
+_LEAST_FACING = 0.3  # cosine between a normal and a ray, 73 degrees: beyond it, depth changes too fast
 _FLAT = 1e-3  # least variance of gray values that tells a gain
 
 
@@ -119,13 +122,14 @@ def prepare_compared_views(frames: Sequence[Frame]) -> list[ComparedView]:
 
 
 class Compared(NamedTuple):
-    """The P compared points of a pair. pixels: (P, 2) rows and columns in the source.  points: (P, 3) in the source's
-    camera frame.  off_m: (P,) residuals of eq. 1.  sigma_m: (P,) their standard deviation by noise alone.  gray: (P,)
-    the target's gray value minus the source's, after gain and offset.  seen_through: share of the points in view that
-    the target sees through."""
+    """The P compared points of a pair. pixels: (P, 2) rows and columns in the source.  points, normals: (P, 3) in the
+    source's camera frame.  off_m: (P,) residuals of eq. 1.  sigma_m: (P,) their standard deviation by noise alone.
+    gray: (P,) the target's gray value minus the source's, after gain and offset.  seen_through: share of the points in
+    view that the target sees through."""
 
     pixels: NDArray[np.int64]
     points: NDArray[np.float64]
+    normals: NDArray[np.float64]
     off_m: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
     gray: NDArray[np.float64]
@@ -201,7 +205,7 @@ def compare_views(
     source: ComparedView, target: ComparedView, T_target_source: NDArray[np.float64], columns: int = _COLUMNS
 ) -> Compared:
     """Compare a sample of the source's points, ``columns`` along a row, with the target (eq. 1)."""
-    at, points, _ = sample = source.sample(columns)
+    at, points, normals = sample = source.sample(columns)
     pixels, z, inside = _project(transform(T_target_source, points), target)
     inside &= sample.facing(T_target_source)
     u, v = pixels[inside].T
@@ -219,7 +223,55 @@ def compare_views(
     gray = _without_exposure(source.gray[tuple(at[known].T)].astype(np.float64), gray_t)
     through = float((off < -GATE * depth).mean()) if len(off) else 0.0
     sigma = np.hypot(source.sigma_m[tuple(at[known].T)], target.sigma_m[top, left][flat][same])
-    return Compared(at[known], points[known], off[same], sigma, gray, through)
+    return Compared(at[known], points[known], normals[known], off[same], sigma, gray, through)
+
+
+def measure_distortion(
+    views: Sequence[ComparedView], T_world_cam: NDArray[np.float64], pairs: Sequence[PairAgreement]
+) -> NDArray[np.float64]:
+    """(3,) coefficients c of a smooth error of the sensor's depth, e = z^2 (c_0 x + c_1 y + c_2 (x^2 + y^2)) meters,
+    that explains the residuals of pairs best; x, y are pixels from the principal point over half the image's width. It
+    is an error of the disparity that is linear and radial in the image. Poses that were fitted to the same depth have
+    taken up a part of it.
+
+    By iteratively reweighted least squares: an error e_s of the source's depth moves its point along its ray, and e_t
+    moves the target's surface, so that (1) changes by e_s (n^T R ray_s) / (n^T ray_t) - e_t.
+    """
+    rows, off, sigma = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0)]
+    for pair in pairs:
+        source, target = views[pair.source], views[pair.target]
+        T = invert(T_world_cam[pair.target]) @ T_world_cam[pair.source]
+        found = compare_views(source, target, T, _DISTORTION_COLUMNS)
+        moved, normals = transform(T, found.points), found.normals @ T[:3, :3].T
+        ray_s, ray_t = found.points / found.points[:, 2:] @ T[:3, :3].T, moved / moved[:, 2:]
+        toward = (normals * ray_t).sum(axis=1)
+        seen = np.abs(toward) > _LEAST_FACING * np.linalg.norm(normals, axis=1) * np.linalg.norm(ray_t, axis=1)
+        gain = (normals * ray_s).sum(axis=1)[seen] / toward[seen]
+        of_source = _distortion_basis(found.points[seen], source.camera)
+        rows.append(gain[:, None] * of_source - _distortion_basis(moved[seen], target.camera))
+        off.append(found.off_m[seen])
+        sigma.append(found.sigma_m[seen])
+    basis, wanted, scale = np.concatenate(rows), np.concatenate(off), np.concatenate(sigma)
+    c: NDArray[np.float64] = np.zeros(3)
+    for _ in range(_REWEIGHTED):
+        share = (wanted - basis @ c) / (GEMAN_MCCLURE * scale)
+        weighted = basis / ((1 + share**2) * scale)[:, None] ** 2
+        c = np.asarray(np.linalg.lstsq(weighted.T @ basis, weighted.T @ wanted, rcond=None)[0])
+    return c
+
+
+def distortion_range(coefficients: NDArray[np.float64], camera: Intrinsics, depth_m: float) -> float:
+    """Half the difference of the largest and the smallest error in the image at a depth, meters."""
+    v, u = np.meshgrid(np.linspace(0, camera.height - 1, 9), np.linspace(0, camera.width - 1, 9))
+    pixels = np.stack((u.ravel(), v.ravel()), axis=1)
+    points = back_project(pixels, np.full(len(pixels), depth_m), camera)
+    return float(np.ptp(_distortion_basis(points, camera) @ coefficients) / 2)
+
+
+def _distortion_basis(points: NDArray[np.float64], camera: Intrinsics) -> NDArray[np.float64]:
+    """(P, 3) derivative of the error by its coefficients."""
+    x, y = (2 * f / camera.width * points[:, axis] / points[:, 2] for axis, f in enumerate((camera.fx, camera.fy)))
+    return points[:, 2:] ** 2 * np.stack((x, y, x**2 + y**2), axis=1)
 
 
 def _agreement(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -114,3 +116,24 @@ def test_pairs_that_share_too_little_are_left_out() -> None:
     assert measure_agreement(views, np.stack((pose(0), pose(180)))).steps == []
     assert measure_agreement(views[:1], np.eye(4)[None]) == view_agreement.Agreement([], [])
     assert measure_agreement([], np.zeros((0, 4, 4))) == view_agreement.Agreement([], [])
+
+
+def test_a_smooth_error_of_the_sensor_is_told_from_noise() -> None:
+    """Two turns through the room, the second one with the camera turned and tilted another way."""
+    rng = np.random.default_rng(1)
+    poses = []
+    for angle in range(0, 720, 40):
+        tilted, tilt = pose(angle, *rng.uniform(-0.6, 0.6, 2)), np.radians(rng.uniform(-35, 35))
+        roll = np.eye(4)
+        roll[:2, :2] = ((np.cos(tilt), -np.sin(tilt)), (np.sin(tilt), np.cos(tilt)))
+        poses.append(tilted @ roll)
+    true = np.stack(poses)
+    x, y = (np.mgrid[: CAMERA.height, : CAMERA.width][::-1] - np.array([[[CAMERA.cx]], [[CAMERA.cy]]])) / 160
+    for c in (np.zeros(3), np.array((0.006, -0.003, 0.002))):
+        frames = [frame(T, n, NOISE) for n, T in enumerate(true)]
+        wrong = [f.depth_m + f.depth_m**2 * (c[0] * x + c[1] * y + c[2] * (x**2 + y**2)) for f in frames]
+        views = [
+            prepare_compared_view(replace(f, depth_m=d.astype(np.float32))) for f, d in zip(frames, wrong, strict=True)
+        ]
+        found = view_agreement.measure_distortion(views, true, measure_agreement(views, true).revisits)
+        assert np.abs(found - c).max() < 5e-4
