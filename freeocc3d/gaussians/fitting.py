@@ -68,14 +68,15 @@ def fit_gaussians(
     judges = [halve_view(views[others[n]]) for n in spread_evenly(len(others), _JUDGES)]
     with _one_torch_thread():
         fit = _Fit(gaussians, rasterizer, options, progress)
-        small, best = [halve_view(views[row]) for row in chosen], -math.inf
+        large = [(views[row], fit.find_rows(views[row])) for row in chosen]
+        small, best = [(halve_view(view), rows) for view, rows in large], -math.inf
         for _ in range(passes - 1):
             fit.show(small)
             found = measure_fidelity(fit.gaussians(), judges, rasterizer).psnr_measured
             if found is None or found - best < _LEAST_GAIN_DB:
                 break
             best = found
-        fit.show([views[row] for row in chosen], last=True)
+        fit.show(large, last=True)
         made = fit.gaussians()
     return made[made.opacities >= ALPHA_MIN]  # the others are never drawn
 
@@ -98,33 +99,30 @@ class _Fit:
     def __init__(self, gaussians: Gaussians, rasterizer: Rasterizer, options: Options, progress: Callable[[int], None]):
         self._before, self._rasterizer, self._depth_weight = gaussians, rasterizer, options.depth_weight
         self._parameters = (_Free if options.means == "free" else _Anchored)(gaussians, options, rasterizer.device)
-        self._optimizer = SparseAdam(self._parameters.optimized)
+        self._optimizer = SparseAdam(len(gaussians), self._parameters.rates)
         self._generator, self._progress, self._done = np.random.default_rng(0), progress, 0
-        self._in_view: dict[int, Tensor] = {}
 
-    def show(self, views: Sequence[CapturedView], last: bool = False) -> None:
-        """One pass over the views. last: steps become small."""
-        for step, row in enumerate(self._generator.permutation(len(views))):
-            self._step(views[row], _DECAY ** (step / len(views)) if last else 1.0)
+    def find_rows(self, view: CapturedView) -> Tensor:
+        """Rows of the Gaussians that the view may show. They stay nearly the same while shapes change."""
+        return torch.from_numpy(find_in_view(self._before, view)).to(self._rasterizer.device)
+
+    def show(self, views: Sequence[tuple[CapturedView, Tensor]], last: bool = False) -> None:
+        """One pass over views with the rows that they may show. last: steps become small."""
+        for step, n in enumerate(self._generator.permutation(len(views))):
+            view, rows = views[n]
+            self._step(view, rows, _DECAY ** (step / len(views)) if last else 1.0)
             self._done += 1
             self._progress(self._done)
 
-    def _step(self, view: CapturedView, share: float) -> None:
+    def _step(self, view: CapturedView, rows: Tensor, share: float) -> None:
         parameters = self._parameters
-        rows = self._rows(view)
-        part = {name: tensor[rows].requires_grad_() for name, tensor in parameters.optimized.items()}
+        values = parameters.values[rows].requires_grad_()
+        part = parameters.by_name(values)
         rendered = self._rasterizer.render(parameters.splats(part, rows), view.T_cam_world, view.camera)
         (_loss(rendered, view, self._depth_weight) + parameters.prior(part)).backward()
-        gradients = {name: tensor.grad for name, tensor in part.items() if tensor.grad is not None}
-        self._optimizer.step(rows, gradients, {name: share * _RATES[name] for name in part})
-        parameters.clamp(rows)
-
-    def _rows(self, view: CapturedView) -> Tensor:
-        """Of the Gaussians that the view may show. They stay nearly the same while shapes change."""
-        if id(view) not in self._in_view:
-            rows = find_in_view(self._before, view)
-            self._in_view[id(view)] = torch.from_numpy(rows).to(self._rasterizer.device)
-        return self._in_view[id(view)]
+        assert values.grad is not None
+        moved = values.detach() + self._optimizer.step(rows, values.grad, share)
+        parameters.values[rows] = parameters.clamped(moved, rows)
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now."""
@@ -143,41 +141,66 @@ _ALL = slice(None)
 
 
 class _Parameters:
-    """The optimized tensors, by their names in ``_RATES``; ``splats`` makes Gaussians from them."""
+    """The optimized numbers of N Gaussians, and how Gaussians are made of them.
 
-    def __init__(self, gaussians: Gaussians, device: torch.device):
+    values: (N, D).  rates: (D,) sizes of Adam's steps.  A subclass names the columns by ``_RATES``.
+    """
+
+    def __init__(self, gaussians: Gaussians, options: Options, device: torch.device):
         def tensor(array: np.ndarray) -> Tensor:
             return torch.from_numpy(np.array(array, np.float32)).to(device)
 
+        self._weight = options.shape_weight
         self.means = tensor(gaussians.means)
         self.log_scales = tensor(np.log(gaussians.scales))
         self.quats = tensor(gaussians.quats_wxyz)
-        self.optimized = {
-            "logits": torch.logit(tensor(gaussians.opacities), _OPACITY_MARGIN),
-            "colors": tensor(gaussians.colors) / 255,
+        self._optimize(
+            logits=torch.logit(tensor(gaussians.opacities), _OPACITY_MARGIN)[:, None],
+            colors=tensor(gaussians.colors) / 255,
+            **self._shape_values(),
+        )
+
+    def _optimize(self, **parts: Tensor) -> None:
+        """Let these (N, d) tensors be the columns of ``values``."""
+        ends = np.cumsum([part.shape[1] for part in parts.values()])
+        self._columns = {
+            name: slice(end - part.shape[1], end) for (name, part), end in zip(parts.items(), ends, strict=True)
         }
+        self.values = torch.cat(list(parts.values()), dim=1)
+        rates = [torch.full((part.shape[1],), _RATES[name]) for name, part in parts.items()]
+        self.rates = torch.cat(rates).to(self.values.device)
+
+    def by_name(self, values: Tensor) -> _Tensors:
+        """The columns of (M, D) values."""
+        return {name: values[:, columns] for name, columns in self._columns.items()}
+
+    def _shape_values(self) -> _Tensors:
+        """The initial numbers of the shapes, (N, d) each."""
+        raise NotImplementedError
 
     def shapes(self, part: _Tensors, rows: Tensor | slice) -> tuple[Tensor, Tensor, Tensor]:
-        """Means, scales, quaternions of some rows. part: their optimized tensors."""
+        """Means, scales, quaternions of some rows. part: their optimized numbers."""
         raise NotImplementedError
 
     def splats(self, part: _Tensors, rows: Tensor | slice) -> Splats:
-        """Some Gaussians, ready to be rendered. part: their optimized tensors."""
-        return Splats(*self.shapes(part, rows), torch.sigmoid(part["logits"]), part["colors"])
+        """Some Gaussians, ready to be rendered. part: their optimized numbers."""
+        return Splats(*self.shapes(part, rows), torch.sigmoid(part["logits"][:, 0]), part["colors"])
 
     def prior(self, part: _Tensors) -> Tensor:
         """The penalty that keeps shapes near the initialization."""
         return torch.zeros((), device=self.means.device)
 
-    def clamp(self, rows: Tensor | slice) -> None:
-        """Clamps some rows to their valid ranges."""
-        logits, colors = self.optimized["logits"], self.optimized["colors"]
-        logits[rows] = logits[rows].clamp_(-_LARGEST_LOGIT, _LARGEST_LOGIT)
-        colors[rows] = colors[rows].clamp_(0, 1)
+    def clamped(self, values: Tensor, rows: Tensor | slice) -> Tensor:
+        """The (M, D) values of some rows, clamped to their valid ranges in place."""
+        part = self.by_name(values)
+        part["logits"].clamp_(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+        part["colors"].clamp_(0, 1)
+        return values
 
     def gaussians(self, before: Gaussians) -> Gaussians:
         """All Gaussians."""
-        means, scales, quats, opacities, colors = (x.cpu().numpy() for x in self.splats(self.optimized, _ALL))
+        splats = self.splats(self.by_name(self.values), _ALL)
+        means, scales, quats, opacities, colors = (x.cpu().numpy() for x in splats)
         return replace(
             before,
             means=means,
@@ -189,16 +212,13 @@ class _Parameters:
 
 
 class _Anchored(_Parameters):
-    """outline (N, 2): logarithms of the change of the two scales across the ray.  turn (N,): radians about the ray."""
+    """outline (N, 2): logarithms of the change of the two scales across the ray.  turn (N, 1): radians about it."""
 
-    def __init__(self, gaussians: Gaussians, options: Options, device: torch.device):
-        super().__init__(gaussians, device)
-        n = len(gaussians)
-        self._weight = options.shape_weight
-        self.optimized |= {"outline": torch.zeros((n, 2), device=device), "turn": torch.zeros(n, device=device)}
+    def _shape_values(self) -> _Tensors:
+        return {"outline": torch.zeros_like(self.means[:, :2]), "turn": torch.zeros_like(self.means[:, :1])}
 
     def shapes(self, part: _Tensors, rows: Tensor | slice) -> tuple[Tensor, Tensor, Tensor]:
-        outline, turn = part["outline"], part["turn"]
+        outline, turn = part["outline"], part["turn"][:, 0]
         kept = outline + 0.5 * torch.log(torch.exp(-2 * outline).mean(dim=1, keepdim=True))  # mean of 1 / change^2 is 1
         change = torch.cat((kept, torch.zeros_like(turn)[:, None]), dim=1)
         w, x, y, z = self.quats[rows].unbind(1)
@@ -209,24 +229,24 @@ class _Anchored(_Parameters):
     def prior(self, part: _Tensors) -> Tensor:
         return self._weight * (part["outline"] ** 2).mean()
 
-    def clamp(self, rows: Tensor | slice) -> None:
-        super().clamp(rows)
-        outline = self.optimized["outline"]
-        outline[rows] = outline[rows].clamp_(-0.5 * _LARGEST_CHANGE, 0.5 * _LARGEST_CHANGE)
+    def clamped(self, values: Tensor, rows: Tensor | slice) -> Tensor:
+        self.by_name(values)["outline"].clamp_(-0.5 * _LARGEST_CHANGE, 0.5 * _LARGEST_CHANGE)
+        return super().clamped(values, rows)
 
 
 class _Free(_Parameters):
     """means, shape (N, 3) logarithms of the scales, quats: as in 3D Gaussian splatting."""
 
-    def __init__(self, gaussians: Gaussians, options: Options, device: torch.device):
-        super().__init__(gaussians, device)
-        self.optimized |= {"means": self.means.clone(), "shape": self.log_scales.clone(), "quats": self.quats.clone()}
+    def _shape_values(self) -> _Tensors:
+        return {"means": self.means, "shape": self.log_scales, "quats": self.quats}
 
     def shapes(self, part: _Tensors, rows: Tensor | slice) -> tuple[Tensor, Tensor, Tensor]:
         return part["means"], torch.exp(part["shape"]), part["quats"]
 
-    def clamp(self, rows: Tensor | slice) -> None:
-        super().clamp(rows)
-        shape, quats, usual = self.optimized["shape"], self.optimized["quats"], self.log_scales[rows]
-        shape[rows] = torch.maximum(torch.minimum(shape[rows], usual + _LARGEST_CHANGE), usual - _LARGEST_CHANGE)
-        quats[rows] = torch.nn.functional.normalize(quats[rows], dim=1)
+    def clamped(self, values: Tensor, rows: Tensor | slice) -> Tensor:
+        part, usual = self.by_name(values), self.log_scales[rows]
+        part["shape"].copy_(
+            torch.maximum(torch.minimum(part["shape"], usual + _LARGEST_CHANGE), usual - _LARGEST_CHANGE)
+        )
+        part["quats"].copy_(torch.nn.functional.normalize(part["quats"], dim=1))
+        return super().clamped(values, rows)

@@ -15,24 +15,20 @@ _EPSILON = 1e-15
 
 
 class SparseAdam:
-    """Changes tensors (N, …) in place, some rows at a time."""
+    """Steps for the rows of a tensor (N, D). rates: (D,) sizes of the steps."""
 
-    def __init__(self, tensors: dict[str, Tensor]):
-        self._tensors = tensors
-        self._mean = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
-        self._square = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
-        first = next(iter(tensors.values()))
-        self._steps = torch.zeros(len(first), device=first.device)
+    def __init__(self, count: int, rates: Tensor):
+        self._rates = rates
+        self._mean = torch.zeros((count, len(rates)), device=rates.device)
+        self._square = torch.zeros_like(self._mean)
+        self._steps = torch.zeros((count, 1), device=rates.device)
 
     @torch.no_grad()
-    def step(self, rows: Tensor, gradients: dict[str, Tensor], rates: dict[str, float]) -> None:
-        """Takes a step. rows: (M,) different rows.  gradients: (M, …) of these rows.  rates: size of the step."""
+    def step(self, rows: Tensor, gradient: Tensor, share: float) -> Tensor:
+        """(M, D) what to add to the M different rows, whose gradients are (M, D). share: multiplies the rates."""
         steps = self._steps[rows] + 1
-        self._steps[rows] = steps
-        for name, gradient in gradients.items():
-            count = steps.reshape(-1, *[1] * (gradient.ndim - 1))
-            mean = self._mean[name][rows].lerp_(gradient, 1 - _BETA_1)
-            square = self._square[name][rows].mul_(_BETA_2).addcmul_(gradient, gradient, value=1 - _BETA_2)
-            self._mean[name][rows], self._square[name][rows] = mean, square
-            usual = (square / (1 - _BETA_2**count)).sqrt_().add_(_EPSILON)
-            self._tensors[name].index_add_(0, rows, mean / (1 - _BETA_1**count) / usual, alpha=-rates[name])
+        mean = self._mean[rows].lerp_(gradient, 1 - _BETA_1)
+        square = self._square[rows].mul_(_BETA_2).addcmul_(gradient, gradient, value=1 - _BETA_2)
+        self._steps[rows], self._mean[rows], self._square[rows] = steps, mean, square
+        usual = square.div_(1 - _BETA_2**steps).sqrt_().add_(_EPSILON)
+        return mean.div_(1 - _BETA_1**steps).div_(usual).mul_(-share * self._rates)

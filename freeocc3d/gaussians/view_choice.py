@@ -9,6 +9,7 @@ Source: V. Vazirani, Approximation Algorithms, Springer 2001, Sec. 13.2 (set mul
 
 from __future__ import annotations
 
+import functools
 import heapq
 import math
 from collections.abc import Sequence
@@ -30,6 +31,9 @@ _WORTH = 0.05
 _WITHIN_M, _WITHIN_SHARE = 0.05, 0.02
 """A view shows a Gaussian if its depth there differs by less than the first, meters, plus the second times the depth:
 the noise of a sensor, and about half the spacing of Gaussians."""
+
+_BEHIND_M = 0.3
+"""Meters behind the measured surface from which a Gaussian counts as hidden: farther than surfaces are thick."""
 
 _REACH = math.sqrt(-2 * math.log(ALPHA_MIN))
 """Standard deviations at which even an opaque Gaussian is not drawn any more."""
@@ -59,24 +63,31 @@ def choose_views(gaussians: Gaussians, views: Sequence[CapturedView]) -> list[in
 def find_shown(means: NDArray[np.float32], view: CapturedView) -> NDArray[np.int64]:
     """Rows of the (N, 3) means, world meters, that lie on what the view's depth shows."""
     pixel, z = project(means, view)
-    camera, depth_m = view.camera, view.depth_m.cpu().numpy()
-    ahead = np.flatnonzero(z > NEAR)
-    column, row = np.rint(pixel[ahead]).astype(np.int64).T
-    inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    ahead, column, row = ahead[inside], column[inside], row[inside]
-    measured = depth_m[row, column]
-    near = np.abs(measured - z[ahead]) < _WITHIN_M + _WITHIN_SHARE * measured
-    return ahead[(measured > 0) & near]
+    measured = _measured_at(pixel, view)
+    off = np.abs(measured - z) - _WITHIN_SHARE * np.where(np.isinf(measured), 0, measured)
+    return np.flatnonzero((off < _WITHIN_M) & (z > NEAR))
 
 
 def find_in_view(gaussians: Gaussians, view: CapturedView) -> NDArray[np.int64]:
-    """Rows of the Gaussians that may reach into the image, hidden or not."""
+    """Rows of the Gaussians that may reach into the image, without those that lie far behind what its depth shows."""
     pixel, z = project(gaussians.means, view)
     camera = view.camera
+    hidden = z > _measured_at(pixel, view) + _BEHIND_M
+    largest = functools.reduce(np.maximum, gaussians.scales.T)
     with np.errstate(divide="ignore"):
-        reach = _REACH * gaussians.scales.max(axis=1) * max(camera.fx, camera.fy) / np.abs(z)
-    near = (pixel > -reach[:, None]) & (pixel < reach[:, None] + np.array((camera.width, camera.height), np.float32))
-    return np.flatnonzero(near.all(axis=1) & (z > NEAR))
+        reach = np.float32(_REACH * max(camera.fx, camera.fy)) * largest / np.abs(z)
+    (u, v), across, down = pixel.T, np.float32(camera.width), np.float32(camera.height)
+    near = (u > -reach) & (v > -reach) & (u < across + reach) & (v < down + reach)
+    return np.flatnonzero(near & (z > NEAR) & ~hidden)
+
+
+def _measured_at(pixel: NDArray[np.float32], view: CapturedView) -> NDArray[np.float32]:
+    """(N,) measured depths at (N, 2) pixels, meters; infinite where there is none."""
+    depth_m = view.depth_m.cpu().numpy()
+    column, row = np.rint(pixel).astype(np.int64).T
+    inside = (column >= 0) & (row >= 0) & (column < view.camera.width) & (row < view.camera.height)
+    found = depth_m[np.where(inside, row, 0), np.where(inside, column, 0)]
+    return np.where(inside & (found > 0), found, np.float32(np.inf))
 
 
 def project(means: NDArray[np.float32], view: CapturedView) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -166,14 +166,13 @@ def test_shapes_and_opacities_stay_within_their_bounds(means: str) -> None:
     made = {"anchored": fitting._Anchored, "free": fitting._Free}[means](cloud, fitting.Options(), torch.device("cpu"))
     rng = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        for name, tensor in made.optimized.items():
+        for name, tensor in made.by_name(made.values).items():
             if name != "quats":
                 tensor.copy_(20 * torch.randn(tensor.shape, generator=rng))
         if means == "free":
-            made.optimized["quats"].mul_(3.0)
-    given = {name: tensor.clone() for name, tensor in made.optimized.items()}
-    made.clamp(slice(None))
-    now = {name: tensor.detach() for name, tensor in made.optimized.items()}
+            made.by_name(made.values)["quats"].mul_(3.0)
+    given = made.by_name(made.values.clone())
+    now = made.by_name(made.clamped(made.values, slice(None)))
     torch.testing.assert_close(now["logits"], given["logits"].clip(-6, 6))
     if means == "free":
         logs = torch.log(torch.from_numpy(cloud.scales))

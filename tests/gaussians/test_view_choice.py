@@ -38,9 +38,11 @@ def test_a_view_without_depth_is_never_chosen() -> None:
     assert view_choice.choose_views(lifted(frames, poses), made) == [1]
 
 
-def test_what_is_shown_lies_on_the_depth_and_what_is_in_view_may_be_hidden() -> None:
+def test_what_is_shown_lies_on_the_depth_and_what_is_in_view_is_not_far_behind() -> None:
     (view,), _, _ = views(1, 0.0)
     ahead, hidden, behind, beside, touching = (0, 0, 2.0), (0, 0, 3.0), (0, 0, -2.0), (9.0, 0, 2.0), (1.3, 0, 2.0)
-    cloud = gaussians([ahead, hidden, behind, beside, touching], 0.05)
+    cloud = gaussians([ahead, hidden, behind, beside, touching, (0, 0, 2.2), (0, 0, 1.0)], 0.05)
     assert view_choice.find_shown(cloud.means, view).tolist() == [0]
-    assert view_choice.find_in_view(cloud, view).tolist() == [0, 1, 4], "a Gaussian reaches farther than its mean"
+    assert view_choice.find_in_view(cloud, view).tolist() == [0, 4, 5, 6], "a Gaussian reaches farther than its mean"
+    (blind,) = [replace(view, depth_m=torch.zeros_like(view.depth_m))]
+    assert view_choice.find_in_view(cloud, blind).tolist() == [0, 1, 4, 5, 6], "nothing hides"
