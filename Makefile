@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+# Two processes of one thread each: threads of small arrays would spend half of the time waiting for each other.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # The fast tests of each room; a whole folder if all its tests are fast.
 QUICK  := tests/test_imports.py tests/core tests/settings tests/capture tests/occupancy tests/export \
@@ -22,11 +24,11 @@ help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
 
 quick: setup lint  ## style, types and the fast tests, in less than two minutes
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q $(QUICK)
+	$(PYTEST) -q $(QUICK)
 
 test: setup lint  ## style, types and all tests, which build the documentation
 	@sh tools/test_clients.sh
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
 
 lint: setup
 	$(BIN)/ruff check .

@@ -28,7 +28,9 @@ def count_threads() -> int:
 
 
 def limit_pools() -> None:
-    """Tell libraries that are imported later the number of threads, where it is less than the number of processors."""
+    """Tell libraries that are imported later the number of threads, where it is less than the number of processors, and
+    that threads of OpenMP sleep while they wait: they would take the time of those that read ahead and save."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     threads = count_threads()
     if threads < len(os.sched_getaffinity(0)):
         for name in _POOLS:

@@ -152,6 +152,8 @@ def test_a_stopped_run_ends_cleanly_and_resumes(tmp_path, number, status) -> Non
         str(data_folder() / "7scenes-kitchen"),
         "-o",
         str(out),
+        "--set",
+        "capture.color_focal=1",
     ]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     while not (Path(f"{out}.partial") / "stages.json").exists():  # the first checkpoint

@@ -66,8 +66,9 @@ def test_the_user_limits_them(monkeypatch: pytest.MonkeyPatch, wish: str, expect
 def test_a_quota_limits_the_threads_of_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1, 2, 3})
     monkeypatch.setattr(threads, "_quotas", lambda membership, mount: iter((1.5,)))
-    monkeypatch.setattr(os, "environ", {"MKL_NUM_THREADS": "1"})
+    monkeypatch.setattr(os, "environ", {"MKL_NUM_THREADS": "1", "OMP_WAIT_POLICY": "active"})
     threads.limit_pools()
+    assert os.environ.pop("OMP_WAIT_POLICY") == "active"  # as the user says
     assert os.environ == {name: "1" if name == "MKL_NUM_THREADS" else "2" for name in threads._POOLS}
 
 
@@ -75,4 +76,4 @@ def test_without_a_limit_libraries_choose(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(threads, "_quotas", lambda membership, mount: iter(()))
     monkeypatch.setattr(os, "environ", {})
     threads.limit_pools()
-    assert not os.environ
+    assert os.environ == {"OMP_WAIT_POLICY": "passive"}
