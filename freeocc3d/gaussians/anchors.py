@@ -54,12 +54,12 @@ class AnchoredCells:
         T_world_keyframe: NDArray[np.float64],
         voxel_origin: NDArray[np.float64] | None = None,
     ):
-        """voxel_origin: (3,) a corner of voxels, which hold walls in their middle. Cells begin half a cell from it, so
-        that they hold the same walls in their middle, and half a cell below the floor at z = 0. None = at the world's
-        origin."""
+        """voxel_origin: (3,) a corner of voxels. Cells begin there along x and y, and at z = 0: the floor, and walls in
+        the middle of voxels, lie between two layers of cells of half a voxel, which measures best: as plane surfaces
+        fill fewest cells where they lie within a layer. None = cells begin at the world's origin."""
         self.options = options
         self.cell_size = cell_size
-        self._origin = None if voxel_origin is None else np.array((*voxel_origin[:2], -cell_size)) + 0.5 * cell_size
+        self._origin = None if voxel_origin is None else np.array((*voxel_origin[:2], 0.0))
         self._T_world_keyframe = T_world_keyframe
         self._sums = CellSums(cell_size, self._origin)
         self._compared = False

@@ -69,6 +69,25 @@ def test_a_surer_measurement_outweighs_a_nearer_one() -> None:
     assert (both.keyframe[~seen_far] == 0).all()
 
 
+def test_cells_begin_at_an_origin() -> None:
+    """Frames that move with the origin give the same cells."""
+    origin, sums, frames = np.array((0.013, -2.02, 0.5)), CellSums(0.05), looks(2)
+    moved = CellSums(0.05, origin)
+    for posed in frames:
+        sums.add_frame(posed, 2, 0.2)
+        T = posed.T_world_cam.copy()
+        T[:3, 3] += origin
+        moved.add_frame(posed._replace(T_world_cam=T), 2, 0.2)
+    plain, found = sums.cells(), moved.cells()
+    assert (found.key == plain.key).mean() > 0.99  # rounding moves a pixel over an edge here and there
+    again = CellSums(0.05, origin)
+    again.add(found)
+    np.testing.assert_array_equal(again.cells().key, found.key)
+    np.testing.assert_allclose(again.cells().points, found.points, atol=1e-9)
+    near = np.abs(found.points[: len(plain)] - origin - plain.points[: len(found)]).max(axis=1)
+    assert np.median(near) < 1e-9
+
+
 def test_means_that_are_added_again_stay_what_they_are() -> None:
     cells = summed(looks(4))
     sums = CellSums(0.05)

@@ -122,6 +122,12 @@ MEASUREMENTS = {
         "air:measure_air",
         table="air:tabulate_air",
     ),
+    "upright": Measurement(
+        "layers of voxels that hold the floor, and thickness of walls, of maps with voxels of 8 and of 4 cm",
+        "capture",
+        "upright_layers:measure_layers",
+        table="upright_layers:tabulate_layers",
+    ),
     "poses_from_color": Measurement(
         "poses from color alone: placed images, ATE and seconds, and those of pycolmap's pipeline at its defaults",
         "capture",
