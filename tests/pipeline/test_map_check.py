@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
+from benchmark.self_check import check_lines, measure_check
 
 from freeocc3d import Map
 from freeocc3d.cli.map_summary import summary_text
@@ -86,6 +88,20 @@ def test_lengths_of_a_scaled_map_are_scaled(room: Map, tmp_path) -> None:
     for name, said in room.report["check"]["measures"].items():
         wanted = said["value"] and said["value"] * (2 if said["unit"] == "m" else 1)
         assert double.report["check"]["measures"][name]["value"] == wanted
+
+
+def test_the_benchmark_compares_other_poses_of_the_same_keyframes(room: Map, checked: MapCheck) -> None:
+    figures = json.loads(json.dumps(measure_check(str(room.path))))
+    told = figures["agreement"]
+    assert told["own"]["step_off_m"] == pytest.approx(measures(checked)["step"].value)
+    assert told["given"]["step_off_m"] < told["drift 8 cm"]["step_off_m"]
+    assert 0 < figures["share_of_run"] < 1
+    # This walk never comes back, so that no line tells of revisits.
+    lines = check_lines(figures)
+    assert lines[0][0].startswith("  step: ")
+    for agreement in told.values():
+        agreement |= {"revisit_off_m": 0.01, "revisit_sigmas": 2 * agreement["step_sigmas"]}
+    assert "1.00 cm, 2.00 steps" in check_lines(figures)[0][1]
 
 
 def test_verdicts_follow_the_limits() -> None:
