@@ -5,17 +5,20 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import msgspec
 import numpy as np
 import pytest
 from benchmark.self_check import check_lines, measure_check
 
 from freeocc3d import Map
+from freeocc3d.cli.check import check_document, check_text
 from freeocc3d.cli.map_summary import summary_text
 from freeocc3d.core.errors import FrameError
 from freeocc3d.core.types import OCCUPIED
 from freeocc3d.editing.scaling import scale_map
 from freeocc3d.pipeline.map_check import LIMITS, MapCheck, Measure, check_map
 from freeocc3d.query.scan_map import load_map
+from freeocc3d.storage.manifest import MapScale
 from freeocc3d.tracking.view_agreement import Agreement
 
 
@@ -102,6 +105,15 @@ def test_the_benchmark_compares_other_poses_of_the_same_keyframes(room: Map, che
     for agreement in told.values():
         agreement |= {"revisit_off_m": 0.01, "revisit_sigmas": 2 * agreement["step_sigmas"]}
     assert "1.00 cm, 2.00 steps" in check_lines(figures)[0][1]
+
+
+def test_a_map_of_unknown_scale_is_told_in_units(room: Map, checked: MapCheck, monkeypatch: pytest.MonkeyPatch) -> None:
+    manifest = msgspec.structs.replace(room.manifest, scale=MapScale(metric=False))
+    monkeypatch.setattr(room, "manifest", manifest)
+    assert " cm" not in check_text(room, checked)
+    assert " units, " in check_text(room, checked)
+    assert check_document(room, checked)["metric"] is False
+    assert " units from one keyframe to the next" in summary_text(room)
 
 
 def test_verdicts_follow_the_limits() -> None:
