@@ -10,7 +10,8 @@ it needs no grid, and a wall becomes one layer thick. Frames that look at the ot
 count, because they show another surface.
 
 The same frames tell which points are no surface: what was there only for a while, depth between the two sides of an
-edge, specks behind a pane. A point is removed if more frames see through it than show it. If only few frames show it,
+edge, specks behind a pane. A point is removed if more frames see through it than show it, or if several see far past it
+after the last one that shows it: it has left. If only few frames show it,
 then frames whose pixel has no depth there count a little, too: a sensor misses black, shiny and slanted surfaces often,
 but not always. And what a single frame shows holds only if few others could have shown it.
 
@@ -48,6 +49,14 @@ _BLANK = 1 / 20
 the voxels that panes with specks in a tenth of their pixels bring into the three captures, this removes 79 to 93 %. At
 1 / 10, it removes 89 to 95 %, but loses more of what lies behind large things without depth."""
 
+_FAR = 3.0
+"""A frame sees far past a point if its depth ends at this many times the distance within which it would show it. So a
+pose that has drifted does not count."""
+
+_LEFT, _LEFT_SHARE = 5, 0.25
+"""Frames that see far past a point after the last one that shows it, and their least ratio to those that show it, of a
+thing that has left. Of the points of still rooms, less than one in a thousand has five."""
+
 _OTHERS = 3
 """Frames that may fail to confirm what a single frame shows."""
 
@@ -80,13 +89,13 @@ def denoise(
 ) -> DenoisedPoints:
     """Moves (N, 3) world points to the mean surface of the depth maps.
 
-    directions: (N, 3) the rays along which the points were measured, world, of any length.  frames: read once. Pixels
-    with depth 0 do not move points, and neither do pixels where depth jumps by more than ``edge`` times itself.
-    reach_m: the greatest depth of any frame. Beyond, a pixel without depth says nothing.
+    directions: (N, 3) the rays along which the points were measured, world, of any length.  frames: read once, in the
+    order of time. Pixels with depth 0 do not move points, and neither do pixels where depth jumps by more than ``edge``
+    times itself.  reach_m: the greatest depth of any frame. Beyond, a pixel without depth says nothing.
     """
     n = len(points)
     moved, weights, best = np.zeros((n, 3)), np.zeros(n), np.zeros(n)
-    shown, through, blank = np.zeros((3, n), np.int32)
+    shown, through, blank, past = np.zeros((4, n), np.int32)
     keyframe = np.full(n, -1, np.int32)
     for frame, T_world_cam, row in frames:
         camera, depth_m = frame.intrinsics, frame.depth_m
@@ -94,18 +103,21 @@ def denoise(
         _look(
             points, directions, depth_m, take_sigma(frame), edge, reach_m, T_cam_world[:3, :3].copy(),
             T_cam_world[:3, 3].copy(), (camera.fx, camera.fy, camera.cx, camera.cy), row, moved, weights, shown,
-            through, blank, best, keyframe,
+            through, blank, past, best, keyframe,
         )  # fmt: skip
     points = points + moved / np.where(weights > 0, weights, 1.0)[:, None]
-    return DenoisedPoints(points, weights, best, keyframe, are_surfaces(shown, through, blank))
+    return DenoisedPoints(points, weights, best, keyframe, are_surfaces(shown, through, blank, past))
 
 
-def are_surfaces(shown: NDArray[np.int32], through: NDArray[np.int32], blank: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(N,) whether points are kept, from the numbers (N,) of frames that show them, that see through them, and that
-    have no depth there."""
+def are_surfaces(
+    shown: NDArray[np.int32], through: NDArray[np.int32], blank: NDArray[np.int32], past: NDArray[np.int32]
+) -> NDArray[np.bool_]:
+    """(N,) whether points are kept, from the numbers (N,) of frames that show them, that see through them, that have no
+    depth there, and that see far past them after the last one that shows them."""
     against = through + np.where(shown < _SURE, _BLANK * blank, 0.0)
     alone = (shown < 2) & (through + blank > _OTHERS)
-    return np.asarray((against <= np.maximum(shown, 1)) & ~alone)
+    left = past >= np.maximum(_LEFT, _LEFT_SHARE * shown)
+    return np.asarray((against <= np.maximum(shown, 1)) & ~alone & ~left)
 
 
 @njit(parallel=True, cache=True)
@@ -125,6 +137,7 @@ def _look(
     shown: NDArray[np.int32],
     through: NDArray[np.int32],
     blank: NDArray[np.int32],
+    past: NDArray[np.int32],
     best: NDArray[np.float64],
     keyframe: NDArray[np.int32],
 ) -> None:
@@ -151,6 +164,7 @@ def _look(
         beyond = depth - z
         if beyond > reach:
             through[n] += 1
+            past[n] += beyond > _FAR * reach
         elif beyond >= -reach:  # else something in front hides it
             ray = (
                 R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
@@ -166,15 +180,16 @@ def _look(
                 moved[n, i] += step * ray[i]
             weight[n] += w
             shown[n] += 1
+            past[n] = 0
             if w > best[n]:
                 best[n], keyframe[n] = w, row
 
 
 def look_reference(
     points: NDArray[np.float64], directions: NDArray[np.float64], posed: PosedFrame, edge: float, reach_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """What one depth map shows of (N, 3) points, in plain NumPy: (N, 3) weighted offset, (N,) weight, (N,) whether it
-    sees through the point, and (N,) whether it has no depth there."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """What one depth map shows of (N, 3) points, in plain NumPy: (N, 3) weighted offset, (N,) weight, (N,) how far it
+    sees through the point in units of the reach, 0 if it does not, and (N,) whether it has no depth there."""
     camera, measured_m = posed.frame.intrinsics, posed.frame.depth_m
     depth_m = np.where(mask_away_from_edges(measured_m, edge), measured_m, 0)
     T = invert(posed.T_world_cam)
@@ -191,4 +206,4 @@ def look_reference(
         weight = np.where(shown, 1.0 / compute_sigma_image(posed.frame)[line, column].astype(np.float64) ** 2, 0.0)
         offset = np.where(shown, weight * beyond / z, 0.0)[:, None] * ray
         blank = inside & (measured_m[line, column] <= 0) & (z <= reach_m)
-        return offset, weight, (depth > 0) & (beyond > reach), blank
+        return offset, weight, np.where((depth > 0) & (beyond > reach), beyond / reach, 0.0), blank

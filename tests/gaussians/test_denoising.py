@@ -34,13 +34,17 @@ def test_the_kernel_agrees_with_plain_numpy(own_sigma: bool) -> None:
     looks = posed(frames, poses)
     found = denoising.denoise(points, directions, looks, 0.15, 2.1)
     parts = [denoising.look_reference(points, directions, look, 0.15, 2.1) for look in looks]
-    offset, weight, through, blank = (sum(part[i].astype(float) for part in parts) for i in range(4))
+    offset, weight = (sum(part[i] for part in parts) for i in range(2))
+    through, blank = (sum((part[i] > 0).astype(int) for part in parts) for i in (2, 3))
+    past = np.zeros(len(points), int)
+    for part in parts:
+        past = np.where(part[1] > 0, 0, past + (part[2] > 3))
     shown = sum((part[1] > 0).astype(int) for part in parts)
     assert 800 < np.count_nonzero(weight) < 3500
     np.testing.assert_allclose(found.weights, weight, rtol=1e-5)
     expected = points + offset / np.where(weight > 0, weight, 1)[:, None]
     np.testing.assert_allclose(found.points, expected, atol=1e-6)
-    np.testing.assert_array_equal(found.kept, denoising.are_surfaces(shown, through, blank))
+    np.testing.assert_array_equal(found.kept, denoising.are_surfaces(shown, through, blank, past))
     best = np.argmax([part[1] for part in parts], axis=0)
     np.testing.assert_array_equal(found.keyframe, np.where(weight > 0, best, -1))
 
@@ -69,33 +73,36 @@ def test_what_most_images_see_through_is_left_out_and_what_none_shows_stays() ->
 
 
 @pytest.mark.parametrize(
-    ("shown", "through", "blank", "kept"),
+    ("shown", "through", "blank", "past", "kept"),
     [
-        (1, 0, 3, True),  # few others could have shown it
-        (1, 0, 4, False),  # shown once of five times
-        (2, 0, 20, True),  # a dark thing, perhaps
-        (2, 0, 50, False),
-        (6, 0, 500, True),  # something without depth often hides it
-        (6, 7, 0, False),
-        (0, 0, 0, True),
+        (1, 0, 3, 0, True),  # few others could have shown it
+        (1, 0, 4, 0, False),  # shown once of five times
+        (2, 0, 20, 0, True),  # a dark thing, perhaps
+        (2, 0, 50, 0, False),
+        (6, 0, 500, 0, True),  # something without depth often hides it
+        (6, 7, 0, 0, False),
+        (20, 9, 0, 4, True),
+        (20, 9, 0, 5, False),  # it has left
+        (40, 9, 0, 9, True),
+        (0, 0, 0, 0, True),
     ],
 )
-def test_a_point_is_kept_by_what_all_frames_show(shown: int, through: int, blank: int, kept: bool) -> None:
-    counts = (np.array([count], np.int32) for count in (shown, through, blank))
+def test_a_point_is_kept_by_what_all_frames_show(shown: int, through: int, blank: int, past: int, kept: bool) -> None:
+    counts = (np.array([count], np.int32) for count in (shown, through, blank, past))
     assert denoising.are_surfaces(*counts).tolist() == [kept]
 
 
 def test_specks_behind_a_pane_and_a_passer_by_are_left_out_and_what_is_behind_a_dark_thing_stays() -> None:
-    frames = [wall_frame(2.0, n) for n in range(60)]
+    frames = [wall_frame(2.0, n) for n in range(70)]
     for n, frame in enumerate(frames):
         frame.depth_m[:, :30] = 0  # a pane, with a speck in another place of each third frame
         if n % 3 == 0:
             frame.depth_m[10 + n // 3, 4:8] = 3.0
-        if n < 20:
-            frame.depth_m[:, -30:] = 1.0  # somebody stands there, and leaves
+        if n < 50:
+            frame.depth_m[:, -30:] = 1.0  # somebody stands there most of the time, and leaves
         if n >= 8:
             frame.depth_m[30:40, 40:50] = 0  # a dark thing is put before the wall
-    g = lifted(frames, np.tile(np.eye(4), (60, 1, 1)), 0.04)
+    g = lifted(frames, np.tile(np.eye(4), (70, 1, 1)), 0.04)
     np.testing.assert_allclose(g.means[:, 2], 2.0, atol=0.02)
     pixels = np.rint(g.means[:, :2] / g.means[:, 2:] * (CAMERA.fx, CAMERA.fy) + (CAMERA.cx, CAMERA.cy)).astype(int)
     assert ((pixels >= (41, 31)) & (pixels < (49, 39))).all(axis=1).any()
