@@ -78,6 +78,22 @@ def measure_cells(
     return cells[enough], value[order][(first + count // 2)[enough]]
 
 
+def _look_up(
+    cells: NDArray[np.int64], off: NDArray[np.float64], centers: NDArray[np.float64], edge: float
+) -> NDArray[np.float64]:
+    """(V,) medians of the cells of (V, 3) voxel centers, or else of a cell within half an edge; NaN where there is
+    none. A surface may lie beside its voxel's center, on the other side of a cell's face."""
+    found = np.full(len(centers), np.nan)
+    for shift in (np.zeros((1, 3)), 0.5 * edge * np.eye(3), -0.5 * edge * np.eye(3)):
+        for step in shift:
+            missing = np.flatnonzero(np.isnan(found))
+            wanted = pack_voxels(np.floor((centers[missing] + step) / edge).astype(np.int64))
+            place = np.searchsorted(cells, wanted)
+            known = np.append(cells, -1)[place] == wanted
+            found[missing[known]] = off[place[known]]
+    return found
+
+
 def _draw_plan(
     picture: NDArray[np.uint8], scan_map: Map, views: Sequence[ComparedView], agreement: Agreement, top: float
 ) -> None:
@@ -87,11 +103,9 @@ def _draw_plan(
     chosen = [kind[row] for kind in (agreement.revisits, agreement.steps) for row in spread_evenly(len(kind), _PAIRS)]
     edge = _CELL * occupancy.voxel_size
     cells, off = measure_cells(views, trajectory.T_world_keyframe, chosen, edge)
-    wanted = pack_voxels(np.floor(centers / edge).astype(np.int64))
-    place = np.minimum(np.searchsorted(cells, wanted), max(len(cells) - 1, 0))
-    known = cells[place] == wanted if len(cells) else np.zeros(len(wanted), bool)
     colors = np.full((len(centers), 3), _UNKNOWN, np.uint8)
-    colors[known] = _colors(off[place[known]], top)
+    found = _look_up(cells, off, centers, edge)
+    colors[np.isfinite(found)] = _colors(found[np.isfinite(found)], top)
 
     R = turn_lengthwise(scan_map.T_gravity_map[:3, :3], centers)
     turned, way = centers @ R.T, trajectory.T_world_cam[trajectory.has_pose][:, :3, 3] @ R.T
