@@ -38,12 +38,12 @@ from .view_choice import choose_views, find_in_view
 _RATES = {"outline": 0.03, "turn": 0.03, "shape": 0.03, "quats": 0.015, "means": 6e-4, "logits": 0.15, "colors": 0.03}
 """Adam's step for each parameter: natural logarithms, radians, meters, logits, 0…1. A third of it takes twice as many
 passes to the same PSNR on house/bedroom."""
-_DECAY = 0.1
+_LAST_DECAY = 0.1
 """During the last pass, steps shrink to this share of their size."""
 _JUDGES = 8
 """Largest number of views, of those that are not fitted to, that tell whether a pass improves anything."""
-_LEAST_GAIN_DB = 0.05
-"""Passes over small views end when one improves the judges by less."""
+_PATIENCE = 2
+"""Passes over small views end after so many that did not improve the judges; one may not, because steps are long."""
 _OPACITY_MARGIN = 1e-3  # smallest distance of initial opacities from 0 and 1, where logits are infinite
 _LARGEST_LOGIT = 6.0
 _LARGEST_CHANGE = math.log(4.0)
@@ -69,14 +69,11 @@ def fit_gaussians(
     with _one_torch_thread():
         fit = _Fit(gaussians, rasterizer, options, progress)
         large = [(views[row], fit.find_rows(views[row])) for row in chosen]
-        small, best = [(halve_view(view), rows) for view, rows in large], -math.inf
-        for _ in range(passes - 1):
-            fit.show(small)
-            found = measure_fidelity(fit.gaussians(), judges, rasterizer).psnr_measured
-            if found is None or found - best < _LEAST_GAIN_DB:
-                break
-            best = found
-        fit.show(large, last=True)
+        small, scores = [(halve_view(view), rows) for view, rows in large], [-math.inf]
+        while len(scores) < passes and len(scores) - int(np.argmax(scores)) <= _PATIENCE:
+            fit.show(small, 1.0)
+            scores.append(measure_fidelity(fit.gaussians(), judges, rasterizer).psnr_measured or -math.inf)
+        fit.show(large, _LAST_DECAY)
         made = fit.gaussians()
     return made[made.opacities >= ALPHA_MIN]  # the others are never drawn
 
@@ -100,28 +97,28 @@ class _Fit:
         self._before, self._rasterizer, self._depth_weight = gaussians, rasterizer, options.depth_weight
         self._parameters = (_Free if options.means == "free" else _Anchored)(gaussians, options, rasterizer.device)
         self._optimizer = SparseAdam(len(gaussians), self._parameters.rates)
-        self._generator, self._progress, self._done = np.random.default_rng(0), progress, 0
+        self._generator, self._progress, self._done, self._share = np.random.default_rng(0), progress, 0, 1.0
 
     def find_rows(self, view: CapturedView) -> Tensor:
         """Rows of the Gaussians that the view may show. They stay nearly the same while shapes change."""
         return torch.from_numpy(find_in_view(self._before, view)).to(self._rasterizer.device)
 
-    def show(self, views: Sequence[tuple[CapturedView, Tensor]], last: bool = False) -> None:
-        """One pass over views with the rows that they may show. last: steps become small."""
-        for step, n in enumerate(self._generator.permutation(len(views))):
-            view, rows = views[n]
-            self._step(view, rows, _DECAY ** (step / len(views)) if last else 1.0)
+    def show(self, views: Sequence[tuple[CapturedView, Tensor]], decay: float) -> None:
+        """One pass over views with the rows that they may show. decay: the share to which steps shrink meanwhile."""
+        for n in self._generator.permutation(len(views)):
+            self._step(*views[n])
+            self._share *= decay ** (1 / len(views))
             self._done += 1
             self._progress(self._done)
 
-    def _step(self, view: CapturedView, rows: Tensor, share: float) -> None:
+    def _step(self, view: CapturedView, rows: Tensor) -> None:
         parameters = self._parameters
         values = parameters.values[rows].requires_grad_()
         part = parameters.by_name(values)
         rendered = self._rasterizer.render(parameters.splats(part, rows), view.T_cam_world, view.camera)
         (_loss(rendered, view, self._depth_weight) + parameters.prior(part)).backward()
         assert values.grad is not None
-        moved = values.detach() + self._optimizer.step(rows, values.grad, share)
+        moved = values.detach() + self._optimizer.step(rows, values.grad, self._share)
         parameters.values[rows] = parameters.clamped(moved, rows)
 
     def gaussians(self) -> Gaussians:

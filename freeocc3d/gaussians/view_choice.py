@@ -14,6 +14,7 @@ import heapq
 import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +35,9 @@ the noise of a sensor, and about half the spacing of Gaussians."""
 
 _BEHIND_M = 0.3
 """Meters behind the measured surface from which a Gaussian counts as hidden: farther than surfaces are thick."""
+_AROUND = 0.04
+"""Share of the image's width around a mean within which nothing may show it: about three standard deviations of a
+Gaussian of usual size at usual depth."""
 
 _REACH = math.sqrt(-2 * math.log(ALPHA_MIN))
 """Standard deviations at which even an opaque Gaussian is not drawn any more."""
@@ -63,16 +67,19 @@ def choose_views(gaussians: Gaussians, views: Sequence[CapturedView]) -> list[in
 def find_shown(means: NDArray[np.float32], view: CapturedView) -> NDArray[np.int64]:
     """Rows of the (N, 3) means, world meters, that lie on what the view's depth shows."""
     pixel, z = project(means, view)
-    measured = _measured_at(pixel, view)
+    measured = _look_up(_without_gaps(view), pixel)
     off = np.abs(measured - z) - _WITHIN_SHARE * np.where(np.isinf(measured), 0, measured)
     return np.flatnonzero((off < _WITHIN_M) & (z > NEAR))
 
 
 def find_in_view(gaussians: Gaussians, view: CapturedView) -> NDArray[np.int64]:
-    """Rows of the Gaussians that may reach into the image, without those that lie far behind what its depth shows."""
+    """Rows of the Gaussians that may reach into the image, without those that lie far behind all that its depth shows
+    around them."""
     pixel, z = project(gaussians.means, view)
     camera = view.camera
-    hidden = z > _measured_at(pixel, view) + _BEHIND_M
+    side = 2 * math.ceil(_AROUND * camera.width) + 1
+    farthest = cv2.dilate(_without_gaps(view), np.ones((side, side), np.uint8))
+    hidden = z > _look_up(farthest, pixel) + _BEHIND_M
     largest = functools.reduce(np.maximum, gaussians.scales.T)
     with np.errstate(divide="ignore"):
         reach = np.float32(_REACH * max(camera.fx, camera.fy)) * largest / np.abs(z)
@@ -81,13 +88,17 @@ def find_in_view(gaussians: Gaussians, view: CapturedView) -> NDArray[np.int64]:
     return np.flatnonzero(near & (z > NEAR) & ~hidden)
 
 
-def _measured_at(pixel: NDArray[np.float32], view: CapturedView) -> NDArray[np.float32]:
-    """(N,) measured depths at (N, 2) pixels, meters; infinite where there is none."""
+def _without_gaps(view: CapturedView) -> NDArray[np.float32]:
+    """(H, W) depth, meters; infinite where none was measured."""
     depth_m = view.depth_m.cpu().numpy()
+    return np.where(depth_m > 0, depth_m, np.float32(np.inf))
+
+
+def _look_up(image: NDArray[np.float32], pixel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N,) values of an image at (N, 2) pixels; infinite outside it."""
     column, row = np.rint(pixel).astype(np.int64).T
-    inside = (column >= 0) & (row >= 0) & (column < view.camera.width) & (row < view.camera.height)
-    found = depth_m[np.where(inside, row, 0), np.where(inside, column, 0)]
-    return np.where(inside & (found > 0), found, np.float32(np.inf))
+    inside = (column >= 0) & (row >= 0) & (column < image.shape[1]) & (row < image.shape[0])
+    return np.where(inside, image[np.where(inside, row, 0), np.where(inside, column, 0)], np.float32(np.inf))
 
 
 def project(means: NDArray[np.float32], view: CapturedView) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -143,7 +143,7 @@ class FittingOptions(TypedOptions, frozen=True):
 
     rasterizer: str = "cpu"
     """The renderer: "cpu" (compiled), "gsplat" (CUDA), or "reference" (plain PyTorch, slow)."""
-    passes: Annotated[int, Meta(ge=0, le=1000)] = 4
+    passes: Annotated[int, Meta(ge=0, le=1000)] = 5
     """Number of times, at most, that keyframes are rendered and compared: at half the width, and the last time at the
     full width. Where many show the same, some are left out. Passes end early if they improve other views no more. 0 =
     keep the initial Gaussians."""
