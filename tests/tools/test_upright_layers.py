@@ -28,7 +28,9 @@ def test_walls_are_bare_where_nothing_touches_them() -> None:
     across_x, across_y = upright_layers.find_bare_walls(room(), room() == 2)
     assert across_x[2, 12, 3]
     assert not across_x[2, 5, 3]  # the cupboard
+    assert not across_x[2, 9, 3]  # within two voxels of it
     assert across_x[2, 5, 8]  # above it
+    assert not across_x[2, 4, 8]  # two voxels from a corner
     assert not across_x[10, 2, 3]
     assert across_y[10, 2, 3]
     assert not (across_x & across_y).any()

@@ -22,7 +22,7 @@ SIZES = 0.08, 0.04
 _ABOVE_M = 0.3  # free above a floor with nothing on it
 _NEAR_FLOOR_M = 0.2  # what the map has up to this height above and below such a floor is counted
 _THIN = 3  # voxels: a wall of the truth is no thicker, and runs on along the other level axis
-_LONG = 6  # voxels of that run, at least
+_LONG, _MARGIN = 6, 2  # voxels of that run, at least, and of its ends that do not count
 
 
 def measure_layers(capture: str) -> Figures:
@@ -90,18 +90,25 @@ def find_bare_floor(labels: NDArray[np.uint8], floor: NDArray[np.bool_], above: 
 
 
 def find_bare_walls(labels: NDArray[np.uint8], wall: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(X, Y, Z) voxels of walls across x, and of walls across y, with nothing beside them."""
+    """(X, Y, Z) voxels of walls across x, and of walls across y, with nothing beside them, nor beside the next voxels
+    of the wall: a map may lie a voxel aside."""
     occupied = (labels > 0) & (labels < 255)
     lengths = [measure_runs(occupied, axis) for axis in (0, 1)]
     x, y = (wall & (lengths[a] <= _THIN) & (measure_runs(wall, 1 - a) >= _LONG) for a in (0, 1))
-    return x, y
+    x, y = (np.asarray(_neighbors(walls, 2, 1).all(axis=0)) for walls in (x, y))  # neither floor nor ceiling
+    return np.asarray(_neighbors(x, 1, _MARGIN).all(axis=0)), np.asarray(_neighbors(y, 0, _MARGIN).all(axis=0))
 
 
 def widened(walls: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
     """(X, Y, Z) the voxels and their neighbors along an axis."""
-    padded = np.pad(walls, [(1, 1) if n == axis else (0, 0) for n in range(3)])
-    parts = [np.take(padded, range(start, start + walls.shape[axis]), axis) for start in range(3)]
-    return np.asarray(np.any(parts, axis=0))
+    return np.asarray(_neighbors(walls, axis, 1).any(axis=0))
+
+
+def _neighbors(voxels: NDArray[np.bool_], axis: int, reach: int) -> NDArray[np.bool_]:
+    """(2 reach + 1, X, Y, Z) the voxels moved along an axis by up to ``reach``."""
+    padded = np.pad(voxels, [(reach, reach) if n == axis else (0, 0) for n in range(3)])
+    starts = range(2 * reach + 1)
+    return np.stack([np.take(padded, range(start, start + voxels.shape[axis]), axis) for start in starts])
 
 
 def measure_runs(occupied: NDArray[np.bool_], axis: int) -> NDArray[np.int64]:
