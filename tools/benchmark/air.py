@@ -72,7 +72,8 @@ def _occupied(looks: Sequence[PosedFrame], change: Change | None, evidence: bool
     from freeocc3d.settings import config
 
     changed = list(disturb(looks, change))
-    poses = np.stack([look.T_world_cam for look in looks[::_GROUP]])
+    first = np.unique([look.keyframe for look in looks], return_index=True)[1]
+    poses = np.stack([looks[n].T_world_cam for n in first])
     settings = config.resolve({"gaussians": {"denoise": evidence}})
     cells = anchors.AnchoredCells(settings.gaussians, 0.5 * settings.occupancy.voxel_size, poses)
     for look in changed:
