@@ -9,6 +9,7 @@ from scipy.linalg import expm
 
 from freeocc3d.capture import open_capture
 from freeocc3d.core.depth_noise import compute_sensor_sigma
+from freeocc3d.core.depth_sensors import STRUCTURED_LIGHT
 from freeocc3d.core.transforms import invert, measure_pose_difference, quats_to_rotations
 from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.tracking.rgbd import dense_alignment, orb_features
@@ -278,7 +279,8 @@ def test_a_stated_standard_deviation_is_averaged_where_there_is_depth() -> None:
     view = prepare_alignment_view(wide)
     known = view.points[..., 2] > 0
     np.testing.assert_allclose(view.sigma_m[known & (view.sigma_m > 0)], 0.01, rtol=1e-5)
-    assert prepare_alignment_view(wall_frame(2.0)).sigma_m.size == 0
+    unstated = prepare_alignment_view(wall_frame(2.0)).sigma_m
+    np.testing.assert_array_equal(unstated, STRUCTURED_LIGHT.coefficients)
 
 
 def test_gain_and_offset_are_eliminated_as_a_full_solution_would() -> None:
