@@ -19,6 +19,7 @@ from freeocc3d.capture import open_capture
 from freeocc3d.core.errors import CaptureError, ConfigError, FreeOccError, MapError, TrackingError
 from freeocc3d.core.progress import Progress
 from freeocc3d.core.threads import count_threads
+from freeocc3d.core.transforms import transform
 from freeocc3d.core.types import FREE, OCCUPIED
 from freeocc3d.settings import config
 from freeocc3d.storage import map_files
@@ -53,8 +54,9 @@ def test_another_number_of_threads_makes_the_same_map(tmp_path, room) -> None:
 def test_the_rooms_poses_are_right(room) -> None:
     capture = open_capture("builtin:room", *_synthetic())
     first = np.linalg.inv(capture.pose(int(room.trajectory.keyframes[0])))
+    T_first_map = np.array(room.manifest.T_first_camera)
     for i in range(24):
-        error = np.linalg.inv(first @ capture.pose(i)) @ room.trajectory.T_world_cam[i]
+        error = np.linalg.inv(first @ capture.pose(i)) @ T_first_map @ room.trajectory.T_world_cam[i]
         assert np.linalg.norm(error[:3, 3]) < 0.03
 
 
@@ -229,6 +231,7 @@ def test_labels_of_the_capture_answer_by_class(tmp_path) -> None:
     assert found.matched
     truth = np.load(data_folder() / "house" / "bedroom" / "ground_truth.npz")
     centers = made.occupancy.centers(made.occupancy.occupied_voxels()[found.regions[0].rows])
+    centers = transform(np.array(made.manifest.T_world_map), centers)
     voxel = np.floor((centers - truth["origin"]) / truth["voxel_size"]).astype(int)
     labels = truth["labels"][tuple(voxel.T)]
     bed = truth["classes"].tolist().index("bed")
@@ -270,8 +273,9 @@ def test_poses_of_another_system_make_a_map(tmp_path) -> None:
     }
     made = freeocc3d.reconstruct(capture, tmp_path / "map", settings)
     assert made.manifest.counts.frames_with_pose == 10
-    np.testing.assert_allclose(made.trajectory.T_world_cam[8], poses[8], atol=1e-5)
-    assert made.manifest.frame.startswith("world frame of the trajectory file")
+    T_world_cam = np.array(made.manifest.T_world_map) @ made.trajectory.T_world_cam[8]
+    np.testing.assert_allclose(T_world_cam, poses[8], atol=1e-5)
+    assert made.manifest.world.startswith("world frame of the trajectory file")
 
 
 def test_a_color_camera_of_another_focal_length_is_reported_and_corrected(tmp_path) -> None:
