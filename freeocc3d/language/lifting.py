@@ -8,7 +8,8 @@ only the keyframes that show most (``keyframe_choice``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +40,7 @@ def lift_features(
     fusion = FeatureFusion(len(gaussians), encoder.dimension, options.disagreement)
     chosen = choose_encoded_keyframes(gaussians, frames, T_world_cam, options)
     progress.stage("language", len(chosen))
-    for done, row in enumerate(chosen, start=1):
-        frame = frames[row]
+    for done, (row, frame) in enumerate(_decode_ahead(frames, chosen), start=1):
         try:
             features = encode_finite(encoder, frame)
         except FrameError as error:
@@ -49,6 +49,17 @@ def lift_features(
             fusion.add(find_visible(gaussians, frame, T_world_cam[row], options), features)
         progress.advance(done)
     return fusion.features()
+
+
+def _decode_ahead(frames: Sequence[Frame], rows: Sequence[int]) -> Iterator[tuple[int, Frame]]:
+    """Yields each row with its frame, while another thread decodes the next one."""
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="keyframes") as pool:
+        following = [pool.submit(frames.__getitem__, row) for row in rows[:1]]
+        for row, after in zip(rows, [*rows[1:], None], strict=True):
+            frame = following.pop().result()
+            if after is not None:
+                following.append(pool.submit(frames.__getitem__, after))
+            yield row, frame
 
 
 def encode_finite(encoder: Encoder, frame: Frame) -> NDArray[np.float16]:

@@ -193,6 +193,7 @@ class ColorEncoder(Encoder):
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16."""
         import cv2
+        import torch
 
         rgb, stride = frame.color, self.options.stride
         height, width = -(-rgb.shape[0] // stride), -(-rgb.shape[1] // stride)
@@ -206,7 +207,9 @@ class ColorEncoder(Encoder):
         for row in range(samples):
             for column in range(samples):
                 total += self._table[entry[row::samples, column::samples]]
-        return np.sqrt(total / samples**2).astype(np.float16)
+        total *= np.float32(1 / samples**2)
+        halves = torch.from_numpy(np.sqrt(total, out=total)).to(torch.float16)  # NumPy takes 30 times as long
+        return np.asarray(halves.numpy(), np.float16)
 
     def text_state(self) -> dict[str, Any]:
         return {"terms": list(TERMS), "colors": list(CENTROIDS)}
