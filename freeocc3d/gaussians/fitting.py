@@ -40,6 +40,8 @@ _RATES = {"outline": 0.03, "turn": 0.03, "shape": 0.03, "quats": 0.015, "means":
 passes to the same PSNR on house/bedroom."""
 _LAST_DECAY = 0.1
 """During the last pass, steps shrink to this share of their size."""
+_LARGE = 2
+"""Time of a step with a view of the full width, over that with one of half the width."""
 _JUDGES = 8
 """Largest number of views, of those that are not fitted to, that tell whether a pass improves anything."""
 _PATIENCE = 2
@@ -58,12 +60,15 @@ def fit_gaussians(
     options: Options,
     passes: int,
     progress: Callable[[int], None] = lambda done: None,
+    most: float = math.inf,
 ) -> Gaussians:
     """Returns the Gaussians after at most ``passes`` over some of the views in random order (always the same), without
-    those that became invisible. progress: called with the number of rendered images."""
+    those that became invisible. progress: called with the number of rendered images.  most: renderings of half the
+    width, of which a full one counts as ``_LARGE``; passes are left out that exceed them, but for the last."""
     chosen = choose_views(gaussians, views) if passes else []
     if not chosen:
         return gaussians
+    passes = max(1, int(min(passes, 1 + most / len(chosen) - _LARGE)))
     others = sorted(set(range(len(views))) - set(chosen)) or chosen
     judges = [halve_view(views[others[n]]) for n in spread_evenly(len(others), _JUDGES)]
     with _one_torch_thread():

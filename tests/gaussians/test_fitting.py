@@ -189,3 +189,12 @@ def test_shapes_and_opacities_stay_within_their_bounds(means: str) -> None:
         change = torch.exp(-2 * now["outline"])
         restored = (before * change / change.mean(dim=1, keepdim=True)).mean(dim=1)
         torch.testing.assert_close(precision, restored, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(("most", "expected"), [(np.inf, 5 * 3), (12, 3 * 3), (3, 3)])
+def test_renderings_are_limited_but_for_the_last_pass(most: float, expected: int) -> None:
+    """The last pass over three views counts as six small renderings, each pass before it as three."""
+    frames, poses = walls()
+    g, views, done = lifted(frames, poses), seen(frames, poses), []
+    fitting.fit_gaussians(g, views, RASTERIZER, fitting.Options(), 5, done.append, most)
+    assert done == list(range(1, expected + 1))
