@@ -15,7 +15,7 @@ from fuzz._damage import damage, damage_archive, damage_folder, replace
 from fuzz._scans import write_scans
 from fuzz.harness import Attack, Silent
 
-SHORT = 40
+SHORT = 60
 
 FRAMES = 4
 READERS = ("scannet", "replica", "seven_scenes", "nerfstudio", "lidar", "colmap_txt", "colmap_bin", "photos")

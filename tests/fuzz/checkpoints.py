@@ -22,7 +22,7 @@ from freeocc3d.storage.work_folder import WorkFolder
 
 from .harness import Attack, Silent
 
-SHORT = 2
+SHORT = 3
 
 SETTINGS: dict[str, Any] = {
     "capture": {"synthetic": {"frames": 120, "width": 96, "height": 72}, "stop": 12, "color_focal": 1},

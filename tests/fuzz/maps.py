@@ -32,7 +32,7 @@ from freeocc3d.settings import registry
 from . import mutators
 from .harness import Attack, Silent, command
 
-SHORT = 30
+SHORT = 40
 
 _SETTINGS: dict[str, Any] = {
     "capture": {"stop": 8, "color_focal": 1, "synthetic": {"frames": 60, "width": 80, "height": 60}},

@@ -22,7 +22,7 @@ from freeocc3d.settings.typed_options import field_types
 from . import mutators
 from .harness import Attack, command
 
-SHORT = 40
+SHORT = 60
 
 _TINY: dict[str, Any] = {
     "capture": {"stop": 5, "color_focal": 1, "synthetic": {"frames": 60, "width": 64, "height": 48}},

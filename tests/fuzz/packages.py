@@ -28,7 +28,7 @@ from freeocc3d.tracking.sfm.local_features import KeypointNetwork
 from . import mutators
 from .harness import Attack, Silent
 
-SHORT = 40
+SHORT = 60
 
 _D, _WORDS, _PATCH = 8, 40, 8
 _F, _I = TensorProto.FLOAT, TensorProto.INT64

@@ -24,7 +24,7 @@ from .harness import Attack, Silent
 sys.path.append(str(Path(__file__).parents[1] / "helpers"))
 from hostile_servers import Connection, attacking
 
-SHORT = 20
+SHORT = 30
 
 _TIMEOUT_S = 0.25
 _REPOSITORY = "someone/tiny"
