@@ -88,11 +88,12 @@ def test_with_a_scale_given_from_the_start_the_map_is_metric(scan: Path, tmp_pat
     assert "scale-unknown" not in codes(scan_map)
     assert config.load_saved(scan_map.path / "config.yaml").gaussians.cell_size is None
     room = open_capture("builtin:room", None, ROOM)
-    centers = scan_map.trajectory.T_world_cam[:, :3, 3]
+    T_world_map = np.array(scan_map.manifest.T_world_map)
+    centers = transform(T_world_map, scan_map.trajectory.T_world_cam[:, :3, 3])
     np.testing.assert_allclose(centers, [room.pose(index)[:3, 3] for index in range(36)], atol=1e-5)
     truth = room.ground_truth(0.08)  # type: ignore[attr-defined]
     occupied = truth["origin"] + (np.argwhere((truth["labels"] > 0) & (truth["labels"] != 255)) + 0.5) * 0.08
-    found = scan_map.occupancy.centers(scan_map.occupancy.occupied_voxels())
+    found = transform(T_world_map, scan_map.occupancy.centers(scan_map.occupancy.occupied_voxels()))
     near = np.array([np.abs(occupied - center).max(axis=1).min() for center in found[::20]])
     assert (near < 0.16).mean() > 0.9
 
