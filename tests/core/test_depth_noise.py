@@ -7,7 +7,9 @@ import pytest
 from scenes import wall_frame, with_sigma
 
 from freeocc3d.core.depth_noise import compute_sensor_sigma, compute_sigma_image, look_up_sigma, take_sigma
-from freeocc3d.core.depth_sensors import SENSORS, STEREO, STRUCTURED_LIGHT, TIME_OF_FLIGHT, find_sensor
+from freeocc3d.core.depth_sensors import AUTO, SENSORS, STEREO, STRUCTURED_LIGHT, TIME_OF_FLIGHT, find_sensor
+from freeocc3d.core.errors import ConfigError
+from freeocc3d.settings import config
 
 
 @pytest.mark.parametrize("stated", [None, *SENSORS])
@@ -26,5 +28,12 @@ def test_sensors_have_the_noise_of_their_sources() -> None:
     np.testing.assert_allclose(compute_sensor_sigma(z, TIME_OF_FLIGHT), kinect_v2, rtol=0.01)
     subpixel, focal, baseline = 0.08, 425, 0.05
     np.testing.assert_allclose(compute_sensor_sigma(z, STEREO) - 5e-4, subpixel * z**2 / (focal * baseline), rtol=0.02)
-    assert find_sensor("auto") is STRUCTURED_LIGHT
+    assert find_sensor(AUTO) is STRUCTURED_LIGHT
     assert find_sensor("stereo") is STEREO
+
+
+def test_every_sensor_can_be_chosen() -> None:
+    for name in (AUTO, *SENSORS):
+        assert config.resolve({"capture": {"sensor": name}}).capture.sensor == name
+    with pytest.raises(ConfigError, match=r"'capture\.sensor' must be"):
+        config.resolve({"capture": {"sensor": "sonar"}})
