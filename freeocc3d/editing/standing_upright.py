@@ -100,7 +100,7 @@ def _build_occupancy(
         read_keyframes(scan_map, poses),
         options,
         settings.carving,
-        origin=find_lattice_origin(patches, size, finest is not None),
+        origin=find_lattice_origin(patches, size),
         progress=progress.advance,
         least_scale=anchors.compute_least_scale(settings.gaussians, cell_size, size),
     )

@@ -112,8 +112,8 @@ class Mapper:
         cameras = [camera for _, camera in keyframes.views()]
         patches = find_surface_patches(zip(map(keyframes.depth_m, range(len(keyframes))), cameras, poses, strict=True))
         self.upright = find_upright_frame(turn_back(poses, turned), patches)
-        options, upright = self.settings.occupancy, patches.moved(self.upright.T_upright_world)
-        self.origin = find_lattice_origin(upright, options.voxel_size, options.finest is not None)
+        voxel_size = self.settings.occupancy.voxel_size
+        self.origin = find_lattice_origin(patches.moved(self.upright.T_upright_world), voxel_size)
         self.refined = True
 
     @property

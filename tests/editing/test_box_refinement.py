@@ -11,6 +11,7 @@ from msgspec import structs
 from freeocc3d.capture.builtin.builtin_room import CUP_HEIGHT, CUPS
 from freeocc3d.core.errors import MapError
 from freeocc3d.core.progress import Progress
+from freeocc3d.core.transforms import invert, transform
 from freeocc3d.core.types import FREE
 from freeocc3d.editing import box_refinement
 from freeocc3d.language.encoders import color
@@ -20,6 +21,13 @@ from freeocc3d.query.scan_map import Map
 RED, YELLOW = (np.array(CUPS[name]) + (0, 0, 0.5 * CUP_HEIGHT) for name in ("red", "yellow"))
 """Middles of the two cups, which stand on a table of 75 cm."""
 MIDDLE, REACH = 0.5 * (RED + YELLOW), np.array((0.2, 0.2, 0.1))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _in_the_maps_frame(room: Map) -> None:
+    """Moves the places of the cups into the frame of the room's map."""
+    for place in (RED, YELLOW, MIDDLE):
+        place[:] = transform(invert(np.array(room.manifest.T_world_map)), place)
 
 
 @pytest.fixture(scope="module")

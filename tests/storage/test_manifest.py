@@ -98,6 +98,8 @@ def test_a_map_from_before_scales_and_gravity_frames_is_read(tmp_path: Path) -> 
         ("up", [0.0, 0.0, 0.0], "'up' is not a unit vector"),
         ("up", [0.0, 0.0, 1e300], "'up' is not a unit vector"),
         ("T_gravity_map", [[1.0, 0, 0, 1e300], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]], "'T_gravity_map'"),
+        ("T_first_camera", [[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1.0]], "'T_first_camera'"),
+        ("upright", {"by": "floor"}, "'upright' lacks 'off_deg'"),
         ("keyframes", [2, 0], "'keyframes' are not frames of the capture in ascending order"),
         ("keyframes", [0, 0], "'keyframes' are not frames of the capture in ascending order"),
         ("keyframes", [0, 240], "'keyframes' are not frames of the capture in ascending order"),

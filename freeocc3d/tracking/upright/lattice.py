@@ -15,14 +15,13 @@ _NEAR_FACE = 0.15
 wall at 2 m, averaged over frames, is less than this part of a voxel of 4 cm."""
 
 
-def find_lattice_origin(upright: SurfacePatches, voxel_size: float, several_sizes: bool = False) -> NDArray[np.float64]:
+def find_lattice_origin(upright: SurfacePatches, voxel_size: float) -> NDArray[np.float64]:
     """Returns (3,) the lower corner of voxel (0, 0, 0) in an upright frame, meters, within one voxel of its origin.
 
-    upright: patches in that frame.  several_sizes: whether voxels will be halved. z = 0 lies in the middle of a layer;
-    if voxels are halved, at a third of it, and so at a third or two thirds of the layers of every size. Along x and y,
-    the fewest walls lie near faces between layers. Without walls, x = y = 0 is the middle of a voxel.
+    upright: patches in that frame. z = 0 lies in the middle of a layer. Along x and y, the fewest walls lie near faces
+    between layers. Without walls, x = y = 0 is the middle of a voxel.
     """
-    origin = np.array((-0.5, -0.5, -1 / 3 if several_sizes else -0.5))
+    origin = np.full(3, -0.5)
     for axis in (0, 1):
         across = np.abs(upright.normals[:, axis]) > _FACING
         if across.any():
