@@ -10,14 +10,10 @@ EVERY = 10
 
 def measure_held_out(loaded: Any) -> dict[str, Any]:
     """PSNR and depth error on every tenth frame that has a pose and is not a keyframe, at the map's own poses."""
-    from freeocc3d.capture.focal_correction import Reregistered
     from freeocc3d.gaussians import fitting, rendered_views
     from freeocc3d.gaussians.rasterizers import cpu
 
     capture, trajectory = loaded.capture, loaded.trajectory
-    ratio = loaded.report.get("color_focal", 1.0)
-    if ratio != 1:
-        capture = Reregistered(capture, ratio)
     keyframes = set(trajectory.keyframes.tolist())
     rows = [n for n in range(0, len(trajectory), EVERY) if trajectory.has_pose[n] and n not in keyframes]
     rasterizer, width = cpu.load(), fitting.Options().width
