@@ -32,6 +32,9 @@ from .scored_classes import ClassMap
 from .trajectory_errors import TrajectoryErrors, describe_few_matches, measure_trajectory_errors
 from .true_occupancy import GroundTruth
 
+_PAPERS = "occupancy.projection=probabilistic"
+"""Gaussians of other systems become voxels by the paper's equations: they are no discs on a surface."""
+
 
 @dataclass(frozen=True)
 class ScoredScene:
@@ -112,7 +115,7 @@ def score_gaussians(
     gaussians, labels = read_standard_ply(ply)
     semantics = predictions.encode_one_hot(labels, classes, ply)
     predicted = predictions.predict_from_gaussians(
-        gaussians, semantics, config.load(None, list(overrides)), alignment, truth
+        gaussians, semantics, config.load(None, [_PAPERS, *overrides]), alignment, truth
     )
     notes = [] if labels is not None else [f"The Gaussians of {ply.name} have no classes: mIoU is not available."]
     return _other(ply, truth, predicted, alignment, errors, trajectory, poses, notes)
@@ -123,7 +126,7 @@ def score_frames(
 ) -> ScoredScene:
     """Scores per-frame Gaussians fused by true poses (``predictions.predict_from_frames``)."""
     predicted, fused = predictions.predict_from_frames(
-        folder, poses, config.load(None, list(overrides)), truth, classes
+        folder, poses, config.load(None, [_PAPERS, *overrides]), truth, classes
     )
     notes = [f"The Gaussians of {fused} frames were fused by true poses."]
     scene = _other(folder, truth, predicted, TrajectoryAlignment.identity(), None, None, poses, notes)

@@ -1,10 +1,11 @@
-"""Lifts keyframe depth to Gaussians: one per surface cell, aligned with its viewing ray and anchored to a keyframe.
+"""Lifts keyframe depth to Gaussians: one per surface cell, a thin disc on the surface, anchored to a keyframe.
 
 Dense pixels do not become Gaussians of their own: a wall seen by a hundred keyframes would be a hundred layers thick,
 which saturates the occupancy product and fills memory. Instead, the measurements in a cell are averaged, weighted by
 their depth uncertainty. The averages move to the surface that all depth maps together show (``denoising``) and are
-averaged by cell again. Each result is anchored to the keyframe that measures it best. The number of Gaussians grows
-with the surface, not with the number of frames.
+averaged by cell again, and to the planes of their neighbors as far as they are less certain (``local_planes``). Each
+result is anchored to the keyframe that measures it best. The number of Gaussians grows with the surface, not with the
+number of frames.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from ..core.transforms import invert, multiply_quats, rotations_to_quats
 from ..core.types import Frame, Gaussians, PosedFrame
 from ..settings.stages import GaussianOptions as Options
 from . import denoising
+from .local_planes import fit_planes
 from .surface_cells import Cells, CellSums
 
 _COLUMNS = 320
@@ -82,15 +84,26 @@ class AnchoredCells:
         cells = cells[cells.pixels >= np.minimum(self.options.min_pixels, np.floor(possible))]
         if self.options.denoise:
             cells = self._denoised(cells, frames)
-        T_world_keyframe = self._T_world_keyframe
-        anchor_cam = _move_each(invert(T_world_keyframe), cells.keyframe, cells.points.astype(np.float32))
-        spacing = np.hypot(
-            np.maximum(self.cell_size, cells.footprint), self.options.uncertainty / np.sqrt(cells.weights)
-        )
+        return self._initialized(cells)
+
+    def _initialized(self, cells: Cells) -> Gaussians:
+        """The Gaussians of the cells, with the shapes that ``initialization`` names."""
+        kind, T_world_keyframe = self.options.initialization, self._T_world_keyframe
+        spacing, sigma_m = np.maximum(self.cell_size, cells.footprint), 1.0 / np.sqrt(cells.weights)
+        points, planes = cells.points, None
+        if kind == "disc":
+            rays = points - T_world_keyframe[cells.keyframe, :3, 3]
+            planes = fit_planes(points, sigma_m, rays, spacing)
+            points = planes.points
+        else:
+            spacing = np.hypot(spacing, self.options.uncertainty * sigma_m)
+        anchor_cam = _move_each(invert(T_world_keyframe), cells.keyframe, points.astype(np.float32))
         colors = np.rint(cells.colors).astype(np.uint8)
         s_perp = (self.options.coverage * spacing).astype(np.float32)
         made = align_to_rays(anchor_cam, cells.keyframe, T_world_keyframe, s_perp, colors, self.options)
-        return make_isotropic(made) if self.options.initialization == "isotropic" else made
+        if planes is not None:
+            return lay_discs(made, planes.normals, planes.sigma_m)
+        return make_isotropic(made) if kind == "isotropic" else made
 
     def _denoised(self, cells: Cells, frames: Iterable[PosedFrame]) -> Cells:
         """Moves the points of the cells to the surface that all depth maps show, and averages them by their new
@@ -166,6 +179,16 @@ def align_to_rays(
         anchor_keyframe=anchor_keyframe,
         anchor_cam=anchor_cam,
     )
+
+
+def lay_discs(gaussians: Gaussians, normals: NDArray[np.float64], sigma_m: NDArray[np.float64]) -> Gaussians:
+    """Returns the Gaussians as discs: local +z along their (N, 3) unit normals, world, and s = (s_perp, s_perp,
+    s_normal), where s_normal is the (N,) standard deviations of their places, meters."""
+    normals = np.where(normals[:, 2:] < 0, -normals, normals)  # an ellipsoid has no sign: the shortest rotation from +z
+    quats = np.stack((1 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))), axis=1)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    scales = np.stack((*gaussians.scales[:, :2].T, sigma_m), axis=1)
+    return replace(gaussians, quats_wxyz=quats.astype(np.float32), scales=scales.astype(np.float32))
 
 
 def make_isotropic(gaussians: Gaussians) -> Gaussians:

@@ -15,8 +15,14 @@ after the last one that shows it: it has left. If only few frames show it,
 then frames whose pixel has no depth there count a little, too: a sensor misses black, shiny and slanted surfaces often,
 but not always. And what a single frame shows holds only if few others could have shown it.
 
+Where poses are exact, a frame that sees through a point looks past an edge, and says nothing of where the surface is.
+Where they are not, it may as well be registered wrongly. So it counts as a distance of twice the reach, with the share
+tau^2 / (tau^2 + sigma^2) of its weight. tau is the registration error: what the distances of all points scatter more
+than their depths' noise explains (median of the points; 0 in the rendered captures, about a centimeter with a Kinect's
+given poses).
+
 Source: B. Curless, M. Levoy, A Volumetric Method for Building Complex Models from Range Images, SIGGRAPH 1996 (the
-weighted mean of projective distances).
+weighted mean of projective distances, cut off in front of the surface).
 """
 
 from __future__ import annotations
@@ -30,14 +36,14 @@ from numba import prange
 from numpy.typing import NDArray
 
 from ..core.compiling import njit
-from ..core.depth_noise import compute_sigma_image, look_up_sigma, take_sigma
+from ..core.depth_noise import compute_sensor_sigma, look_up_sigma, take_sigma
 from ..core.transforms import invert
 from ..core.types import PosedFrame
 from .depth_edges import is_at_edge, mask_away_from_edges
 
-_REACH_M, _REACH_PER_M = 0.03, 0.01
-"""A depth map shows a point if it ends within the first value of it, plus the second value times the squared depth.
-This covers noise and pose errors. Half or twice either value changes IoU by less than one point on the shipped
+_REACH_M, _REACH_SIGMAS = 0.05, 3.0
+"""A depth map shows a point if it ends within this many meters of it, plus this many standard deviations of its depth:
+pose errors, and 99.7 % of the noise. Half or twice the first value changes IoU by less than one point on the shipped
 captures."""
 
 _SURE = 6
@@ -60,6 +66,19 @@ thing that has left. Of the points of still rooms, less than one in a thousand h
 _OTHERS = 3
 """Frames that may fail to confirm what a single frame shows."""
 
+_BEYOND = 2.0
+"""Reaches that a frame which sees through a point counts as its distance."""
+
+_ENOUGH = 8
+"""Frames that show a point whose distances' scatter is used for the registration error."""
+
+_MOST_NEEDED, _SHARE_NEEDED = 3, 1 / 25
+"""Where frames are many, a point needs this share of those that show a usual point, but not more than the first value:
+stray depth repeats in few frames, a surface in many."""
+
+_SUMS = 10
+"""Columns of a point's sums."""
+
 _NEAREST_M = 1e-3
 """Smallest depth of a point that a camera shows, meters: projection divides by the depth."""
 
@@ -68,8 +87,9 @@ _NEAREST_M = 1e-3
 class DenoisedPoints:
     """N points and what the depth maps show of them.
 
-    points: (N, 3) float64 world, meters.  weights: (N,) sums of 1 / sigma^2, 0 if no image shows the point.
-    best: (N,) the largest of these terms.  keyframe: (N,) int32 the keyframe of the frame that gives it (-1: none).
+    points: (N, 3) float64 world, meters.  weights: (N,) 1 over the variance of the mean distance along the ray, m^-2; 0
+    if no image shows the point.
+    best: (N,) the largest 1 / sigma^2.  keyframe: (N,) int32 the keyframe of the frame that gives it (-1: none).
     kept: (N,) bool, false if the evidence against the point outweighs the images that show it.
     """
 
@@ -94,19 +114,18 @@ def denoise(
     times itself.  reach_m: the greatest depth of any frame. Beyond, a pixel without depth says nothing.
     """
     n = len(points)
-    moved, weights, best = np.zeros((n, 3)), np.zeros(n), np.zeros(n)
+    sums, best, keyframe = np.zeros((n, _SUMS)), np.zeros(n), np.full(n, -1, np.int32)
     shown, through, blank, past = np.zeros((4, n), np.int32)
-    keyframe = np.full(n, -1, np.int32)
     for frame, T_world_cam, row in frames:
         camera, depth_m = frame.intrinsics, frame.depth_m
         T_cam_world = invert(T_world_cam)
         _look(
             points, directions, depth_m, take_sigma(frame), edge, reach_m, T_cam_world[:3, :3].copy(),
-            T_cam_world[:3, 3].copy(), (camera.fx, camera.fy, camera.cx, camera.cy), row, moved, weights, shown,
-            through, blank, past, best, keyframe,
+            T_cam_world[:3, 3].copy(), (camera.fx, camera.fy, camera.cx, camera.cy), row, sums, shown, through, blank,
+            past, best, keyframe,
         )  # fmt: skip
-    points = points + moved / np.where(weights > 0, weights, 1.0)[:, None]
-    return DenoisedPoints(points, weights, best, keyframe, are_surfaces(shown, through, blank, past))
+    offset, weights = weigh(sums, shown)
+    return DenoisedPoints(points + offset, weights, best, keyframe, are_surfaces(shown, through, blank, past))
 
 
 def are_surfaces(
@@ -117,7 +136,37 @@ def are_surfaces(
     against = through + np.where(shown < _SURE, _BLANK * blank, 0.0)
     alone = (shown < 2) & (through + blank > _OTHERS)
     left = past >= np.maximum(_LEFT, _LEFT_SHARE * shown)
-    return np.asarray((against <= np.maximum(shown, 1)) & ~alone & ~left)
+    few = shown < _count_needed(shown)
+    return np.asarray((against <= np.maximum(shown, 1)) & ~alone & ~left & ~few)
+
+
+def weigh(sums: NDArray[np.float64], shown: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the (N, 3) moves of the points, meters, and their (N,) weights. sums: (N, 10) as ``_look`` makes them.
+    shown: (N,) frames that show each point."""
+    weight = sums[:, 3]
+    seen = weight > 0
+    variance = np.divide(shown, weight, out=np.ones(len(sums)), where=seen)  # of a usual frame's depth
+    registration = _estimate_registration(sums, shown, variance) ** 2
+    share = registration / (registration + variance)
+    total = np.where(seen, weight + share * sums[:, 9], 1.0)
+    offset = np.where(seen[:, None], (sums[:, :3] + share[:, None] * sums[:, 6:9]) / total[:, None], 0.0)
+    return offset, np.where(seen, shown / (variance + registration), 0.0)
+
+
+def _estimate_registration(sums: NDArray[np.float64], shown: NDArray[np.int32], variance: NDArray[np.float64]) -> float:
+    """Returns tau, meters; 0 if no point is shown by enough frames."""
+    enough = shown >= _ENOUGH
+    if not enough.any():
+        return 0.0
+    count, weight = shown[enough], sums[enough, 3]
+    scatter = (sums[enough, 5] - sums[enough, 4] ** 2 / weight) / weight * count / (count - 1)
+    return float(np.sqrt(max(np.median(scatter - variance[enough]), 0.0)))
+
+
+def _count_needed(shown: NDArray[np.int32]) -> int:
+    """Returns the number of frames that have to show a point."""
+    usual = float(np.median(shown[shown > 0])) if shown.any() else 0.0
+    return min(_MOST_NEEDED, int(_SHARE_NEEDED * usual))
 
 
 @njit(parallel=True, cache=True)
@@ -132,8 +181,7 @@ def _look(
     t: NDArray[np.float64],
     camera: tuple[float, float, float, float],
     row: int,
-    moved: NDArray[np.float64],
-    weight: NDArray[np.float64],
+    sums: NDArray[np.float64],
     shown: NDArray[np.int32],
     through: NDArray[np.int32],
     blank: NDArray[np.int32],
@@ -141,7 +189,9 @@ def _look(
     best: NDArray[np.float64],
     keyframe: NDArray[np.int32],
 ) -> None:
-    """Adds what one depth map shows of each point."""
+    """Adds what one depth map shows of each point. sums: (N, 10), for frames that show a point of weighted
+    offsets x, y, z, weights, weighted distances and their squares; for those that see through it of weighted offsets x,
+    y, z and weights."""
     fx, fy, cx, cy = camera
     height, width = depth_m.shape
     for n in prange(len(points)):
@@ -160,38 +210,45 @@ def _look(
             continue
         if is_at_edge(depth_m, line, column, edge):
             continue
-        reach = _REACH_M + _REACH_PER_M * z * z
+        sigma = look_up_sigma(sigma_m, line, column, z)
+        reach = _REACH_M + _REACH_SIGMAS * sigma
         beyond = depth - z
-        if beyond > reach:
-            through[n] += 1
-            past[n] += beyond > _FAR * reach
-        elif beyond >= -reach:  # else something in front hides it
-            ray = (
-                R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
-                R[0, 1] * x + R[1, 1] * y + R[2, 1] * z,
-                R[0, 2] * x + R[1, 2] * y + R[2, 2] * z,
-            )
-            if ray[0] * directions[n, 0] + ray[1] * directions[n, 1] + ray[2] * directions[n, 2] <= 0:
-                continue  # it shows the other side
-            sigma = look_up_sigma(sigma_m, line, column, depth)
-            w = 1.0 / (sigma * sigma)
-            step = w * beyond / z
-            for i in range(3):
-                moved[n, i] += step * ray[i]
-            weight[n] += w
-            shown[n] += 1
-            past[n] = 0
-            if w > best[n]:
-                best[n], keyframe[n] = w, row
+        if beyond < -reach:
+            continue  # something in front hides it
+        passes = beyond > reach
+        through[n] += passes
+        past[n] += beyond > _FAR * reach
+        ray = (
+            R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
+            R[0, 1] * x + R[1, 1] * y + R[2, 1] * z,
+            R[0, 2] * x + R[1, 2] * y + R[2, 2] * z,
+        )
+        if ray[0] * directions[n, 0] + ray[1] * directions[n, 1] + ray[2] * directions[n, 2] <= 0:
+            continue  # it shows the other side
+        w = 1.0 / (sigma * sigma)
+        distance = _BEYOND * reach if passes else beyond
+        first = 6 if passes else 0
+        for i in range(3):
+            sums[n, first + i] += w * distance / z * ray[i]
+        if passes:
+            sums[n, 9] += w
+            continue
+        sums[n, 3] += w
+        sums[n, 4] += w * beyond
+        sums[n, 5] += w * beyond * beyond
+        shown[n] += 1
+        past[n] = 0
+        if w > best[n]:
+            best[n], keyframe[n] = w, row
 
 
 def look_reference(
     points: NDArray[np.float64], directions: NDArray[np.float64], posed: PosedFrame, edge: float, reach_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """What one depth map shows of (N, 3) points, in plain NumPy: (N, 3) weighted offset, (N,) weight, (N,) how far it
-    sees through the point in units of the reach, 0 if it does not, and (N,) whether it has no depth there."""
-    camera, measured_m = posed.frame.intrinsics, posed.frame.depth_m
-    depth_m = np.where(mask_away_from_edges(measured_m, edge), measured_m, 0)
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.bool_]]:
+    """What one depth map shows of (N, 3) points, in plain NumPy: the (N, 10) sums, and (N,) whether it shows the point,
+    how far it sees through it in units of the reach, 0 if it does not, and whether it has no depth there."""
+    frame, camera = posed.frame, posed.frame.intrinsics
+    depth_m = np.where(mask_away_from_edges(frame.depth_m, edge), frame.depth_m, 0)
     T = invert(posed.T_world_cam)
     p = points @ T[:3, :3].T + T[:3, 3]
     z = np.where(p[:, 2] < _NEAREST_M, np.nan, p[:, 2])
@@ -201,9 +258,17 @@ def look_reference(
         inside = ((pixel >= 0) & (pixel < (camera.width, camera.height))).all(axis=1)
         column, line = np.where(np.asarray(inside)[:, None], pixel, 0).astype(int).T
         depth = np.where(inside, depth_m[line, column], 0)
-        beyond, reach = depth - z, _REACH_M + _REACH_PER_M * z**2
-        shown = (depth > 0) & (np.abs(beyond) <= reach) & ((ray * directions).sum(axis=1) > 0)
-        weight = np.where(shown, 1.0 / compute_sigma_image(posed.frame)[line, column].astype(np.float64) ** 2, 0.0)
-        offset = np.where(shown, weight * beyond / z, 0.0)[:, None] * ray
-        blank = inside & (measured_m[line, column] <= 0) & (z <= reach_m)
-        return offset, weight, np.where((depth > 0) & (beyond > reach), beyond / reach, 0.0), blank
+        stated = frame.depth_sigma_m
+        sigma = (compute_sensor_sigma(z, frame.sensor) if stated is None else stated[line, column]).astype(np.float64)
+        beyond, reach = depth - z, _REACH_M + _REACH_SIGMAS * sigma
+        shown, through = (depth > 0) & (np.abs(beyond) <= reach), (depth > 0) & (beyond > reach)
+        blank = inside & (frame.depth_m[line, column] <= 0) & (z <= reach_m)
+    front = (ray * directions).sum(axis=1) > 0
+    sums = np.zeros((len(points), _SUMS))
+    for mask, distance, first in ((shown & front, beyond, 0), (through & front, _BEYOND * reach, 6)):
+        weight = 1 / sigma[mask] ** 2
+        sums[mask, first : first + 3] = (weight * distance[mask] / z[mask])[:, None] * ray[mask]
+        sums[mask, first + 3] = weight
+        if first == 0:
+            sums[mask, 4:6] = np.stack((weight * distance[mask], weight * distance[mask] ** 2), axis=1)
+    return sums, shown & front, np.where(through, beyond / reach, 0.0), blank

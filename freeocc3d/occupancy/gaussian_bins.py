@@ -41,9 +41,9 @@ class Bins:
     ``gaussian[start[b]:start[b + 1]]``.  means: (N, 3) float32 in voxels, relative to the lattice's origin.  form: (N,
     6) float32 upper triangle of a matrix: Sigma^-1 in voxels^-2; integrated: Sigma in voxels^2; released: Sigma in
     meters^2, times the squared voxel size in meters.  lo, hi: (N, 3) int32 first and last voxel of the neighborhood's
-    box.  opacities: (N,) float32.  share: (N,) float32 factor of phi.  log_weight: (N,) float32 logarithm of the part
-    of w_k that is the same at all voxels, up to a common constant.  mode, squared_cutoff: of the projection.  device:
-    where the projection runs.
+    box.  opacities: (N,) float32.  share: (N,) float32 factor of phi; integrated: a_k.  log_weight: (N,) float32
+    logarithm of the part of w_k that is the same at all voxels, up to a common constant.  mode, squared_cutoff: of the
+    projection.  device: where the projection runs.
     """
 
     packed: NDArray[np.int64]

@@ -8,13 +8,15 @@ with phi_k(x) = exp(-1/2 (x - mu_k)^T Sigma_k^-1 (x - mu_k)), Sigma_k = R(r_k) d
 
     probabilistic   c_k = phi_k(x): the paper's; opacity plays no part                                         (A)
     poisson         c_k = 1 - exp(-o_k phi_k(x)), so that alpha = 1 - exp(-sum_k o_k phi_k(x))
-    integrated      c_k = the mass of N(mu_k, Sigma_k) within V(x)
+    integrated      c_k = 1 - (1 - m_k(x))^a_k, m_k(x) being the mass of N(mu_k, Sigma_k) within V(x), and a_k the area
+                    that a Gaussian stands for, over that of a cell of half a voxel's edge. For the default cells, a_k
+                    is 1, and c_k the mass; the default
     released        as poisson, with Sigma_k (m^2) in place of Sigma_k^-1: what the paper's code seems to compute. phi
                     is 1 in all of H(x), which amounts to a dilation by H(x); for comparison.
 
 and the features of the voxel are posterior means,
 
-    p(G_k | x) = w_k(x) / sum_j w_j(x),  w_k = N(x; mu_k, Sigma_k) o_k  (integrated: c_k o_k, released: o_k phi_k)   (C)
+    p(G_k | x) = w_k(x) / sum_j w_j(x),  w_k = N(x; mu_k, Sigma_k) o_k  (integrated: m_k o_k, released: o_k phi_k)   (C)
     f(x)       = sum_k p(G_k | x) f_k                                                                          (D)
 
 H(x) holds every k whose Mahalanobis distance to x does not exceed the cutoff. Each c_k that this omits is less than
@@ -25,7 +27,11 @@ than ceil(cutoff s_max / voxel) voxels away.
 Gaussians that are finer than the lattice would fall between the voxels' centers. So a deviation s_ki below a given
 s_min becomes s_min. phi_k is multiplied by the ratio of the areas, (prod_i s_ki / max(s_ki, s_min))^(2/3), so that the
 sum over a surface of Gaussians stays the same. The limit comes from Mip-Splatting (Z. Yu et al., CVPR 2024, Sec. 5.1).
-The weight follows the area because the Gaussians of occupancy lie next to each other on surfaces.
+The weight follows the area because the Gaussians of occupancy lie next to each other on surfaces. Mass needs no limit:
+it is exact at any size.
+
+Why mass: a thin disc tells in which voxels a surface lies, however near it is to their faces, while phi at a voxel's
+center tells how near the center is to the surface. A surface that runs close to a face is one voxel thick, not two.
 """
 
 from __future__ import annotations
@@ -38,10 +44,12 @@ from ..core.types import BLOCK, Gaussians
 from ..core.voxel_keys import KEY_LIMIT
 from ..settings.stages import OccupancyOptions as Options
 from . import splat_kernels
-from .gaussian_bins import INTEGRATED, MODES, POISSON, PROBABILISTIC, RELEASED, Bins, prepare_gaussians, sort_by_block
+from .gaussian_bins import INTEGRATED, MODES, PROBABILISTIC, RELEASED, Bins, prepare_gaussians, sort_by_block
 
 _MOST_TOUCHED = 1 << 28
 """Pairs of a Gaussian and a block that it touches; a Gaussian of a map touches about ten."""
+_SPACED = 0.7
+"""Deviations along a surface over the spacing of its Gaussians (``gaussians.coverage``)."""
 _MOST_OF_EACH, _FEW_TOUCHED = 512, 1 << 20
 """Blocks that Gaussians touch on average, at most, and a number of pairs that takes no time."""
 
@@ -111,9 +119,12 @@ def _refuse_many(lo: NDArray[np.int32], hi: NDArray[np.int32], options: Options)
 def widen_scales(
     scales: NDArray[np.float32], least_scale: float, options: Options
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns (N, 3) deviations of s_min or more, meters, and the (N,) factors of phi. The modes integrated and
-    released need neither."""
-    if least_scale == 0 or MODES[options.projection] not in (PROBABILISTIC, POISSON):
+    """Returns (N, 3) deviations, meters, of s_min or more where the mode needs it, and (N,) factors: of phi, or a_k."""
+    mode = MODES[options.projection]
+    if mode == INTEGRATED:
+        _, middle, most = np.sort(scales, axis=1).T
+        return scales, np.asarray(middle * most / np.float32(_SPACED * 0.5 * options.voxel_size) ** 2, np.float32)
+    if least_scale == 0 or mode == RELEASED:
         return scales, np.ones(len(scales), np.float32)
     wide = np.maximum(scales, np.float32(least_scale))
     return wide, np.asarray((scales / wide).prod(axis=1) ** np.float32(2 / 3), np.float32)
@@ -124,10 +135,10 @@ def compute_probability(bins: Bins, keys: NDArray[np.int32]) -> NDArray[np.float
     if bins.device != "cpu":
         from . import splat_torch
 
-        return splat_torch.compute_probability_torch(bins, keys, bins.mode != PROBABILISTIC)
+        return splat_torch.compute_probability_torch(bins, keys)
     listed = keys, bins.start, bins.gaussian, bins.means, bins.form, bins.lo, bins.hi
     if bins.mode == INTEGRATED:
-        return splat_kernels.splat_mass(*listed)
+        return splat_kernels.splat_mass(*listed, bins.share)
     return splat_kernels.splat_probability(
         *listed, bins.opacities, bins.share, bins.squared_cutoff, bins.mode != PROBABILISTIC
     )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.compiling import njit
 from ..core.half_floats import widen_halves
 from ..core.types import BLOCK
-from .gaussian_mass import integrate_boxes
+from .gaussian_mass import count_points, measure_boxes
 
 
 @njit(parallel=True, cache=True)
@@ -65,6 +65,7 @@ def splat_mass(
     covariance: NDArray[np.float32],
     lo: NDArray[np.int32],
     hi: NDArray[np.int32],
+    share: NDArray[np.float32],
 ) -> NDArray[np.float32]:
     alpha = np.empty((len(keys), BLOCK**3), np.float32)
     for b in prange(len(keys)):
@@ -72,11 +73,13 @@ def splat_mass(
         for pair in range(start[b], start[b + 1]):
             g = gaussian[pair]
             i0, j0, k0, i1, j1, k1 = _window(keys[b], lo[g], hi[g])
-            integrate_boxes(means[g], covariance[g], keys[b], i0, j0, k0, i1, j1, k1, mass)
+            count = count_points(lo[g], hi[g])
+            measure_boxes(means[g], covariance[g], count, keys[b], (i0, j0, k0), (i1, j1, k1), mass)
             for i in range(i0, i1):
                 for j in range(j0, j1):
                     for k in range(k0, k1):
-                        survival[(i * BLOCK + j) * BLOCK + k] *= 1.0 - mass[i, j, k]
+                        if mass[i, j, k] > 0:
+                            survival[(i * BLOCK + j) * BLOCK + k] *= max(1.0 - mass[i, j, k], 0.0) ** share[g]
         for voxel in range(BLOCK**3):
             alpha[b, voxel] = 1.0 - survival[voxel]  # (B)
     return alpha
@@ -144,7 +147,8 @@ def splat_posterior_mean(
             i0, j0, k0, i1, j1, k1 = _window(keys[b], lo[g], hi[g])
             loaded = False
             if by_mass:
-                integrate_boxes(means[g], form[g], keys[b], i0, j0, k0, i1, j1, k1, mass)
+                count = count_points(lo[g], hi[g])
+                measure_boxes(means[g], form[g], count, keys[b], (i0, j0, k0), (i1, j1, k1), mass)
             for i in range(i0, i1):
                 dx = np.float32(x0 + i) + half - means[g, 0]
                 for j in range(j0, j1):
@@ -157,6 +161,8 @@ def splat_posterior_mean(
                         if row < 0:
                             continue
                         if by_mass:
+                            if mass[i, j, k] == 0:
+                                continue
                             weight = np.float32(mass[i, j, k] * math.exp(log_weight[g] - unit))  # (C), numerator
                         else:
                             dz = np.float32(z0 + k) + half - means[g, 2]

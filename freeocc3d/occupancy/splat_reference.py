@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.transforms import quats_to_rotations
 from ..core.types import Gaussians
-from .splat import Options
+from .splat import _SPACED, Options
 
 
 def compute_contributions_reference(
@@ -19,7 +19,9 @@ def compute_contributions_reference(
     "integrated" and "released" ignore. The cutoff applies, except for "released": there the neighborhood is all space.
     """
     if options.projection == "integrated":
-        return _masses(gaussians, points, options)
+        middle, most = np.sort(gaussians.scales.astype(np.float64), axis=1).T[1:]
+        share = middle * most / (_SPACED * 0.5 * options.voxel_size) ** 2
+        return np.asarray(1 - (1 - measure_masses_reference(gaussians, points, options)) ** share)
     o = gaussians.opacities.astype(np.float64)
     if options.projection == "released":
         R = quats_to_rotations(gaussians.quats_wxyz.astype(np.float64))
@@ -48,7 +50,7 @@ def compute_posterior_mean_reference(
     """Returns the (P, D) posterior means of values (N, D) at the centers of voxels: equations (C) and (D)."""
     o = gaussians.opacities.astype(np.float64)
     if options.projection == "integrated":
-        weight = compute_contributions_reference(gaussians, points, options) * o
+        weight = measure_masses_reference(gaussians, points, options) * o
     elif options.projection == "released":
         weight = -np.log(1 - compute_contributions_reference(gaussians, points, options))
     else:
@@ -67,7 +69,9 @@ def _squared_distances(gaussians: Gaussians, points: NDArray[np.float64]) -> NDA
     return np.asarray((along_axes**2).sum(axis=2))
 
 
-def _masses(gaussians: Gaussians, points: NDArray[np.float64], options: Options) -> NDArray[np.float64]:
+def measure_masses_reference(
+    gaussians: Gaussians, points: NDArray[np.float64], options: Options
+) -> NDArray[np.float64]:
     """Returns the (P, N) mass of each Gaussian in the voxel around each point, by SciPy's quadrature; 0 where the voxel
     does not touch the Gaussian's bounding box at the cutoff."""
     from scipy.stats import multivariate_normal

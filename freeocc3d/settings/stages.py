@@ -114,23 +114,20 @@ class GaussianOptions(TypedOptions, frozen=True):
     most depth maps see through. This adds 6 to 22 points of IoU on the shipped captures and halves the number of
     Gaussians."""
     coverage: Advanced[Annotated[float, Meta(ge=0.01, le=10)]] = 0.7
-    """s_perp divided by the spacing of the Gaussians. The spacing is the edge of a cell, or the footprint of a pixel on
-    the surface where that is larger. At 0.7 a flat wall reaches alpha = 0.5 at 0.6 voxels from its surface. The center
-    of a voxel that the surface crosses is within 0.5 voxels of the surface where the surface is parallel to the grid,
-    and within 0.87 where it is oblique."""
+    """Standard deviation of a Gaussian along the surface, s_perp, divided by the spacing of the Gaussians. The spacing
+    is the edge of a cell, or the footprint of a pixel on the surface where that is larger."""
     uncertainty: Advanced[Annotated[float, Meta(ge=0, le=10)]] = 0.0
-    """Standard deviations of an anchor's averaged depth to add (in quadrature) to the spacing. Uncertain surfaces,
-    which few keyframes saw from afar, become thicker. A value of 1 loses two to eight points of IoU on the house
-    captures and gains 0.3 on the kitchen."""
+    """Standard deviations of an anchor's averaged depth to add (in quadrature) to the spacing, with "ray_aligned"."""
     gamma: Advanced[Annotated[float, Meta(ge=0.1, le=10)]] = 1.0
-    """Elongation along the viewing ray, s_par = gamma * s_perp; at 1 a Gaussian is a sphere. 1 gives the best results
-    on the shipped captures (0.6 and 1.5 lose one to five points of IoU on the kitchen)."""
+    """Elongation along the viewing ray, s_par = gamma * s_perp, with "ray_aligned"; at 1 a Gaussian is a sphere."""
     opacity: Advanced[PositiveShare] = 0.9
     """Opacity of a new Gaussian, 0…1. Fitting starts from it, and it weights the Gaussian when voxels receive features
     and colors; alpha does not depend on it."""
-    initialization: Advanced[Literal["ray_aligned", "isotropic"]] = "ray_aligned"
-    """"ray_aligned": the paper's geometry-aware initialization, as above; "isotropic": spheres with the mean distance
-    to the three nearest Gaussians, as in 3D Gaussian splatting (for comparison)."""
+    initialization: Advanced[Literal["disc", "ray_aligned", "isotropic"]] = "disc"
+    """Shape of a new Gaussian. "disc": flat on the surface, as thick as its place is uncertain, on the plane of its
+    neighbors; "ray_aligned": the paper's geometry-aware initialization, along the viewing ray; "isotropic": spheres
+    with the mean distance to the three nearest Gaussians, as in 3D Gaussian splatting. The last two need
+    occupancy.projection=probabilistic."""
     edge: Advanced[Factor] = 0.05
     """Drop pixels whose depth differs from a neighbor's by more than this share of the depth. At an edge, a sensor
     reports depths that belong to neither side."""
@@ -215,10 +212,10 @@ class OccupancyOptions(TypedOptions, frozen=True):
     finest: VoxelEdge | None = None
     """Edge of the smallest voxels in meters, such as 0.01 where the others have 0.08. Voxels are halved down to this
     size where the surface is not flat or its meaning changes. null = all voxels have one size."""
-    projection: Advanced[Literal["probabilistic", "poisson", "integrated", "released"]] = "probabilistic"
-    """What a Gaussian adds to a voxel: "probabilistic" (the paper's equations), "poisson" (with its opacity, in the
-    form of the paper's code), "integrated" (its mass inside the voxel), "released" (a dilation, as the paper's code
-    runs)."""
+    projection: Advanced[Literal["integrated", "probabilistic", "poisson", "released"]] = "integrated"
+    """What a Gaussian adds to a voxel: "integrated" (its mass inside the voxel), "probabilistic" (the paper's
+    equations), "poisson" (with its opacity, in the form of the paper's code), "released" (a dilation, as the paper's
+    code runs)."""
     cutoff: Advanced[Annotated[float, Meta(ge=0.1, le=10)]] = 3.0
     """Distance, in standard deviations, to which a Gaussian affects voxels."""
     threshold: Annotated[float, Meta(gt=0, lt=1)] = 0.5
@@ -228,11 +225,6 @@ class OccupancyOptions(TypedOptions, frozen=True):
     contradiction: Advanced[Positive] = 4.0
     """A voxel above the threshold is nevertheless free if the log-odds of the depth maps there (see carving) are at
     most minus this. 4 is ten depth maps that saw through the voxel, or more if others ended in it."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.projection == "integrated" and self.device != "cpu":
-            raise ConfigError("The projection 'integrated' runs only on the CPU: set occupancy.device=cpu.")
 
 
 class CarvingOptions(TypedOptions, frozen=True):

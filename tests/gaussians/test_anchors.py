@@ -70,13 +70,23 @@ def test_means_are_their_anchors_in_their_keyframes_and_keep_pixel_and_depth() -
 
 def test_ray_aligned_initialization_is_the_papers() -> None:
     T = random_pose(3)
-    g = lifted([wall_frame(2.0)], [T], gamma=2.5, coverage=0.5)
+    g = lifted([wall_frame(2.0)], [T], gamma=2.5, coverage=0.5, initialization="ray_aligned")
     np.testing.assert_allclose(g.scales[:, 2], 2.5 * g.scales[:, 0], rtol=1e-6)
     np.testing.assert_array_equal(g.scales[:, 0], g.scales[:, 1])
     ray = g.means - T[:3, 3]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     local_z = quats_to_rotations(g.quats_wxyz.astype(float))[:, :, 2]
     np.testing.assert_allclose(local_z, ray, atol=1e-4)
+
+
+def test_discs_lie_on_the_surface_as_thick_as_their_place_is_uncertain() -> None:
+    T = random_pose(3)
+    g = lifted([wall_frame(2.0)], [T], coverage=0.5)
+    np.testing.assert_allclose(g.scales[:, :2], 0.5 * CELL)
+    assert (g.scales[:, 2] < compute_sensor_sigma(np.float32(2.0))).all()
+    local_z = quats_to_rotations(g.quats_wxyz.astype(float))[:, :, 2]
+    np.testing.assert_allclose(np.abs(local_z @ T[:3, 2]), 1, atol=1e-5)
+    np.testing.assert_allclose(transform(T, g.anchor_cam.astype(float)), g.means, atol=1e-5)
 
 
 def test_far_measurements_that_lie_wider_apart_than_cells_get_wider_gaussians() -> None:
@@ -89,13 +99,16 @@ def test_far_measurements_that_lie_wider_apart_than_cells_get_wider_gaussians() 
 def test_at_the_default_coverage_a_wall_reaches_one_half_at_six_tenths_of_a_voxel(finer: float) -> None:
     """Whatever the cells: finer ones hold more Gaussians, each of which says less on the lattice."""
     V = 2 * CELL
-    g = lifted([wall_frame(2.0 + 0.5 * CELL)], [np.eye(4)], cell=finer * CELL)
-    least = anchors.compute_least_scale(anchors.Options(), finer * CELL, V)
+    g = lifted([wall_frame(2.0 + 0.5 * CELL)], [np.eye(4)], cell=finer * CELL, initialization="ray_aligned")
+    least, paper = (
+        anchors.compute_least_scale(anchors.Options(), finer * CELL, V),
+        splat.Options(projection="probabilistic"),
+    )
     wall = float(g.means[0, 2])
     x, y = (np.random.default_rng(0).uniform(-0.5, 0.5, 200) for _ in range(2))
     points = {offset: np.stack((x, y, np.full(200, wall + offset * V)), axis=1) for offset in (0.0, 0.6, 1.0)}
     alpha = {
-        offset: splat_reference.compute_probability_reference(g, at, splat.Options(), least).mean()
+        offset: splat_reference.compute_probability_reference(g, at, paper, least).mean()
         for offset, at in points.items()
     }
     assert alpha[0.0] > 0.9

@@ -34,19 +34,37 @@ def test_the_kernel_agrees_with_plain_numpy(own_sigma: bool) -> None:
     looks = posed(frames, poses)
     found = denoising.denoise(points, directions, looks, 0.15, 2.1)
     parts = [denoising.look_reference(points, directions, look, 0.15, 2.1) for look in looks]
-    offset, weight = (sum(part[i] for part in parts) for i in range(2))
+    sums, shown = (sum(part[i].astype(float) for part in parts) for i in range(2))
     through, blank = (sum((part[i] > 0).astype(int) for part in parts) for i in (2, 3))
     past = np.zeros(len(points), int)
     for part in parts:
-        past = np.where(part[1] > 0, 0, past + (part[2] > 3))
-    shown = sum((part[1] > 0).astype(int) for part in parts)
-    assert 800 < np.count_nonzero(weight) < 3500
+        past = np.where(part[1], 0, past + (part[2] > 3))
+    shown = shown.astype(np.int32)
+    assert 800 < np.count_nonzero(shown) < 3500
+    assert np.count_nonzero(sums[:, 9]) > 100
+    offset, weight = denoising.weigh(sums, shown)
     np.testing.assert_allclose(found.weights, weight, rtol=1e-5)
-    expected = points + offset / np.where(weight > 0, weight, 1)[:, None]
-    np.testing.assert_allclose(found.points, expected, atol=1e-6)
+    np.testing.assert_allclose(found.points, points + offset, atol=1e-6)
     np.testing.assert_array_equal(found.kept, denoising.are_surfaces(shown, through, blank, past))
-    best = np.argmax([part[1] for part in parts], axis=0)
+    best = np.argmax([part[0][:, 3] for part in parts], axis=0)
     np.testing.assert_array_equal(found.keyframe, np.where(weight > 0, best, -1))
+
+
+def test_frames_that_see_through_a_point_count_as_much_as_poses_are_wrong() -> None:
+    """Five frames see to 3 m, ten show a wall at 2 m; then the frames are a few centimeters off."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack((rng.uniform(-0.5, 0.5, (200, 2)), np.full(200, 2.0)))
+    frames = [wall_frame(3.0, n) for n in range(5)] + [wall_frame(2.0, n) for n in range(5, 15)]
+    exact = np.tile(np.eye(4), (15, 1, 1))
+    wrong = exact.copy()
+    wrong[:, 2, 3] = 0.03 * np.where(np.arange(15) % 2, 1, -1)
+    behind = []
+    for poses in (exact, wrong):
+        found = denoising.denoise(points, points, posed(frames, poses), 0.05, 3.0)
+        assert found.kept.all()
+        behind.append(float(np.median(found.points[:, 2])) - 2.0)
+    assert abs(behind[0]) < 1e-6
+    assert 0.02 < behind[1] < 0.07
 
 
 def test_a_noisy_wall_ends_one_layer_thick() -> None:

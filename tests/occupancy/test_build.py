@@ -10,6 +10,7 @@ from freeocc3d.core.types import FREE, OCCUPIED, UNKNOWN
 from freeocc3d.occupancy import build, carve, splat
 
 V = 0.08
+SPHERES = splat.Options(projection="probabilistic")
 
 
 def build_wall(distance: float, repeats: int = 2, **splatting):
@@ -52,9 +53,9 @@ def test_what_several_images_see_through_is_not_occupied() -> None:
     poses = np.tile(np.eye(4), (12, 1, 1))
     floater = gaussians([[0.02, 0.02, 1.0]], 0.05)
     nothing = np.zeros((1, 0), np.float16)
-    contradicted = build.build_occupancy(floater, nothing, posed(frames, poses), splat.Options(), carve.Options())
+    contradicted = build.build_occupancy(floater, nothing, posed(frames, poses), SPHERES, carve.Options())
     assert np.count_nonzero(contradicted.state == OCCUPIED) == 0
-    kept = build.build_occupancy(floater, nothing, posed(frames[:2], poses[:2]), splat.Options(), carve.Options())
+    kept = build.build_occupancy(floater, nothing, posed(frames[:2], poses[:2]), SPHERES, carve.Options())
     assert np.count_nonzero(kept.state == OCCUPIED) > 0
 
 

@@ -83,10 +83,9 @@ def test_options_of_a_backend_nest_below_its_layer() -> None:
         ({"capture": {"intrinsics": [585, 585, 320]}}, r"'capture\.intrinsics' must be a list of 4 numbers"),
         (
             {"gaussians": {"initialization": "x"}},
-            r"'gaussians\.initialization' must be ray_aligned or isotropic, got 'x'",
+            r"'gaussians\.initialization' must be disc, ray_aligned or isotropic, got 'x'",
         ),
         ({"vocabulary": {"endpoint": "http://h/v1"}}, r"'vocabulary\.endpoint' names a server, so 'vocabulary\.model'"),
-        ({"occupancy": {"projection": "integrated", "device": "cuda:0"}}, r"set occupancy\.device=cpu"),
         ({"fitting": {"cpu": {"x": 1}}}, r"'fitting\.cpu' has no options\. Remove x"),
         ({"fitting": {"gsplat": {"devise": "x"}}}, r"'fitting\.gsplat\.devise' \(did you mean 'device'\?\)"),
         ({"tracking": "known"}, r"section 'tracking' must contain 'key: value' lines, got 'known'"),

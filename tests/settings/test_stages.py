@@ -7,7 +7,7 @@ import pytest
 from freeocc3d.core.errors import ConfigError
 from freeocc3d.settings import config
 from freeocc3d.settings.option_types import converted, described
-from freeocc3d.settings.stages import OccupancyOptions, VocabularyOptions
+from freeocc3d.settings.stages import VocabularyOptions
 from freeocc3d.settings.typed_options import field_types
 
 FIELDS = [
@@ -27,9 +27,3 @@ def test_defaults_fit_and_infinite_numbers_do_not(section: str, key: str, kind: 
 def test_a_server_needs_a_model() -> None:
     with pytest.raises(ConfigError, match="'endpoint' names a server, so 'model' must name the model"):
         VocabularyOptions(endpoint="http://localhost/v1")
-
-
-def test_the_integrated_projection_runs_on_the_processor() -> None:
-    OccupancyOptions(projection="integrated")
-    with pytest.raises(ConfigError, match=r"set occupancy\.device=cpu"):
-        OccupancyOptions(projection="integrated", device="cuda:0")
