@@ -34,6 +34,10 @@ NO_CLASSES = ClassMap((), {})
 SHORT = {"stop": 30, "color_focal": 1.0, "synthetic": {"width": 160, "height": 120}}
 
 
+PAPERS = "occupancy.projection=probabilistic"
+"""As Gaussians of other systems are scored."""
+
+
 def lattice(origin: NDArray[np.float64] = ORIGIN, size: float = 0.08, shape: tuple[int, ...] = SHAPE) -> GroundTruth:
     return GroundTruth(np.zeros(shape, np.uint8), np.asarray(origin, float), size, ("free", "wall", "sofa"))
 
@@ -134,9 +138,9 @@ def test_gaussians_are_projected_at_the_lattices_centers() -> None:
     some = random_gaussians(60, seed=3, extent=1.0)
     truth = lattice((-0.5, -0.5, -0.5), 0.05, (20, 20, 20))
     semantics = np.eye(2, dtype=np.float32)[np.arange(60) % 2]
-    settings = config.load(None, ["occupancy.cutoff=8"])
+    settings = config.load(None, [PAPERS, "occupancy.cutoff=8"])
     found = predictions.predict_from_gaussians(some, semantics, settings, TrajectoryAlignment.identity(), truth)
-    points, wide = truth.centers().reshape(-1, 3), Options(cutoff=8.0)
+    points, wide = truth.centers().reshape(-1, 3), Options(cutoff=8.0, projection="probabilistic")
     expected = (splat_reference.compute_probability_reference(some, points, wide) >= wide.threshold).reshape(
         truth.shape
     )
@@ -155,7 +159,7 @@ def test_gaussians_and_lattice_may_move_together() -> None:
     """x' = s R x + t, scales times s, rotations R R_g: a quarter turn and a scale permute the lattice exactly."""
     some = random_gaussians(80, seed=4, extent=1.2)
     truth = lattice((-0.8, -0.8, -0.8), 0.05, (32, 32, 32))
-    settings = config.load(None)
+    settings = config.load(None, [PAPERS])
     here = predictions.predict_from_gaussians(some, None, settings, TrajectoryAlignment.identity(), truth).occupied
     moved = TrajectoryAlignment(2.0, QUARTER, np.array((5.0, -3.0, 1.0)))
     there = lattice(2.0 * truth.origin + moved.translation, 0.1, (32, 32, 32))
@@ -168,7 +172,7 @@ def test_a_scaled_map_scores_what_its_shell_overlaps() -> None:
     """A Gaussian of standard deviation s is occupied within s sqrt(2 ln 2): scaled by 1.25, IoU is 1 / 1.25^3."""
     ball = gaussians((0.0, 0.0, 0.0), 1.0)
     truth = lattice((-2.0, -2.0, -2.0), 0.05, (80, 80, 80))
-    settings = config.load(None)
+    settings = config.load(None, [PAPERS])
     small = predictions.predict_from_gaussians(ball, None, settings, TrajectoryAlignment.identity(), truth).occupied
     large = predictions.predict_from_gaussians(
         ball, None, settings, TrajectoryAlignment(1.25, np.eye(3), np.zeros(3)), truth
@@ -181,11 +185,11 @@ def test_a_scaled_map_scores_what_its_shell_overlaps() -> None:
 def test_a_gaussian_far_larger_than_the_lattice_costs_no_memory() -> None:
     truth = lattice((0, 0, 0), 0.08, (10, 10, 10))
     huge = predictions.predict_from_gaussians(
-        gaussians((0.0, 0, 0), 500.0), None, config.load(None), TrajectoryAlignment.identity(), truth
+        gaussians((0.0, 0, 0), 500.0), None, config.load(None, [PAPERS]), TrajectoryAlignment.identity(), truth
     )
     assert huge.occupied.all()
     far = predictions.predict_from_gaussians(
-        gaussians((900.0, 0, 0), 1.0), None, config.load(None), TrajectoryAlignment.identity(), truth
+        gaussians((900.0, 0, 0), 1.0), None, config.load(None, [PAPERS]), TrajectoryAlignment.identity(), truth
     )
     assert not far.occupied.any()
 
@@ -204,7 +208,7 @@ def test_frames_are_fused_by_their_true_poses(tmp_path: Path) -> None:
             labels=np.full(len(part), index + 1),
         )  # fmt: skip
     truth, classes = lattice((-0.6, -0.6, -0.6), 0.06, (20, 20, 20)), map_each_to_itself(("free", "wall", "sofa"))
-    settings = config.load(None)
+    settings = config.load(None, [PAPERS])
     fused, count = predictions.predict_from_frames(tmp_path, Poses(np.arange(2.0), T), settings, truth, classes)
     assert count == 2
     semantics = np.eye(2, dtype=np.float32)[(np.arange(40) >= 25).astype(int)]
@@ -230,13 +234,19 @@ def _assert_ply_frames_are_the_same(
     folder.mkdir()
     for index, rows in enumerate((slice(0, 25), slice(25, 40))):
         write_standard_ply(folder / f"{index:06d}.ply", _seen_from(world[rows], T[index]))
-    fused, _ = predictions.predict_from_frames(folder, Poses(np.arange(2.0), T), config.load(None), truth, NO_CLASSES)
+    fused, _ = predictions.predict_from_frames(
+        folder, Poses(np.arange(2.0), T), config.load(None, [PAPERS]), truth, NO_CLASSES
+    )
     assert fused.labels is None
     assert agreement(fused.occupied, expected.occupied) > 0.99
 
 
 def test_unusable_frames_are_reported_in_a_sentence(tmp_path: Path) -> None:
-    poses, settings, classes = Poses(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))), config.load(None), NO_CLASSES
+    poses, settings, classes = (
+        Poses(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))),
+        config.load(None, [PAPERS]),
+        NO_CLASSES,
+    )
     truth = lattice(shape=(4, 4, 4))
     with pytest.raises(FreeOccError, match="no per-frame Gaussians"):
         predictions.predict_from_frames(tmp_path, poses, settings, truth, classes)
@@ -342,7 +352,7 @@ def test_another_systems_map_is_scored_through_its_trajectory(room: Any, tmp_pat
     own = select_estimated_poses(room.trajectory)
     theirs = Poses(own.timestamps, other.poses(own.T_world_cam))
     direct = predictions.predict_from_gaussians(
-        room.gaussians, None, config.load(None), TrajectoryAlignment.identity(), lattice()
+        room.gaussians, None, config.load(None, [PAPERS]), TrajectoryAlignment.identity(), lattice()
     )
     scene = scene_scoring.score_gaussians(ply, lattice(), NO_CLASSES, theirs, own, "sim3")
     assert scene.alignment.scale == pytest.approx(2.0)
