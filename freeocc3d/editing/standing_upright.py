@@ -68,9 +68,7 @@ def stand_upright(
 
 
 def _patches(scan_map: Map) -> SurfacePatches:
-    keyframes, poses = scan_map.keyframes, scan_map.trajectory.T_world_keyframe
-    depth = map(keyframes.depth_m, range(len(keyframes)))
-    return find_surface_patches(zip(depth, [camera for _, camera in keyframes.views()], poses, strict=True))
+    return find_surface_patches(scan_map.keyframes.depth_images(), scan_map.trajectory.T_world_keyframe)
 
 
 def _held(scan_map: Map) -> NDArray[np.float64]:

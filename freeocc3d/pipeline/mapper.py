@@ -109,8 +109,7 @@ class Mapper:
         trajectory = self.tracker.trajectory(self.capture.timestamps)
         poses, keyframes = trajectory.T_world_keyframe, self.mapped(trajectory)
         turned = np.array([self.capture.turned(index) for index in trajectory.keyframes.tolist()], np.int8)
-        cameras = [camera for _, camera in keyframes.views()]
-        patches = find_surface_patches(zip(map(keyframes.depth_m, range(len(keyframes))), cameras, poses, strict=True))
+        patches = find_surface_patches(keyframes.depth_images(), poses)
         self.upright = find_upright_frame(turn_back(poses, turned), patches)
         voxel_size = self.settings.occupancy.voxel_size
         self.origin = find_lattice_origin(patches.moved(self.upright.T_upright_world), voxel_size)

@@ -175,13 +175,22 @@ class Keyframes(Sequence[Frame]):
         """(H, W) depth of a keyframe, meters; 0 = no measurement. Does not decode its color image."""
         return self._read_units(self._entries[row], 1) / np.float32(_UNITS_PER_METER)
 
+    def depth_images(self) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32] | DepthSensor, Intrinsics]]:
+        """Yields of each keyframe ``depth_m``; the standard deviations, (H, W) meters or those of its sensor; and the
+        camera."""
+        for row, entry in enumerate(self._entries):
+            sigma_m = self._read_sigma(entry)
+            yield self.depth_m(row), self.sensor if sigma_m is None else sigma_m, _camera(entry)
+
+    def _read_sigma(self, entry: dict[str, float]) -> NDArray[np.float32] | None:
+        return self._read_units(entry, 2) / np.float32(_SIGMA_UNITS_PER_METER) if _SIGMA in entry else None
+
     def _read(self, entry: dict[str, float]) -> Frame:
         index = int(entry["frame"])
         color = self._decoded(entry, 0, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         depth_m = self._read_units(entry, 1) / np.float32(_UNITS_PER_METER)
-        sigma_m = self._read_units(entry, 2) / np.float32(_SIGMA_UNITS_PER_METER) if _SIGMA in entry else None
         rgb = cv2.cvtColor(color, cv2.COLOR_BGR2RGB)
-        return Frame(index, entry["timestamp"], rgb, depth_m, _camera(entry), sigma_m, self.sensor)
+        return Frame(index, entry["timestamp"], rgb, depth_m, _camera(entry), self._read_sigma(entry), self.sensor)
 
     def _read_units(self, entry: dict[str, float], image: int) -> NDArray[np.float32]:
         units = self._decoded(entry, image, cv2.IMREAD_UNCHANGED)
