@@ -13,6 +13,7 @@ from freeocc3d.core import threads
 def test_there_are_as_many_threads_as_processors_of_the_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 3, 5})
     monkeypatch.setattr(threads, "_quotas", lambda membership, mount: iter(()))
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     assert threads.count_threads() == 3
 
 
@@ -20,6 +21,7 @@ def test_there_are_as_many_threads_as_processors_of_the_affinity(monkeypatch: py
 def test_a_quota_limits_them(monkeypatch: pytest.MonkeyPatch, quotas: tuple[float, ...], expected: int) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1, 2, 3})
     monkeypatch.setattr(threads, "_quotas", lambda membership, mount: iter(quotas))
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     assert threads.count_threads() == expected
 
 

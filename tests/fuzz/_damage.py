@@ -219,9 +219,11 @@ def damage_image(rng: random.Random, path: Path) -> str:
         path.write_bytes(data[:33] + chunk + data[33:])
         return f"with a chunk {name!r} of {len(inner)} bytes"
     if kind == "bomb":
-        side = rng.choice((3000, 11000))
-        image = np.zeros((side, side), rng.choice((np.uint8, np.uint16)))
-        suffix = rng.choice((".png", ".png", ".jpg", ".webp")) if image.dtype == np.uint8 else ".png"
+        side, dtype = rng.choice((3000, 11000)), rng.choice((np.uint8, np.uint16))
+        suffix = rng.choice((".png", ".png", ".jpg", ".webp")) if dtype == np.uint8 else ".png"
+        if suffix == ".webp":
+            side = 3000  # writing a larger one takes more than a gigabyte, which would count as that of reading it
+        image = np.zeros((side, side), dtype)
         options = [cv2.IMWRITE_PNG_COMPRESSION, 1] if suffix == ".png" else []
         path.write_bytes(cv2.imencode(suffix, image, options)[1].tobytes())
         return f"{side} x {side} zeros as {suffix}"

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from .figures import Figures, tabulate
+from .true_frame import put_gaussians_in_world, put_keyframes_in_world
 
 FLIPPED, SEEDS, CELL_PX = 0.2, (0, 1, 2), 48
 KINDS = ("superpixels", "components")
@@ -98,13 +98,13 @@ class _Scene:
         self.truth = load_ground_truth(truth_path)
         self.classes = scoring.collect_common_classes([self.truth])
         self.words = scan_map.text_encoder.encode_words(list(self.truth.classes[1:]))
-        self.gaussians, self.scan_map = scan_map.gaussians, scan_map
+        self.gaussians, self.scan_map = put_gaussians_in_world(scan_map), scan_map
         labels = self.truth.labels
         self.present = np.unique(labels[(labels > 0) & (labels != UNKNOWN)])
         made = build.build_occupancy(
             self.gaussians,
             np.zeros((len(self.gaussians), 0), np.float16),
-            self.keyframes(),
+            put_keyframes_in_world(scan_map),
             settings.occupancy.changed(voxel_size=self.truth.voxel_size),
             settings.carving,
             origin=self.truth.origin,
@@ -118,13 +118,6 @@ class _Scene:
         nearest = true[cKDTree(true).query(voxels[self.inside])[1]]
         self.ceiling = self.miou(labels[tuple(nearest.T)])
 
-    def keyframes(self) -> Iterator[Any]:
-        from freeocc3d.core.types import PosedFrame
-
-        poses = self.scan_map.trajectory.T_world_keyframe
-        for row, (frame, T) in enumerate(zip(self.scan_map.keyframes, poses, strict=True)):
-            yield PosedFrame(frame, T, row)
-
     def fused(self, encoder: Any) -> Figures:
         """mIoU by method of fusion."""
         import numpy as np
@@ -135,7 +128,7 @@ class _Scene:
         count = len(self.gaussians)
         ours = FeatureFusion(count, encoder.dimension, self.options.disagreement)
         mean, last = FeatureFusion(count, encoder.dimension), np.zeros((count, encoder.dimension), np.float16)
-        for frame, T, _ in self.keyframes():
+        for frame, T, _ in put_keyframes_in_world(self.scan_map):
             shown, features = find_visible(self.gaussians, frame, T, self.options), encoder.encode(frame)
             ours.add(shown, features)
             mean.add(shown, features)

@@ -18,6 +18,7 @@ import numpy as np
 
 from .figures import Figures, Line, tabulate_asked
 from .processes import COMMAND, run_inside, run_timed
+from .true_frame import put_gaussians_in_world, put_keyframes_in_world
 
 LEAST = 30
 ENOUGH = 0.5
@@ -39,12 +40,12 @@ def measure_present_words(capture: str) -> Figures:
 
 
 def classes_found(scan_map: Any, truth_path: Path) -> Figures:
-    """How well each class is found, in a map whose frame is the truth's.
+    """How well each class is found, in a map whose given poses are the truth's.
 
     iou: of the answer.  occupied: share of the class's voxels that the map holds occupied at all.  iou_occupied: of the
     answer among voxels that both hold occupied, which measures the language alone.
     """
-    from freeocc3d.core.types import UNKNOWN, PosedFrame
+    from freeocc3d.core.types import UNKNOWN
     from freeocc3d.evaluation.ground_truth import load_ground_truth
     from freeocc3d.occupancy import build
     from freeocc3d.query import word_query
@@ -52,12 +53,10 @@ def classes_found(scan_map: Any, truth_path: Path) -> Figures:
 
     truth = load_ground_truth(truth_path)
     settings = config.load_saved(scan_map.path / "config.yaml")
-    poses = scan_map.trajectory.T_world_keyframe
-    keyframes = (PosedFrame(f, T, row) for row, (f, T) in enumerate(zip(scan_map.keyframes, poses, strict=True)))
     occupancy = build.build_occupancy(
-        scan_map.gaussians,
+        put_gaussians_in_world(scan_map),
         scan_map.gaussian_features,
-        keyframes,
+        put_keyframes_in_world(scan_map),
         settings.occupancy.changed(voxel_size=truth.voxel_size),
         settings.carving,
         origin=truth.origin,
