@@ -43,8 +43,7 @@ from .depth_edges import is_at_edge, mask_away_from_edges
 
 _REACH_M, _REACH_SIGMAS = 0.05, 3.0
 """A depth map shows a point if it ends within this many meters of it, plus this many standard deviations of its depth:
-pose errors, and 99.7 % of the noise. Half or twice the first value changes IoU by less than one point on the shipped
-captures."""
+pose errors, and 99.7 % of the noise. 4 cm moves the IoU of the kitchen at its given poses by 0.9 points."""
 
 _SURE = 6
 """Frames that show a point beyond doubt. Of the points of walls and furniture in the shipped captures, 94 % have more,
