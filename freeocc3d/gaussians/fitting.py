@@ -7,9 +7,9 @@ Paper, "Geometrically Anchored Gaussian Updates": over scales, rotations, opacit
 over the pixels that have a depth. The space beyond has no anchors, and nearby Gaussians would grow to paint it.
 
 A camera sees the outline of a Gaussian, but not its extent along the ray, nor the space it takes in front of others.
-The initialization keeps what images cannot show: the axis of an anchored Gaussian stays along its keyframe's ray, with
-the same extent. Across the ray, the two axes of the outline turn and change their ratio, but their mean precision
-stays, because alpha(x) of the occupancy is exp(-1/2 d^T Sigma^-1 d). Opacities and colors are free.
+The initialization keeps what images cannot show: the local z axis of an anchored Gaussian, the surface's normal or its
+keyframe's ray, and the extent on it stay. The two other axes turn and change their ratio, but their mean precision
+stays, so that occupancy does. Opacities and colors are free.
 
 Time is bounded: some views are enough (``view_choice``), each step touches only what its view shows, and all passes but
 the last compare views of half the size, which show what Gaussians of this spacing can show. These passes end when other

@@ -22,6 +22,8 @@ def test_who_knows_a_cell_decides_over_what_agreement_is() -> None:
     assert found["obstacles_invented"] == pytest.approx(1 / 5)
     assert found["obstacles_lost"] == 0  # one of ours is beside
     assert found["free_in_one_piece"] == pytest.approx(2 / 3)  # the obstacle shuts one of three off
+    lines = report.write_markdown({"rows": [], "measurements": {"plan": [{"capture": "room", **found}]}})
+    assert "called free | 50.0 % | 0 % |" in lines
 
 
 def test_exports_of_a_map_are_measured_in_processes_of_their_own(tmp_path, monkeypatch) -> None:

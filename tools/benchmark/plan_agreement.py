@@ -135,7 +135,7 @@ def _measured(capture: Any, truth: Any) -> Any:
 
 def plan_lines(figures: Figures) -> list[Line]:
     """Rows of a table: what, measured, asked."""
-    percent = {name: f"{100 * value:.1f} %" for name, value in figures.items() if name != "cells_known_to_truth"}
+    percent = {name: f"{100 * value:.1f} %" for name, value in figures.items() if isinstance(value, float)}
     return [
         ("plan: cells known to map and truth that agree", percent["agree_of_both"], "90 %"),
         (
