@@ -193,7 +193,9 @@ def lift_gaussians(
     progress.stage("gaussians", len(T_world_keyframe))
     cells = anchors.AnchoredCells(options, 0.5 * voxel_size, T_world_keyframe, origin)
     for done, look in enumerate(posed(), 1):
-        pixels, points = _points(look.frame, look.T_world_cam, cells.stride(look.frame))
+        pixels, points = _points(
+            look.frame, look.T_world_cam, anchors.choose_stride(look.frame, options, cells.cell_size)
+        )
         outside = pixels[~space.contains(points, margin)]
         depth_m = look.frame.depth_m.copy()
         depth_m[outside[:, 1], outside[:, 0]] = 0

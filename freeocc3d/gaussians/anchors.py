@@ -72,7 +72,8 @@ class AnchoredCells:
         if not self._compared:
             self._compared = _refuse_tiny(self.cell_size, posed.frame)
         self._reach_m = max(self._reach_m, float(posed.frame.depth_m.max(initial=0.0)))
-        self._sums.add_frame(posed, self.stride(posed.frame), self.options.edge)
+        stride = choose_stride(posed.frame, self.options, self.cell_size)
+        self._sums.add_frame(posed, stride, self.options.edge)
 
     def gaussians(self, frames: Iterable[PosedFrame]) -> Gaussians:
         """Returns one Gaussian per cell with enough measurements. frames: the added frames again, to denoise the
@@ -122,19 +123,20 @@ class AnchoredCells:
         sums.add(moved[found.kept])
         return sums.cells()
 
-    def stride(self, frame: Frame) -> int:
-        """The step between the pixels used in a frame: the option, or the step that leaves about 320 columns. If cells
-        are small, the step is smaller: about two pixels per cell edge. If the depth states its uncertainty, all pixels
-        are used."""
-        if self.options.pixel_stride is not None:
-            return self.options.pixel_stride
-        if frame.depth_sigma_m is not None:
-            return 1
-        measured = frame.depth_m[::_SAMPLED, ::_SAMPLED]
-        measured = measured[measured > 0]
-        usual = float(np.median(measured)) if len(measured) else 1.0
-        fine = int(0.5 * self.cell_size * frame.intrinsics.fx / usual)
-        return max(1, min(frame.intrinsics.width // _COLUMNS, fine))
+
+def choose_stride(frame: Frame, options: Options, cell_size: float) -> int:
+    """The step between the pixels used in a frame: the option, or the step that leaves about 320 columns. If cells, of
+    ``cell_size`` meters, are small, the step is smaller: about two pixels per cell edge. If the depth states its
+    uncertainty, all pixels are used."""
+    if options.pixel_stride is not None:
+        return options.pixel_stride
+    if frame.depth_sigma_m is not None:
+        return 1
+    measured = frame.depth_m[::_SAMPLED, ::_SAMPLED]
+    measured = measured[measured > 0]
+    usual = float(np.median(measured)) if len(measured) else 1.0
+    fine = int(0.5 * cell_size * frame.intrinsics.fx / usual)
+    return max(1, min(frame.intrinsics.width // _COLUMNS, fine))
 
 
 def _refuse_tiny(cell_size: float, frame: Frame) -> bool:

@@ -8,12 +8,13 @@ only the keyframes that show most (``keyframe_choice``).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import contextlib
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..capture.read_ahead import call_ahead
 from ..core.errors import FrameError
 from ..core.progress import Progress
 from ..core.types import Frame, Gaussians
@@ -40,26 +41,16 @@ def lift_features(
     fusion = FeatureFusion(len(gaussians), encoder.dimension, options.disagreement)
     chosen = choose_encoded_keyframes(gaussians, frames, T_world_cam, options)
     progress.stage("language", len(chosen))
-    for done, (row, frame) in enumerate(_decode_ahead(frames, chosen), start=1):
-        try:
-            features = encode_finite(encoder, frame)
-        except FrameError as error:
-            progress.warn(str(error))
-        else:
-            fusion.add(find_visible(gaussians, frame, T_world_cam[row], options), features)
-        progress.advance(done)
+    with contextlib.closing(call_ahead(frames.__getitem__, chosen, depth=1)) as decoded:
+        for done, (row, frame) in enumerate(zip(chosen, decoded, strict=True), start=1):
+            try:
+                features = encode_finite(encoder, frame)
+            except FrameError as error:
+                progress.warn(str(error))
+            else:
+                fusion.add(find_visible(gaussians, frame, T_world_cam[row], options), features)
+            progress.advance(done)
     return fusion.features()
-
-
-def _decode_ahead(frames: Sequence[Frame], rows: Sequence[int]) -> Iterator[tuple[int, Frame]]:
-    """Yields each row with its frame, while another thread decodes the next one."""
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="keyframes") as pool:
-        following = [pool.submit(frames.__getitem__, row) for row in rows[:1]]
-        for row, after in zip(rows, [*rows[1:], None], strict=True):
-            frame = following.pop().result()
-            if after is not None:
-                following.append(pool.submit(frames.__getitem__, after))
-            yield row, frame
 
 
 def encode_finite(encoder: Encoder, frame: Frame) -> NDArray[np.float16]:

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..capture.read_ahead import call_ahead
 from ..core.errors import FrameError
 from ..core.types import Frame
 from .packed_depth import MOST_UNITS, pack_depth, unpack_depth
@@ -75,17 +76,7 @@ class FrameCache:
         false = their colors are left out, an empty array."""
         while self._waiting:
             self._waiting.popleft().result()
-        pending: deque[Future[Frame | FrameError]] = deque()
-        reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frame-cache")
-        try:
-            for index in indices:
-                pending.append(reader.submit(self._frame, index, color))
-                if len(pending) > _AHEAD:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
-        finally:
-            reader.shutdown(wait=True, cancel_futures=True)
+        return call_ahead(lambda index: self._frame(index, color), indices, _AHEAD)
 
     def _frame(self, index: int, color: bool) -> Frame | FrameError:
         if index in self._at:

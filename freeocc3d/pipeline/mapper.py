@@ -73,8 +73,9 @@ class Mapper:
         """Whether all poses so far are consistent with each other."""
         self.upright: UprightFrame | None = None
         """The frame of the map, found by the last ``refine``. None = the tracker's world."""
-        stride = anchors.AnchoredCells(settings.gaussians, self.cell_size, np.zeros((0, 4, 4))).stride
-        self.cache = FrameCache(folder, self._read, stride)
+        self.cache = FrameCache(
+            folder, self._read, lambda frame: anchors.choose_stride(frame, settings.gaussians, self.cell_size)
+        )
         self.origin = np.zeros(3)
         """(3,) lower corner of voxel (0, 0, 0) in the map's frame, meters."""
 

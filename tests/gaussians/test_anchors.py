@@ -169,10 +169,10 @@ def test_cells_smaller_than_the_pixels_spacing_keep_the_surface() -> None:
 
 def test_every_pixel_counts_whose_depth_says_how_uncertain_it_is() -> None:
     wide = Intrinsics(640, 480, 520.0, 520.0, 319.5, 239.5)
-    frame, cells = wall_frame(2.0, camera=wide), anchors.AnchoredCells(anchors.Options(), CELL, np.eye(4)[None])
-    assert cells.stride(frame) == 2
-    assert cells.stride(with_sigma(frame)) == 1
-    assert anchors.AnchoredCells(anchors.Options(pixel_stride=3), CELL, np.eye(4)[None]).stride(with_sigma(frame)) == 3
+    frame = wall_frame(2.0, camera=wide)
+    assert anchors.choose_stride(frame, anchors.Options(), CELL) == 2
+    assert anchors.choose_stride(with_sigma(frame), anchors.Options(), CELL) == 1
+    assert anchors.choose_stride(with_sigma(frame), anchors.Options(pixel_stride=3), CELL) == 3
 
 
 def test_a_frame_without_depth_adds_nothing() -> None:
