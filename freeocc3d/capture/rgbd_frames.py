@@ -126,8 +126,6 @@ class RgbdFrames(Capture):
         confidence = self.stored_confidence(index)
         if confidence is None or confidence.min(initial=2) >= 2:
             return registration.depth(depth_m), None
-        from ..core.depth_noise import compute_sensor_sigma  # imports Numba, which opening a capture must not
-
         if confidence.shape != depth_m.shape:
             confidence = cv2.resize(confidence, depth_m.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
         depth_m *= confidence != 0
@@ -136,7 +134,7 @@ class RgbdFrames(Capture):
         times = unsure * np.float32(UNSURE_SIGMA - 1.0) + np.float32(1.0)
         # confidence comes from the LiDAR of phones
         sensor = TIME_OF_FLIGHT if self.options.sensor == AUTO else find_sensor(self.options.sensor)
-        return depth_m, times * compute_sensor_sigma(depth_m, sensor)
+        return depth_m, times * sensor.compute_sigma(depth_m)
 
 
 def _check_size(image: NDArray[Any], camera: Intrinsics, what: str) -> None:

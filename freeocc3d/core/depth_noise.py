@@ -7,16 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .compiling import njit
-from .depth_sensors import STRUCTURED_LIGHT, DepthSensor
 from .types import Frame
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a Gaussian over the median of its absolute value, 1 / Phi^-1(3/4)."""
-
-
-def compute_sensor_sigma(depth_m: NDArray[np.floating], sensor: DepthSensor = STRUCTURED_LIGHT) -> NDArray[np.float32]:
-    """Standard deviations, meters, of a sensor's depths, meters, of any shape."""
-    return np.asarray(sensor.a + sensor.b * (depth_m - sensor.z_0) ** 2, np.float32)
 
 
 def take_sigma(frame: Frame) -> NDArray[np.float32]:
@@ -38,4 +32,4 @@ def compute_sigma_image(frame: Frame) -> NDArray[np.float32]:
     """(H, W) standard deviations, meters: ``look_up_sigma`` for all pixels, in NumPy."""
     if frame.depth_sigma_m is not None:
         return frame.depth_sigma_m
-    return compute_sensor_sigma(frame.depth_m, frame.sensor)
+    return frame.sensor.compute_sigma(frame.depth_m)

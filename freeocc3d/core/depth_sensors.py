@@ -23,6 +23,10 @@ class DepthSensor:
     b: float
     z_0: float
 
+    def compute_sigma(self, depth_m: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Standard deviations, meters, of depths, meters, of any shape."""
+        return np.asarray(self.a + self.b * (depth_m - self.z_0) ** 2, np.float32)
+
     @property
     def coefficients(self) -> NDArray[np.float32]:
         """(1, 3) a, b and z_0."""

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..core.compiling import njit
-from ..core.depth_noise import compute_sensor_sigma
 from ..core.depth_sensors import STRUCTURED_LIGHT, DepthSensor, find_sensor
 from ..core.errors import MapError
 from ..core.hash_table import build_table, find_row, packed_key
@@ -188,7 +187,7 @@ def _detailed(
         for j in range(3):
             moments[:, i, j] = np.bincount(cube, local[:, i] * local[:, j]) / n - mean[:, i] * mean[:, j]
     off_plane = np.sqrt(np.maximum(np.linalg.eigvalsh(moments)[:, 0], 0.0))
-    noise = np.bincount(cube, compute_sensor_sigma(np.abs(gaussians.anchor_cam[:, 2]), sensor)) / n
+    noise = np.bincount(cube, sensor.compute_sigma(np.abs(gaussians.anchor_cam[:, 2]))) / n
     uneven = (n >= _FEWEST) & (off_plane > np.hypot(_UNEVEN * voxel_size, noise))
     uneven |= np.bincount(cube, changing) > 0
     uneven &= noise <= 0.5 * voxel_size  # smaller voxels would show the noise

@@ -36,7 +36,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from ..core.compiling import njit
-from ..core.depth_noise import compute_sensor_sigma, look_up_sigma, take_sigma
+from ..core.depth_noise import look_up_sigma, take_sigma
 from ..core.transforms import invert
 from ..core.types import PosedFrame
 from .depth_edges import is_at_edge, mask_away_from_edges
@@ -258,7 +258,7 @@ def look_reference(
         column, line = np.where(np.asarray(inside)[:, None], pixel, 0).astype(int).T
         depth = np.where(inside, depth_m[line, column], 0)
         stated = frame.depth_sigma_m
-        sigma = (compute_sensor_sigma(z, frame.sensor) if stated is None else stated[line, column]).astype(np.float64)
+        sigma = (frame.sensor.compute_sigma(z) if stated is None else stated[line, column]).astype(np.float64)
         beyond, reach = depth - z, _REACH_M + _REACH_SIGMAS * sigma
         shown, through = (depth > 0) & (np.abs(beyond) <= reach), (depth > 0) & (beyond > reach)
         blank = inside & (frame.depth_m[line, column] <= 0) & (z <= reach_m)

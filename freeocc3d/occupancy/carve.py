@@ -10,7 +10,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from ..core.compiling import njit
-from ..core.depth_noise import compute_sensor_sigma, look_up_sigma, take_sigma
+from ..core.depth_noise import look_up_sigma, take_sigma
 from ..core.transforms import back_project, invert, transform
 from ..core.types import BLOCK, Frame
 from ..core.voxel_keys import unpack_voxels
@@ -108,7 +108,7 @@ class DepthEvidence:
         if frame.depth_sigma_m is not None:
             sigma = frame.depth_sigma_m[rows[v], columns[u]]
         else:
-            sigma = compute_sensor_sigma(measured[v, u], frame.sensor)
+            sigma = frame.sensor.compute_sigma(measured[v, u])
         z = measured[v, u] + 0.5 * self.voxel_size + _SIGMAS * sigma
         points = transform(T_world_cam, back_project(pixels, z.astype(np.float32), camera).astype(np.float64))
         return find_blocks_along_rays(points, T_world_cam[:3, 3], self.origin, self.voxel_size)

@@ -43,8 +43,7 @@ _FINE = 0.01
 
 _FITTED_PER_FRAME, _FITTED_PER_KEYFRAME = 0.45, 1.5
 """Small renderings that fitting may take for each frame and each keyframe. The rest of a run takes 35 ms of a processor
-for a frame and about 100 ms for a keyframe, a small rendering 25 to 50 ms: fitting stays below a third of the run. With
-0.7 and 2.2, it took 40 % of that of house/living."""
+for a frame and about 100 ms for a keyframe, a small rendering 25 to 50 ms: fitting stays below a third of the run."""
 
 
 class Mapper:

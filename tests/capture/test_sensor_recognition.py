@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from freeocc3d.capture.checks.sensor_recognition import recognize_sensor
-from freeocc3d.core.depth_noise import compute_sensor_sigma
 from freeocc3d.core.depth_sensors import STRUCTURED_LIGHT, TIME_OF_FLIGHT
 
 FOCAL_BASELINE = {8: 580 * 0.075, 32: 383 * 0.05}
@@ -31,7 +30,7 @@ class Stored:
 
 
 def projected(depth_m):
-    return compute_sensor_sigma(depth_m, STRUCTURED_LIGHT)
+    return STRUCTURED_LIGHT.compute_sigma(depth_m)
 
 
 @pytest.mark.parametrize("units", [1000.0, 5000.0])
@@ -42,7 +41,7 @@ def projected(depth_m):
         (8, lambda depth_m: 0.2 * projected(depth_m), "structured_light"),  # smoothed
         (32, projected, "stereo"),
         (None, projected, "structured_light"),
-        (None, lambda depth_m: compute_sensor_sigma(depth_m, TIME_OF_FLIGHT), "time_of_flight"),
+        (None, lambda depth_m: TIME_OF_FLIGHT.compute_sigma(depth_m), "time_of_flight"),
     ],
 )
 def test_a_sensor_is_told_by_its_steps_and_its_noise(parts, sigma, name: str, units: float) -> None:

@@ -12,7 +12,7 @@ import pytest
 from freeocc3d.capture import base, open_capture
 from freeocc3d.capture.builtin import builtin_room
 from freeocc3d.capture.readers import synthetic
-from freeocc3d.core.depth_noise import compute_sensor_sigma
+from freeocc3d.core.depth_sensors import STRUCTURED_LIGHT
 from freeocc3d.core.errors import CaptureError, ConfigError
 from freeocc3d.core.transforms import back_project, invert, is_rigid, project, transform
 from freeocc3d.core.types import FREE, UNKNOWN, Frame
@@ -212,7 +212,7 @@ def test_a_frames_depth_has_that_noise(noisy, exact) -> None:
         measured, true = noisy[index].depth_m, exact[index].depth_m
         holes += np.count_nonzero((measured == 0) & (true > 0))
         near = (measured > 0) & (np.abs(measured - true) < 0.05)
-        ratios.append(((measured - true) / compute_sensor_sigma(true))[near])
+        ratios.append(((measured - true) / STRUCTURED_LIGHT.compute_sigma(true))[near])
     ratio = np.concatenate(ratios)
     assert abs(np.median(ratio)) < 0.05
     assert np.median(np.abs(ratio)) == pytest.approx(0.6745, rel=0.1)  # that of a unit normal distribution

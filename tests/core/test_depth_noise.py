@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import wall_frame, with_sigma
 
-from freeocc3d.core.depth_noise import compute_sensor_sigma, compute_sigma_image, look_up_sigma, take_sigma
+from freeocc3d.core.depth_noise import compute_sigma_image, look_up_sigma, take_sigma
 from freeocc3d.core.depth_sensors import AUTO, SENSORS, STEREO, STRUCTURED_LIGHT, TIME_OF_FLIGHT, find_sensor
 from freeocc3d.core.errors import ConfigError
 from freeocc3d.settings import config
@@ -25,9 +25,9 @@ def test_a_pixel_has_the_standard_deviation_of_the_image(stated) -> None:
 def test_sensors_have_the_noise_of_their_sources() -> None:
     z = np.array([1.0, 2.0, 4.0])
     kinect_v2 = 1e-3 * (1.5 - 0.5 * z + 0.3 * z**2)
-    np.testing.assert_allclose(compute_sensor_sigma(z, TIME_OF_FLIGHT), kinect_v2, rtol=0.01)
+    np.testing.assert_allclose(TIME_OF_FLIGHT.compute_sigma(z), kinect_v2, rtol=0.01)
     subpixel, focal, baseline = 0.08, 425, 0.05
-    np.testing.assert_allclose(compute_sensor_sigma(z, STEREO) - 5e-4, subpixel * z**2 / (focal * baseline), rtol=0.02)
+    np.testing.assert_allclose(STEREO.compute_sigma(z) - 5e-4, subpixel * z**2 / (focal * baseline), rtol=0.02)
     assert find_sensor(AUTO) is STRUCTURED_LIGHT
     assert find_sensor("stereo") is STEREO
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes import CAMERA, lifted, wall_frame, with_sigma
 
-from freeocc3d.core.depth_noise import compute_sensor_sigma
+from freeocc3d.core.depth_sensors import STRUCTURED_LIGHT
 from freeocc3d.core.transforms import project, quats_to_rotations, transform
 from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.gaussians import anchors, depth_edges
@@ -49,7 +49,7 @@ def test_a_near_measurement_outweighs_a_far_one_by_its_uncertainty() -> None:
     near[2, 3], far[2, 3] = 1.1, -1.86
     g = lifted([wall_frame(1.0), wall_frame(4.0)], [near, far], cell=0.25)
     middle = np.abs(g.means[:, :2]).max(axis=1) < 0.3
-    sigma = compute_sensor_sigma(np.float32([1.0, 4.0]))
+    sigma = STRUCTURED_LIGHT.compute_sigma(np.float32([1.0, 4.0]))
     assert sigma[1] / sigma[0] > 10
     assert np.abs(g.means[middle, 2] - 2.10).max() < 0.004
     assert (g.anchor_keyframe[middle] == 0).all()
@@ -83,7 +83,7 @@ def test_discs_lie_on_the_surface_as_thick_as_their_place_is_uncertain() -> None
     T = random_pose(3)
     g = lifted([wall_frame(2.0)], [T], coverage=0.5)
     np.testing.assert_allclose(g.scales[:, :2], 0.5 * CELL)
-    assert (g.scales[:, 2] < compute_sensor_sigma(np.float32(2.0))).all()
+    assert (g.scales[:, 2] < STRUCTURED_LIGHT.compute_sigma(np.float32(2.0))).all()
     local_z = quats_to_rotations(g.quats_wxyz.astype(float))[:, :, 2]
     np.testing.assert_allclose(np.abs(local_z @ T[:3, 2]), 1, atol=1e-5)
     np.testing.assert_allclose(transform(T, g.anchor_cam.astype(float)), g.means, atol=1e-5)

@@ -7,7 +7,7 @@ import pytest
 from scenes import CAMERA, wall_frame
 
 from freeocc3d.core import voxel_keys
-from freeocc3d.core.depth_noise import compute_sensor_sigma
+from freeocc3d.core.depth_sensors import STRUCTURED_LIGHT
 from freeocc3d.core.transforms import project
 from freeocc3d.core.types import Frame, Intrinsics
 from freeocc3d.occupancy import carve
@@ -167,7 +167,7 @@ def count_plainly(frame: Frame, T, centers, voxel_size: float, options: carve.Op
         return np.where(inside, found, 0.0), inside
 
     here, inside = depth_at(row, column)
-    sigma = compute_sensor_sigma(np.abs(depth)) if frame.depth_sigma_m is None else frame.depth_sigma_m
+    sigma = STRUCTURED_LIGHT.compute_sigma(np.abs(depth)) if frame.depth_sigma_m is None else frame.depth_sigma_m
     spread = 3 * sigma[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)].astype(float)
     far = options.margin * voxel_size + spread
     du, dv = (camera.fx * half / safe).astype(int), (camera.fy * half / safe).astype(int)

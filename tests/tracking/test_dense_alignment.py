@@ -8,7 +8,6 @@ from scenes import CAMERA, wall_frame, with_sigma
 from scipy.linalg import expm
 
 from freeocc3d.capture import open_capture
-from freeocc3d.core.depth_noise import compute_sensor_sigma
 from freeocc3d.core.depth_sensors import STRUCTURED_LIGHT
 from freeocc3d.core.transforms import invert, measure_pose_difference, quats_to_rotations
 from freeocc3d.core.types import Frame, Intrinsics
@@ -232,7 +231,7 @@ def reference(source, target, T, brightness, scales, photometric, stride, stated
     if stated:
         sigma = np.hypot(target.sigma_m[it, jt][met], source.sigma_m[i, j][has][inside][met])
     else:
-        sigma = np.hypot(compute_sensor_sigma(q[:, 2]), compute_sensor_sigma(p[:, 2])).astype(float)
+        sigma = np.hypot(STRUCTURED_LIGHT.compute_sigma(q[:, 2]), STRUCTURED_LIGHT.compute_sigma(p[:, 2])).astype(float)
     k = np.abs(r) / sigma
     counts.append((k < 3 * scales[0]).sum())
     weight = 1 / (1 + (k / (2.4 * scales[0])) ** 2) ** 2 / (sigma * scales[0]) ** 2

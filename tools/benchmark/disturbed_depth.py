@@ -131,7 +131,7 @@ def _add_person(
     look: PosedFrame, place: NDArray[np.float64], down: NDArray[np.float64], rng: np.random.Generator
 ) -> Depth:
     """The depth with a cylinder along ``down`` at a place, the height of a camera on a person, with noise."""
-    from freeocc3d.core.depth_noise import compute_sensor_sigma
+    from freeocc3d.core.depth_sensors import STRUCTURED_LIGHT
 
     depth, camera = look.frame.depth_m, look.frame.intrinsics
     v, u = np.indices(depth.shape)
@@ -144,4 +144,4 @@ def _add_person(
     z = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
     height = off @ down + z * (rays @ down)
     hit = (z > 0.3) & (height > -_ABOVE_M) & (height < _BELOW_M) & ((depth == 0) | (z < depth)) & (c > 0)
-    return np.where(hit, z + compute_sensor_sigma(z) * rng.standard_normal(depth.shape), depth)
+    return np.where(hit, z + STRUCTURED_LIGHT.compute_sigma(z) * rng.standard_normal(depth.shape), depth)

@@ -98,6 +98,6 @@ def measure_noise(images: list[NDArray[np.float64]]) -> float | None:
     for low, high in itertools.pairwise(_EDGES_M):
         there = (z >= low) & (z < high)
         if there.sum() >= _LEAST_PIXELS:
-            usual = STRUCTURED_LIGHT.a + STRUCTURED_LIGHT.b * (0.5 * (low + high) - STRUCTURED_LIGHT.z_0) ** 2
+            usual = float(STRUCTURED_LIGHT.compute_sigma(0.5 * (low + high)))
             ratios.append(float(np.sqrt(own[there].mean())) / usual)
     return float(np.median(ratios)) if ratios else None

@@ -15,7 +15,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from ...core.compiling import njit
-from ...core.depth_noise import compute_sensor_sigma
+from ...core.depth_sensors import STRUCTURED_LIGHT
 from ...core.errors import CaptureError, ConfigError
 from ...core.transforms import back_project, invert
 from ...core.types import FREE, UNKNOWN, Frame, Intrinsics
@@ -282,7 +282,7 @@ def disturbed_depth(
     columns = np.clip(np.arange(width)[None] + shift[1], 0, width - 1)
     edges = _edges(depth_m)
     noisy = np.where(edges, depth_m[rows, columns], depth_m)
-    noisy = noisy + compute_sensor_sigma(noisy) * rng.standard_normal(noisy.shape, np.float32)
+    noisy = noisy + STRUCTURED_LIGHT.compute_sigma(noisy) * rng.standard_normal(noisy.shape, np.float32)
     chance = np.where(edges, _EDGE_HOLES, np.clip((_GRAZING[1] - cosine) / (_GRAZING[1] - _GRAZING[0]), 0, 1))
     holes = (rng.random(depth_m.shape, np.float32) < chance) | (depth_m < _NEAREST_M)
     return np.where(holes, 0, np.rint(noisy * _MILLIMETERS) / _MILLIMETERS).astype(np.float32)

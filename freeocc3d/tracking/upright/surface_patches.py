@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.depth_noise import compute_sensor_sigma
 from ...core.depth_sensors import DepthSensor
 from ...core.transforms import transform
 from ...core.types import Intrinsics
@@ -96,7 +95,7 @@ def find_patches(
     y = (step * (_EDGE * row + (_EDGE - 1) / 2) - camera.cy) / camera.fy + at_v
     depth = 1 / inverse
     if isinstance(sigma, DepthSensor):
-        sigma_m = compute_sensor_sigma(depth, sigma).astype(np.float64)
+        sigma_m = sigma.compute_sigma(depth).astype(np.float64)
     else:
         sigma_m = cut(sigma)[measured].sum(axis=1) / (blocks[measured] > 0).sum(axis=1)
     flat = off * depth**2 < _NOISE * sigma_m + _ROUGH * depth
