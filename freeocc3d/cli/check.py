@@ -10,27 +10,13 @@ import typer
 
 from ..core.atomic_files import refuse_existing
 from .console import Json, MapPath, Overwrite
-from .map_summary import length_text
+from .map_summary import MEASURE_NAMES, length_text
 
 if TYPE_CHECKING:
     from ..pipeline.map_check import MapCheck, Measure
     from ..query.scan_map import Map
 
 _WORST = 5
-_LABELS = {
-    "step": "depth, from keyframe to keyframe",
-    "revisit": "depth, at revisits",
-    "step_gray": "gray values, from keyframe to keyframe",
-    "revisit_gray": "gray values, at revisits",
-    "seen_through": "occupied voxels that frames see through",
-    "unmeasured": "occupied voxels in which no depth ends",
-    "closures_refused": "loop closures that the poses contradict",
-    "distortion": "smooth error of depth across the image",
-    "psnr_held_out": "rendered frames between keyframes",
-    "psnr_keyframes": "rendered keyframes",
-    "rendered": "measured pixels that Gaussians cover",
-    "posed": "used frames that have a pose",
-}
 _RELATIVE = {
     "step": "of the depth",
     "revisit": "x the step's for its distances",
@@ -97,7 +83,7 @@ def check_text(loaded: Map, found: MapCheck) -> str:
     """What ``check`` prints for people."""
     rows = [("", "measured", "usual", "")]
     rows += [
-        (_LABELS[measure.name], _value(measure, loaded.metric), _usual(measure), measure.verdict or "not told")
+        (MEASURE_NAMES[measure.name], _value(measure, loaded.metric), _usual(measure), measure.verdict or "not told")
         for measure in found.measures
     ]
     widths = [max(len(row[column]) for row in rows) for column in range(3)]

@@ -14,6 +14,23 @@ if TYPE_CHECKING:
 _SHOWN_NAMES = 12
 
 
+MEASURE_NAMES = {
+    "step": "depth, from keyframe to keyframe",
+    "revisit": "depth, at revisits",
+    "step_gray": "gray values, from keyframe to keyframe",
+    "revisit_gray": "gray values, at revisits",
+    "seen_through": "occupied voxels that frames see through",
+    "unmeasured": "occupied voxels in which no depth ends",
+    "closures_refused": "loop closures that the poses contradict",
+    "distortion": "smooth error of depth across the image",
+    "psnr_held_out": "rendered frames between keyframes",
+    "psnr_keyframes": "rendered keyframes",
+    "rendered": "measured pixels that Gaussians cover",
+    "posed": "used frames that have a pose",
+}
+"""What the measures of ``check`` are, in words."""
+
+
 def summary_document(loaded: Map) -> dict[str, Any]:
     """What ``info --json`` prints."""
     manifest, report = loaded.manifest, loaded.report
@@ -133,7 +150,10 @@ def _check_text(check: dict[str, Any], metric: bool) -> str:
     depth = f", depth differs by {', by '.join(parts)}" if parts else ""
     through = told.get("seen_through")
     seen = f", {through['value']:.1%} of the occupied voxels are seen through" if through else ""
-    return f"check      {check['verdict'] or 'nothing to compare'}{depth}{seen}"
+    verdict = check["verdict"]
+    doubtful = [MEASURE_NAMES[name] for name, said in told.items() if said["verdict"] == verdict != "good"]
+    why = f" ({'; '.join(doubtful)})" if doubtful else ""
+    return f"check      {verdict or 'nothing to compare'}{why}{depth}{seen}"
 
 
 def length_text(value: float, metric: bool) -> str:

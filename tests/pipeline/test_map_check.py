@@ -43,7 +43,7 @@ def test_a_saved_map_has_every_measure(room: Map, checked: MapCheck) -> None:
     assert {measure.verdict for measure in told.values()} <= {"good", "fair", ""}
 
 
-def test_the_run_has_told_the_same(room: Map, checked: MapCheck) -> None:
+def test_the_run_has_told_the_same(room: Map, checked: MapCheck, monkeypatch: pytest.MonkeyPatch) -> None:
     report, told = room.report["check"], measures(checked)
     assert set(report["measures"]) < set(told)
     for name, said in report["measures"].items():
@@ -51,6 +51,10 @@ def test_the_run_has_told_the_same(room: Map, checked: MapCheck) -> None:
         assert said["value"] == (value and pytest.approx(value, rel=1e-4)), name
     assert room.report["seconds"]["check"] > 0
     assert f"check      {report['verdict']}, depth differs by" in summary_text(room)
+    poor = {**report["measures"]["unmeasured"], "verdict": "poor"}
+    changed = {**room.report, "check": {"verdict": "poor", "measures": {"unmeasured": poor}}}
+    monkeypatch.setitem(vars(room), "report", changed)
+    assert "check      poor (occupied voxels in which no depth ends)\n" in summary_text(room) + "\n"
 
 
 def test_wrong_poses_and_voxels_show(room: Map, checked: MapCheck, monkeypatch: pytest.MonkeyPatch) -> None:
