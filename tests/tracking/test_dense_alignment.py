@@ -80,7 +80,7 @@ def plane_at(depth: np.ndarray, i: int, j: int, step: int, window: int) -> np.nd
         return None
     inverse, du, dv = 1.0 / np.where(depth > 0, depth.astype(float), np.inf), u - u0, v - v0
     near = inverse[square][np.argmin((du**2 + dv**2)[square])]
-    rows, columns = (np.arange(max(0, int(c) - window + 1), int(c) + window + 1, every) for c in (v0, u0))
+    rows, columns = (np.arange(int(c) - window + 1, int(c) + window + 1, every) for c in (v0, u0))
     around = np.isin(v, rows) & np.isin(u, columns) & (depth > 0)
     plane = np.array((near, 0.0, 0.0))
     for allowed in (0.04 * near, 0.012 * near):

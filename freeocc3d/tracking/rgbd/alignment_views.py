@@ -43,6 +43,10 @@ _LEAST_FACING = 0.12
 
 _FARTHER = math.inf  # squared pixels
 
+_LANES = 32
+"""Centers to which planes are fitted at once: with a constant number, a compiler adds several sums by one instruction,
+and keeps them in the first cache."""
+
 
 @dataclass(frozen=True)
 class AlignmentView:
@@ -112,77 +116,140 @@ def fit_planes(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Points and normals (h, w, 3) of planes 1/z = a + b (u - u0) + c (v - v0), fitted around every ``step``-th pixel
     center (u0, v0) to the depths of one surface within ``window`` pixels; 0 with too few depths."""
-    H, W = depth_m.shape
-    h, w = H // step, W // step
+    h, w = depth_m.shape[0] // step, depth_m.shape[1] // step
     points = np.zeros((h, w, 3), np.float32)
     normals = np.zeros((h, w, 3), np.float32)
-    stride = 2 if window >= 4 else 1
-    inverse_m = np.zeros((H, W))  # 0 without a depth; each is used in many windows
-    for v in range(H):
-        for u in range(W):
-            if depth_m[v, u] > 0:
-                inverse_m[v, u] = 1.0 / depth_m[v, u]
+    inverse_m, near = _invert_depth(depth_m, step, window)
+    plane = np.empty((4, _LANES), np.float32)
     for i in range(h):
-        v0 = i * step + 0.5 * (step - 1)
-        for j in range(w):
-            u0 = j * step + 0.5 * (step - 1)
-            near = 0.0
-            best = _FARTHER
-            for v in range(i * step, min(i * step + step, H)):
-                for u in range(j * step, min(j * step + step, W)):
-                    d = (u - u0) ** 2 + (v - v0) ** 2
-                    if inverse_m[v, u] > 0 and d < best:
-                        best = d
-                        near = inverse_m[v, u]
-            if near == 0.0:
-                continue
-            a, b, c = near, 0.0, 0.0
-            good = False
-            for sweep in range(2):
-                allowed = _SAME_SURFACE * near if sweep == 0 else _ON_PLANE * near
-                n = suu = svv = suv = su = sv = 0.0
-                sw = swu = swv = 0.0
-                for v in range(max(0, int(v0) - window + 1), min(H, int(v0) + window + 1), stride):
-                    dv = v - v0
-                    for u in range(max(0, int(u0) - window + 1), min(W, int(u0) + window + 1), stride):
-                        inverse = inverse_m[v, u]
-                        if inverse == 0:
-                            continue
-                        du = u - u0
-                        if abs(inverse - (a + b * du + c * dv)) > allowed:
-                            continue
-                        n += 1.0
-                        su += du
-                        sv += dv
-                        suu += du * du
-                        svv += dv * dv
-                        suv += du * dv
-                        sw += inverse
-                        swu += inverse * du
-                        swv += inverse * dv
-                if n < _LEAST_FITTED:
-                    good = False
-                    break
-                mu, mv, mw = su / n, sv / n, sw / n
-                uu, vv, uv = suu / n - mu * mu, svv / n - mv * mv, suv / n - mu * mv
-                wu, wv = swu / n - mw * mu, swv / n - mw * mv
-                det = uu * vv - uv * uv
-                if det < _LEAST_SPREAD * window**4 / 9:
-                    good = False
-                    break
-                b = (wu * vv - wv * uv) / det
-                c = (wv * uu - wu * uv) / det
-                a = mw - b * mu - c * mv
-                good = a > 0
-            if not good:
-                continue
-            z = 1.0 / a
-            x, y = (u0 - cx) / fx * z, (v0 - cy) / fy * z
-            nx, ny, nz = b * fx, c * fy, a + b * (cx - u0) + c * (cy - v0)
-            length = math.sqrt(nx * nx + ny * ny + nz * nz)
-            grazing = 1.0 / (length * math.sqrt(x * x + y * y + z * z))  # n . X = 1
-            if grazing < _LEAST_FACING:
-                continue
-            points[i, j, 0], points[i, j, 1], points[i, j, 2] = x, y, z
-            normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = nx / length, ny / length, nz / length
+        y = (i * step + 0.5 * (step - 1) - cy) / fy
+        for first in range(0, w, _LANES):
+            _fit_row(inverse_m, near, i, first, step, window, plane)
+            for k in range(min(_LANES, w - first)):
+                j = first + k
+                a = near[i, j] + plane[0, k]
+                if plane[3, k] <= 0 or a <= 0:
+                    continue
+                x = (j * step + 0.5 * (step - 1) - cx) / fx
+                nx, ny = plane[1, k] * fx, plane[2, k] * fy
+                nz = a - nx * x - ny * y  # n . X = 1
+                length = math.sqrt(nx * nx + ny * ny + nz * nz)
+                if a < _LEAST_FACING * length * math.sqrt(x * x + y * y + 1.0):
+                    continue
+                z = 1.0 / a
+                points[i, j, 0], points[i, j, 1], points[i, j, 2] = x * z, y * z, z
+                normals[i, j, 0], normals[i, j, 1], normals[i, j, 2] = nx / length, ny / length, nz / length
     return points, normals
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _window_pixels(step: int, window: int) -> tuple[int, int, int]:
+    """The first pixel of a center's window, the one after the last, both from the first pixel of the center's square,
+    and the step between those that are fitted."""
+    middle = (step - 1) // 2
+    return middle - window + 1, middle + window + 1, 2 if window >= 4 else 1
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _invert_depth(
+    depth_m: NDArray[np.float32], step: int, window: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(H, step, w + margins) inverse depths, 0 without a depth: that of pixel (v, u) at [v, u % step, u // step +
+    margin], so that what neighboring centers compare lies side by side. (h, w + lanes) those nearest to the centers."""
+    H, W = depth_m.shape
+    h, w = H // step, W // step
+    first, _, stride = _window_pixels(step, window)
+    margin = window // step + 1
+    inverse_m = np.zeros((H, step, w + _LANES + 2 * margin), np.float32)
+    every = stride if step % stride == 0 else 1  # windows hold no other pixels
+    for v in range(first % every, H, every):
+        for phase in range(first % every, step, every):
+            for j in range(min(w + margin, (W - phase + step - 1) // step)):
+                z = depth_m[v, j * step + phase]
+                if z > 0:
+                    inverse_m[v, phase, j + margin] = 1.0 / z
+    near = np.zeros((h, w + _LANES), np.float32)
+    middle, center = (step - 1) // 2, 0.5 * (step - 1)
+    for i in range(h):
+        for j in range(w):
+            z = depth_m[i * step + middle, j * step + middle]
+            if not z > 0:
+                best = _FARTHER
+                for v in range(step):
+                    for u in range(step):
+                        d = (u - center) ** 2 + (v - center) ** 2
+                        if depth_m[i * step + v, j * step + u] > 0 and d < best:
+                            best = d
+                            z = depth_m[i * step + v, j * step + u]
+            if z > 0:
+                near[i, j] = 1.0 / z
+    return inverse_m, near
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _fit_row(
+    inverse_m: NDArray[np.float32],
+    near: NDArray[np.float32],
+    i: int,
+    first: int,
+    step: int,
+    window: int,
+    plane: NDArray[np.float32],
+) -> None:
+    """Fit the planes of ``_LANES`` centers of row ``i`` at once: the innermost loops are over centers.
+
+    plane: receives a - near, b, c and the largest difference from the plane, which is negative where there is none.
+    """
+    begin, end, stride = _window_pixels(step, window)
+    center, margin, height = 0.5 * (step - 1), window // step + 1, len(inverse_m)
+    nearest = np.empty(_LANES, np.float32)
+    row, total = np.empty((6, _LANES), np.float32), np.empty((9, _LANES), np.float32)
+    least = np.float32(_LEAST_SPREAD * window**4 / 9)
+    for k in range(_LANES):
+        nearest[k] = near[i, first + k]
+        plane[0, k] = plane[1, k] = plane[2, k] = np.float32(0)
+        plane[3, k] = np.float32(_SAME_SURFACE) * nearest[k]
+    for _ in range(2):
+        for s in range(9):
+            for k in range(_LANES):
+                total[s, k] = np.float32(0)
+        for v in range(begin, end, stride):
+            if not 0 <= i * step + v < height:
+                continue
+            dv = np.float32(v - center)
+            for k in range(_LANES):
+                row[0, k] = row[1, k] = row[2, k] = row[3, k] = row[4, k] = np.float32(0)
+                row[5, k] = nearest[k] + plane[0, k] + plane[2, k] * dv
+            for u in range(begin, end, stride):
+                du = np.float32(u - center)
+                values = inverse_m[i * step + v, u % step, first + u // step + margin :]
+                for k in range(_LANES):
+                    held = (values[k] > 0) & (abs(values[k] - row[5, k] - plane[1, k] * du) <= plane[3, k])
+                    one = np.float32(1) if held else np.float32(0)
+                    above = values[k] - nearest[k] if held else np.float32(0)
+                    row[0, k] += one
+                    row[1, k] += one * du
+                    row[2, k] += one * (du * du)
+                    row[3, k] += above
+                    row[4, k] += above * du
+            for k in range(_LANES):
+                total[0, k] += row[0, k]
+                total[1, k] += row[1, k]
+                total[2, k] += row[0, k] * dv
+                total[3, k] += row[2, k]
+                total[4, k] += row[0, k] * (dv * dv)
+                total[5, k] += row[1, k] * dv
+                total[6, k] += row[3, k]
+                total[7, k] += row[4, k]
+                total[8, k] += row[3, k] * dv
+        for k in range(_LANES):
+            n = total[0, k]
+            mu, mv, mw = total[1, k] / n, total[2, k] / n, total[6, k] / n
+            uu, vv, uv = total[3, k] / n - mu * mu, total[4, k] / n - mv * mv, total[5, k] / n - mu * mv
+            wu, wv = total[7, k] / n - mw * mu, total[8, k] / n - mw * mv
+            det = uu * vv - uv * uv
+            good = (n >= _LEAST_FITTED) & (det >= least) & (plane[3, k] > 0)
+            plane[1, k] = (wu * vv - wv * uv) / det
+            plane[2, k] = (wv * uu - wu * uv) / det
+            plane[0, k] = mw - plane[1, k] * mu - plane[2, k] * mv
+            plane[3, k] = np.float32(_ON_PLANE) * nearest[k] if good else np.float32(-1)
