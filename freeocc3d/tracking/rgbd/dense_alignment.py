@@ -75,6 +75,10 @@ BRIGHTNESS_DAMPING = 1e-9
 STILL = 2e-4
 """Radians and meters: a smaller step ends the level."""
 
+_STRIDE = 2
+"""Step between source pixels before the last step. Neighboring pixels carry nearly the same information: the fits of
+their planes share most depths, and the blurred image much of its noise."""
+
 _SMALL_ANGLE = 1e-7  # radians: below it sin(x) / x and similar terms equal their limits, up to rounding
 _TINY = 1e-12  # avoids a division by eigenvalues of exactly 0
 
@@ -88,7 +92,8 @@ def align_views(
 ) -> ViewAlignment:
     """Refine the pose of ``source`` in ``target`` from an initial guess, coarse to fine.
 
-    iterations: largest number of steps at each level, coarsest first.  photometric: weight of the intensities.
+    iterations: largest number of steps at each level, coarsest first; one more step compares every pixel.
+    photometric: weight of the intensities.
     """
     T = np.array(T_target_source, np.float64)
     equations = make_equations()
@@ -130,10 +135,13 @@ def _descend(
     the last step."""
     H, g = equations.H, equations.g
     weighting = Weighting(np.array(FIRST_SPREADS), np.array((1.0, 0.0)), photometric)
-    for done in range(len(iterations)):
-        level = len(iterations) - 1 - done
-        for _ in range(iterations[done]):
-            linearize(source[level], target[level], camera, T, 1 << level, weighting, equations)
+    levels = len(iterations)
+    for done in range(levels + 1):
+        last = done == levels  # one step that compares every pixel
+        level = 0 if last else levels - 1 - done
+        stride = 1 if last else max(_STRIDE, 1 << level)
+        for _ in range(1 if last else iterations[done]):
+            linearize(source[level], target[level], camera, T, stride, weighting, equations)
             if equations.statistics[2] < LEAST_MET:
                 return
             information, gradient = eliminate_brightness(H, g)
