@@ -8,7 +8,7 @@ with phi_k(x) = exp(-1/2 (x - mu_k)^T Sigma_k^-1 (x - mu_k)), Sigma_k = R(r_k) d
 
     probabilistic   c_k = phi_k(x): the paper's; opacity plays no part                                         (A)
     poisson         c_k = 1 - exp(-o_k phi_k(x)), so that alpha = 1 - exp(-sum_k o_k phi_k(x))
-    integrated      c_k = 1 - (1 - m_k(x))^a_k, m_k(x) being the mass of N(mu_k, Sigma_k) within V(x), and a_k the area
+    integrated      c_k = 1 - (1 - m_k(x))^a_k, m_k(x) being the mass of N(mu_k, Sigma_k') within V(x), and a_k the area
                     that a Gaussian stands for, over that of a cell of half a voxel's edge. For the default cells, a_k
                     is 1, and c_k the mass; the default
     released        as poisson, with Sigma_k (m^2) in place of Sigma_k^-1: what the paper's code seems to compute. phi
@@ -30,6 +30,10 @@ sum over a surface of Gaussians stays the same. The limit comes from Mip-Splatti
 The weight follows the area because the Gaussians of occupancy lie next to each other on surfaces. Mass needs no limit:
 it is exact at any size.
 
+Gaussians that are rendered overlap widely, lest one sees between them. Sigma' is as narrow along the surface as an even
+sheet allows: of Gaussians a spacing apart with a deviation of half a spacing, it is even to 4 exp(-2 pi^2 / 4), 3 %. So
+a surface ends in the voxel where it ends. No deviation becomes smaller than the least.
+
 Why mass: a thin disc tells in which voxels a surface lies, however near it is to their faces, while phi at a voxel's
 center tells how near the center is to the surface. A surface that runs close to a face is one voxel thick, not two.
 """
@@ -48,8 +52,9 @@ from .gaussian_bins import INTEGRATED, MODES, PROBABILISTIC, RELEASED, Bins, pre
 
 _MOST_TOUCHED = 1 << 28
 """Pairs of a Gaussian and a block that it touches; a Gaussian of a map touches about ten."""
-_SPACED = 0.7
-"""Deviations along a surface over the spacing of its Gaussians (``gaussians.coverage``)."""
+_SPACED, _EVEN = 0.7, 0.5
+"""Deviations along a surface over the spacing of its Gaussians: of rendered ones (``gaussians.coverage``), and of those
+whose mass counts."""
 _MOST_OF_EACH, _FEW_TOUCHED = 512, 1 << 20
 """Blocks that Gaussians touch on average, at most, and a number of pairs that takes no time."""
 
@@ -79,7 +84,7 @@ def bin_gaussians(
     if shape is None:
         _refuse_far(gaussians, origin, options, least_scale)
     mode = MODES[options.projection]
-    scales, share = widen_scales(gaussians.scales, least_scale, options)
+    scales, share = adapt_scales(gaussians.scales, least_scale, options)
     means, form, log_weight, lo, hi = prepare_gaussians(
         gaussians.means, scales, gaussians.quats_wxyz, gaussians.opacities, origin, options.voxel_size,
         options.cutoff, mode,
@@ -116,14 +121,15 @@ def _refuse_many(lo: NDArray[np.int32], hi: NDArray[np.int32], options: Options)
         )
 
 
-def widen_scales(
+def adapt_scales(
     scales: NDArray[np.float32], least_scale: float, options: Options
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns (N, 3) deviations, meters, of s_min or more where the mode needs it, and (N,) factors: of phi, or a_k."""
+    """Returns (N, 3) deviations, meters, as the mode needs them, and (N,) factors: of phi, or a_k."""
     mode = MODES[options.projection]
     if mode == INTEGRATED:
-        _, middle, most = np.sort(scales, axis=1).T
-        return scales, np.asarray(middle * most / np.float32(_SPACED * 0.5 * options.voxel_size) ** 2, np.float32)
+        least, middle, most = np.sort(scales, axis=1).T
+        area = middle * most / np.float32(_SPACED * 0.5 * options.voxel_size) ** 2
+        return np.maximum(np.float32(_EVEN / _SPACED) * scales, least[:, None]), np.asarray(area, np.float32)
     if least_scale == 0 or mode == RELEASED:
         return scales, np.ones(len(scales), np.float32)
     wide = np.maximum(scales, np.float32(least_scale))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.transforms import quats_to_rotations
 from ..core.types import Gaussians
-from .splat import _SPACED, Options
+from .splat import _EVEN, _SPACED, Options
 
 
 def compute_contributions_reference(
@@ -72,15 +72,15 @@ def _squared_distances(gaussians: Gaussians, points: NDArray[np.float64]) -> NDA
 def measure_masses_reference(
     gaussians: Gaussians, points: NDArray[np.float64], options: Options
 ) -> NDArray[np.float64]:
-    """Returns the (P, N) mass of each Gaussian in the voxel around each point, by SciPy's quadrature; 0 where the voxel
-    does not touch the Gaussian's bounding box at the cutoff."""
+    """Returns the (P, N) mass of each Gaussian, as narrow as an even sheet allows, in the voxel around each point, by
+    SciPy's quadrature; 0 where the voxel does not touch the Gaussian's bounding box at the cutoff."""
     from scipy.stats import multivariate_normal
 
     half = 0.5 * options.voxel_size
     masses = np.zeros((len(points), len(gaussians)))
     R = quats_to_rotations(gaussians.quats_wxyz.astype(np.float64))
-    for n in range(len(gaussians)):
-        mean, axes = gaussians.means[n].astype(np.float64), R[n] * gaussians.scales[n].astype(np.float64)
+    for n, scales in enumerate(gaussians.scales.astype(np.float64)):
+        mean, axes = gaussians.means[n].astype(np.float64), R[n] * np.clip(scales * _EVEN / _SPACED, scales.min(), None)
         covariance = axes @ axes.T
         near = (np.abs(points - mean) <= half + options.cutoff * np.sqrt(np.diag(covariance))).all(axis=1)
         for p in np.flatnonzero(near):

@@ -177,6 +177,17 @@ def test_finer_and_coarser_discs_make_the_same_surface() -> None:
     assert np.ptp(thin) < 0.05
 
 
+def test_a_surface_is_even_up_to_the_voxel_in_which_it_ends() -> None:
+    for offset in (0.0, 0.1, 0.25, 0.4):
+        means = flat_grid(0.5 * V, 20) + (0.25 * V, (0.25 + offset) * V, 0.5 * V)  # x ends at the face x = 5 V
+        g = gaussians(means, (0.35 * V, 0.35 * V, 0.002))
+        _, keys, alpha, _ = project(g, projection="integrated")
+        x, y, z = (keys[:, None] * 8 + LOCAL).reshape(-1, 3).T
+        inner, beyond = ((z == 0) & (np.abs(y) < 3) & (x == place) for place in (3, 5))
+        assert np.ptp(alpha.reshape(-1)[inner]) < 0.03
+        assert 0 < alpha.reshape(-1)[beyond].max() < 0.33
+
+
 def test_an_unknown_projection_is_refused_with_what_there_is() -> None:
     with pytest.raises(ConfigError, match="integrated, probabilistic, poisson"):
         splat.Options(projection="average")
