@@ -5,13 +5,14 @@ from benchmark import upright_layers
 
 
 def room() -> np.ndarray:
-    """Labels of a room of 20 x 16 x 12: 1 floor, 2 walls, 3 a cupboard at the wall of the least x, 0 free."""
+    """Labels of a room of 20 x 16 x 12: 1 floor, 2 walls, 3 a cupboard and a lamp at the wall of least x, 0 free."""
     labels = np.full((24, 20, 12), 255, np.uint8)
     labels[2:22, 2:18] = 0
     labels[2:22, 2:18, 0] = 1
     labels[2, 2:18, 1:] = labels[21, 2:18, 1:] = 2
     labels[2:22, 2, 1:] = labels[2:22, 17, 1:] = 2
     labels[3:6, 4:8, 1:6] = 3
+    labels[3, 12, 8] = 3
     return labels
 
 
@@ -30,6 +31,7 @@ def test_walls_are_bare_where_nothing_touches_them() -> None:
     assert not across_x[2, 5, 3]  # the cupboard
     assert not across_x[2, 9, 3]  # within two voxels of it
     assert across_x[2, 5, 8]  # above it
+    assert not across_x[2, 12, 8]  # the lamp
     assert not across_x[2, 4, 8]  # two voxels from a corner
     assert not across_x[10, 2, 3]
     assert across_y[10, 2, 3]

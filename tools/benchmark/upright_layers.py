@@ -91,10 +91,11 @@ def find_bare_floor(labels: NDArray[np.uint8], floor: NDArray[np.bool_], above: 
 
 def find_bare_walls(labels: NDArray[np.uint8], wall: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(X, Y, Z) voxels of walls across x, and of walls across y, with nothing beside them, nor beside the next voxels
-    of the wall: a map may lie a voxel aside."""
+    of the wall: a map may lie a voxel aside. Lamps, pictures and curtains are beside a wall."""
     occupied = (labels > 0) & (labels < 255)
     lengths = [measure_runs(occupied, axis) for axis in (0, 1)]
-    x, y = (wall & (lengths[a] <= _THIN) & (measure_runs(wall, 1 - a) >= _LONG) for a in (0, 1))
+    others = [_neighbors(occupied & ~wall, axis, _THIN).any(axis=0) for axis in (0, 1)]
+    x, y = (wall & ~others[a] & (lengths[a] <= _THIN) & (measure_runs(wall, 1 - a) >= _LONG) for a in (0, 1))
     x, y = (np.asarray(_neighbors(walls, 2, 1).all(axis=0)) for walls in (x, y))  # neither floor nor ceiling
     return np.asarray(_neighbors(x, 1, _MARGIN).all(axis=0)), np.asarray(_neighbors(y, 0, _MARGIN).all(axis=0))
 
