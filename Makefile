@@ -57,9 +57,9 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 		{ echo "freeocc3d needs Python 3.11 or 3.12: run 'make PYTHON=python3.12 $(MAKECMDGOALS)'"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
-	@echo "Compiling kernels, once, for about a minute"
-	@made=$$(mktemp -d) && { $(BIN)/freeocc3d demo --frames 12 -o $$made/demo >$$made/log 2>&1 || tail -3 $$made/log >&2; }; \
-		rm -rf $$made
+	@echo "Compiling kernels, once, for about half a minute"
+	@$(BIN)/python -m freeocc3d.core.ahead_of_time 2>/dev/null || { made=$$(mktemp -d) && \
+		{ $(BIN)/freeocc3d demo --frames 12 -o $$made/demo >$$made/log 2>&1 || tail -3 $$made/log >&2; }; rm -rf $$made; }
 	@touch $@
 
 # Libraries that the wheels of open3d (libusb, libgomp) and pyvista (EGL, GL) load but do not contain.

@@ -3,6 +3,7 @@
 
 A path in the site-packages of the new environment points to the dependencies of this interpreter's environment, so
 nothing is downloaded. freeocc3d itself can only come from the wheel: the new processes start outside the repository.
+The demo has neither a home nor kernels but those of the wheel, and must compile nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import venv
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-SOURCES = ("freeocc3d", "configs", "setup.cfg", "pyproject.toml", "README.md", "LICENSE")
+SOURCES = ("freeocc3d", "configs", "setup.cfg", "pyproject.toml", "tools/build_backend.py", "README.md", "LICENSE")
 FRAMES = 12
 PICTURES = ("map.png", "query_red_cup.png", "query_blue_chair.png", "query_green_plant.png")
 
@@ -28,8 +29,11 @@ def build_wheel(folder: Path) -> Path:
     sources.mkdir()
     for name in SOURCES:
         path = REPOSITORY / name
+        (sources / name).parent.mkdir(exist_ok=True)
         if path.is_dir():
-            shutil.copytree(path, sources / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(
+                path, sources / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__", "compiled")
+            )
         else:
             shutil.copy(path, sources / name)
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
@@ -49,9 +53,9 @@ def install(wheel: Path, folder: Path) -> Path:
     return python.parent
 
 
-def run(command: list[str], folder: Path) -> str:
-    """The stdout of a command that starts in a folder outside the repository."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+def run(command: list[str], folder: Path, **added: str) -> str:
+    """The stdout of a command that starts in a folder outside the repository, with added variables."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")} | added
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
@@ -68,7 +72,10 @@ def main() -> None:
             raise SystemExit(f"freeocc3d comes from {found}, not from the wheel")
         command = str(programs / "freeocc3d")
         run([command, "list"], folder)
-        print(run([command, "demo", "--frames", str(FRAMES), "-o", "demo"], folder))
+        variables = {"HOME": "/nonexistent", "NUMBA_CACHE_DIR": str(folder / "kernels")}
+        print(run([command, "demo", "--frames", str(FRAMES), "-o", "demo"], folder, **variables))
+        if compiled := [path.name for path in folder.glob("kernels/*/*.nbc")]:
+            raise SystemExit(f"the first run compiled {', '.join(compiled)}")
         if missing := [name for name in PICTURES if not (folder / "demo" / name).is_file()]:
             raise SystemExit(f"the demo left out {', '.join(missing)}")
         print(f"{wheel.name}: {wheel.stat().st_size:,} bytes, installed, and its demo ran")

@@ -21,6 +21,7 @@ import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 
 from .kernel_folders import find_writable_folder
+from .portable_kernels import FOLDER, PortableCache, runs_here
 
 _stamps: dict[Any, str] = {}
 """What the code of each compiled function depends on, hashed."""
@@ -40,9 +41,9 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 class _Cache:
-    """Numba's interface of caches. Reads from the folder that can be written. What that lacks it reads from the
-    installation, which may hold the kernels of a container's image, unless the user chose a folder. A damaged or
-    missing file, or a full disk, is never an error."""
+    """Numba's interface of caches. Reads from the folder that can be written. What that lacks it reads from the kernels
+    that were compiled ahead of time, then from the installation, which may hold the kernels of a container's image,
+    unless the user chose a folder. A damaged or missing file, or a full disk, is never an error."""
 
     def __init__(self, function: Callable[..., Any]):
         source = Path(function.__code__.co_filename).parent
@@ -51,6 +52,8 @@ class _Cache:
         chosen = self._own is not None and "NUMBA_CACHE_DIR" in os.environ
         folders = dict.fromkeys((self._own, None if chosen else source / "__pycache__"))
         self._caches = [_open_folder(function, folder, stamp) for folder in folders if folder is not None]
+        if runs_here():
+            self._caches.insert(self._own is not None, open_portable(function))
 
     @property
     def cache_path(self) -> str | None:
@@ -109,10 +112,15 @@ class _Locator:
         return str(self._line)
 
 
-def _open_folder(function: Callable[..., Any], folder: Path, stamp: str) -> FunctionCache:
+def open_portable(function: Callable[..., Any]) -> PortableCache:
+    """The files of a function that is compiled ahead of time (``ahead_of_time``)."""
+    return _open_folder(function, FOLDER / function.__module__, _stamps[function], PortableCache)
+
+
+def _open_folder(function: Callable[..., Any], folder: Path, stamp: str, kind: type = FunctionCache) -> Any:
     locators = [_Locator(function, folder, stamp)]
     implementation = type("Files", (CompileResultCacheImpl,), {"_locator_classes": locators})
-    return type("Folder", (FunctionCache,), {"_impl_class": implementation})(function)
+    return type("Folder", (kind,), {"_impl_class": implementation})(function)
 
 
 def _hash_dependencies(function: Callable[..., Any]) -> str:

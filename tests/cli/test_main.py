@@ -14,6 +14,8 @@ import yaml
 from command_line import SMALL, refused, run
 from small_captures import data_folder, write_scannet, write_seven_scenes
 
+from freeocc3d.core.portable_kernels import runs_here
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -113,9 +115,17 @@ def test_every_help_page_explains_every_option(command: list[str]) -> None:
     assert "Usage: freeocc3d" in run(*command, "--help").stdout
 
 
-def test_the_demo_thins_the_walk_and_answers_its_words(tmp_path) -> None:
-    out = tmp_path / "demo"
-    done = run("demo", "-o", out, "--frames", 12)
+def test_the_demo_thins_the_walk_answers_its_words_and_compiles_nothing_that_was_compiled_ahead(
+    tmp_path, monkeypatch
+) -> None:
+    out, kernels = tmp_path / "demo", tmp_path / "kernels"
+    if runs_here():
+        subprocess.run([sys.executable, "-m", "freeocc3d.core.ahead_of_time"], check=True)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(kernels))
+    monkeypatch.setenv("HOME", "/nonexistent")
+    done = run("demo", "-o", out, "--frames", 12, encoding="utf-8")
+    if runs_here():
+        assert not list(kernels.rglob("*.nbc")), "write freeocc3d/core/first_kernels.txt anew (tools/list_kernels.py)"
     assert "12 in the capture, 12 used" in done.stdout
     assert "blue chair: " in done.stdout
     assert "blue chair: no match" not in done.stdout

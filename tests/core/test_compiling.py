@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from freeocc3d.core import compiling
+from freeocc3d.core import compiling, portable_kernels
 
 CALLED = "from freeocc3d.core.compiling import njit\n@njit(cache=True)\ndef add(a):\n    return a + 1\n"
 CALLING = (
@@ -72,6 +72,38 @@ def test_kernels_of_a_read_only_installation_are_read(kernel, monkeypatch: pytes
     assert again(1) == 3
     assert was_cached(again)
     assert again(1.5) == 3.5  # a signature that was not kept
+
+
+def test_portable_kernels_are_read_by_processors_of_their_level(
+    kernel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiling, "FOLDER", tmp_path / "portable")
+    monkeypatch.setattr(compiling, "runs_here", lambda: True)
+    ahead = kernel()
+    ahead._cache = compiling.open_portable(ahead.py_func)
+    assert ahead(1) == 3
+    assert list((tmp_path / "portable").rglob("calling*.nbc"))
+    assert not list((tmp_path / "__pycache__").glob("calling*.nbc"))
+    found = kernel()
+    assert found(1) == 3
+    assert was_cached(found)
+    monkeypatch.setattr(compiling, "runs_here", lambda: False)
+    elsewhere = kernel()
+    assert elsewhere(1) == 3
+    assert not was_cached(elsewhere)
+    monkeypatch.setattr(compiling, "runs_here", lambda: True)
+    assert kernel(step=10)(1) == 30
+
+
+def test_the_level_of_processors_is_told_by_their_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    features = {name[1:]: True for name in portable_kernels.CPU_FEATURES.split(",")}
+    monkeypatch.setattr(portable_kernels.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(portable_kernels.binding, "get_host_cpu_features", lambda: features)
+    monkeypatch.delenv("NUMBA_CPU_NAME", raising=False)
+    ask = portable_kernels.runs_here.__wrapped__
+    assert ask()
+    features["fma"] = False
+    assert not ask()
 
 
 def test_they_work_where_nothing_can_be_kept(kernel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -177,6 +177,12 @@ MEASUREMENTS = {
         "budget:measure_budget",
         lines="budget:budget_lines",
     ),
+    "first_run": Measurement(
+        "seconds that a first run takes longer than a later one, with kernels compiled ahead of time and without",
+        "nothing",
+        "first_run:measure_first_run",
+        lines="first_run:first_run_lines",
+    ),
     "earlier_tree": Measurement(
         "seconds of reconstruct and of a cold query over those of the tree of --before",
         "earlier",

@@ -16,12 +16,13 @@ agree.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from ...core.types import Intrinsics
+
+if TYPE_CHECKING:  # kernels take their constants from here, and are compiled where there is no torch
+    import torch
+    from torch import Tensor
 
 BLUR = 0.3
 """Variance in pixels^2 that is added to every splat, so that none is smaller than a pixel."""
