@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -36,22 +37,21 @@ def twist(xi: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_motion_is_moved_to_another_frame_by_the_adjoint(seed: int) -> None:
     T, xi = some_pose(seed), np.random.default_rng(seed).normal(size=6)
-    np.testing.assert_allclose(
-        T @ expm(twist(xi)) @ np.linalg.inv(T), expm(twist(joint_refinement._adjoint(T) @ xi)), atol=1e-9
-    )
+    moved = T @ expm(twist(xi)) @ np.linalg.inv(T)
+    np.testing.assert_allclose(moved, expm(twist(joint_refinement._adjoint(T[None])[0] @ xi)), atol=1e-9)
+    small = 1e-3 * xi
+    found = joint_refinement._measure_motion(T[None], (expm(twist(small)) @ T)[None])[0]
+    np.testing.assert_allclose(found, small, atol=1e-5)
 
 
 def test_steps_minimize_the_sum_over_all_pairs_and_the_first_keyframe_stays() -> None:
     rng = np.random.default_rng(0)
     ends = [(1, 0), (2, 1), (3, 2), (3, 0), (2, 0)]
-    pairs = [joint_refinement._Pair(*pair, FeatureMatches(np.zeros((0, 3)), np.zeros((0, 2)))) for pair in ends]
-    terms = []
-    for _ in ends:
-        root = rng.normal(size=(6, 6))
-        terms.append((100 * root @ root.T, rng.normal(size=6)))
-    step = joint_refinement._solve(pairs, terms, 5)
+    root = rng.normal(size=(5, 6, 6))
+    information, gradients = 100 * root @ root.swapaxes(1, 2), rng.normal(size=(5, 6))
+    step = joint_refinement._solve(*np.transpose(ends), information, gradients, 5)
     M, g = np.zeros((30, 30)), np.zeros(30)
-    for (source, target), (H, gradient) in zip(ends, terms, strict=True):
+    for (source, target), H, gradient in zip(ends, information, gradients, strict=True):
         J = np.zeros((6, 30))
         J[:, 6 * source : 6 * source + 6], J[:, 6 * target : 6 * target + 6] = np.eye(6), -np.eye(6)
         M += J.T @ H @ J
@@ -60,7 +60,34 @@ def test_steps_minimize_the_sum_over_all_pairs_and_the_first_keyframe_stays() ->
     wanted = np.concatenate((np.zeros(6), np.linalg.solve(held[6:, 6:], -g[6:]))).reshape(5, 6)
     np.testing.assert_allclose(step, wanted, atol=1e-9)
     assert not step[4].any(), "nothing ties the last keyframe to others"
-    assert not joint_refinement._solve([], [], 3).any()
+
+
+def test_pairs_are_linearized_again_only_where_they_moved_and_meet_the_same_minimum(monkeypatch) -> None:
+    """Pairs whose residual is the motion from a wanted pose: one step ends at the minimum, which a second one finds
+    from the equations of the first wherever pairs have not moved."""
+    ends = [(1, 0), (2, 1), (3, 2), (3, 0)]
+    true = [some_pose(seed) for seed in range(4)]
+    start = np.stack([expm(twist(np.full(6, off))) @ T for T, off in zip(true, (0, 0, 0, 2e-3), strict=True)])
+    linearized = []
+
+    def linearize(pair, keyframes, T_ts) -> None:
+        wanted = np.linalg.inv(true[pair.target]) @ true[pair.source]
+        pair.linearized_at, pair.H = T_ts, 1e6 * np.eye(6)
+        pair.g = -pair.H @ joint_refinement._measure_motion(T_ts[None], wanted[None])[0]
+        linearized.append((pair.source, pair.target))
+
+    monkeypatch.setattr(joint_refinement, "_linearize", linearize)
+    pairs = [joint_refinement._Pair(*pair, FeatureMatches(np.zeros((0, 3)), np.zeros((0, 2)))) for pair in ends]
+    with ThreadPoolExecutor(1) as pool:
+        assert joint_refinement._step(pairs, [], start, pool)
+        assert sorted(linearized) == sorted(ends)
+        linearized.clear()
+        assert joint_refinement._step(pairs, [], start, pool)
+        assert sorted(linearized) == [(3, 0), (3, 2)], "the last keyframe's, which moved"
+        np.testing.assert_allclose(start, true, atol=2e-5)
+        while joint_refinement._step(pairs, [], start, pool):
+            pass
+    np.testing.assert_allclose(start, true, atol=2e-5)
 
 
 def test_the_middle_of_what_a_keyframe_sees_is_in_the_world() -> None:
@@ -99,8 +126,8 @@ def test_pairs_that_disagree_are_left_out(pixels, share, correlation, counts, mo
     monkeypatch.setattr(joint_refinement, "linearize", linearized)
     monkeypatch.setattr(dense_alignment, "compute_correlation", lambda stats: correlation)
     monkeypatch.setattr(dense_alignment, "compute_inlier_share", lambda stats: share)
-    found = joint_refinement._terms(pair, [keyframe, keyframe], poses)
-    assert (found is not None) == counts
+    joint_refinement._linearize(pair, [keyframe, keyframe], np.linalg.inv(poses[0]) @ poses[1])
+    assert pair.H.any() == counts
     if counts:
         agreement = 1.0 if np.isnan(correlation) else (correlation - 0.5) / 0.5
         assert pair.weighting.photometric == pytest.approx(dense_alignment.PHOTOMETRIC * agreement**4)

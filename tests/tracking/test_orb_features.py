@@ -87,6 +87,25 @@ def test_descriptors_match_if_they_differ_in_less_than_a_quarter_of_their_bits(b
     assert sorted(map(tuple, found.tolist())) == ([(0, 1), (2, 0)] if matched else [(2, 0)])
 
 
+def test_matches_whose_place_is_roughly_known_are_each_others_nearest_around_it() -> None:
+    rng = np.random.default_rng(0)
+    a, b = (rng.integers(0, 256, (count, 32), dtype=np.uint8) for count in (60, 50))
+    b[:40] = [flipped(descriptor, n % 70) for n, descriptor in enumerate(a[:40])]
+    rays_a, rays_b = (np.float32(rng.uniform(-0.2, 0.2, (len(x), 2))) for x in (a, b))
+    rays_b[:30] = rays_a[:30] + rng.uniform(-0.07, 0.07, (30, 2))
+    different = np.unpackbits(a[:, None] ^ b[None], axis=2).sum(axis=2)
+    different = np.where(np.abs(rays_a[:, None] - rays_b[None]).max(axis=2) <= 0.06, different, 999)
+    nearest = different.argmin(axis=1)
+    wanted = [(i, j) for i, j in enumerate(nearest) if different[i, j] < 64 and different[:, j].argmin() == i]
+    features = [OrbFeatures(np.zeros((len(x), 2), np.float32), x) for x in (a, b)]
+    found = orb_features.match_near(features[0], rays_a, features[1], rays_b, 0.06)
+    assert sorted(map(tuple, found.tolist())) == wanted
+    assert 10 < len(wanted) < 30
+    for n, m in ((0, 50), (60, 0)):
+        none = [OrbFeatures(f.pixels[:k], f.descriptors[:k]) for f, k in zip(features, (n, m), strict=True)]
+        assert orb_features.match_near(none[0], rays_a[:n], none[1], rays_b[:m], 0.06).shape == (0, 2)
+
+
 def test_corners_are_found_where_they_are_and_as_many_as_asked_for() -> None:
     color = np.zeros((120, 160, 3), np.uint8)
     for x, y in ((40, 40), (120, 40), (40, 80), (120, 80)):

@@ -98,8 +98,28 @@ def match_binary(a: OrbFeatures, b: OrbFeatures) -> NDArray[np.int64]:
     near."""
     if not len(a.pixels) or not len(b.pixels):
         return np.zeros((0, 2), np.int64)
-    nearest_b, nearest_a = _find_nearest(_words(a), _words(b))
-    rows = np.flatnonzero(nearest_a[nearest_b & _ROW] & _ROW == np.arange(len(nearest_b)))
+    return _keep_mutual(*_find_nearest(_words(a), _words(b)))
+
+
+def match_near(
+    a: OrbFeatures, rays_a: NDArray[np.floating], b: OrbFeatures, rays_b: NDArray[np.floating], farthest: float
+) -> NDArray[np.int64]:
+    """``match_binary`` among those whose rays in one camera, (N, 2) and (M, 2), differ by at most ``farthest`` in each
+    direction."""
+    order = np.argsort(rays_b[:, 1], kind="stable")
+    first = np.searchsorted(rays_b[order, 1], rays_a[:, 1] - farthest, "left")
+    last = np.searchsorted(rays_b[order, 1], rays_a[:, 1] + farthest, "right")
+    across_a, across_b = (np.ascontiguousarray(x, np.float64) for x in (rays_a[:, 0], rays_b[order, 0]))
+    words_b = np.ascontiguousarray(_words(b)[:, order])
+    rows = _keep_mutual(*_find_nearest_near(_words(a), across_a, first, last, words_b, across_b, farthest))
+    rows[:, 1] = order[rows[:, 1]]
+    return rows
+
+
+def _keep_mutual(nearest_b: NDArray[np.int32], nearest_a: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(M, 2) rows that are each other's nearest, and near, from the results of a search."""
+    rows = np.flatnonzero(nearest_b < _FARTHEST_KEY)
+    rows = rows[nearest_a[nearest_b[rows] & _ROW] & _ROW == rows]
     rows = rows[nearest_b[rows] >> _ROW_BITS < _NEAREST_DESCRIPTORS]
     return np.stack((rows, nearest_b[rows] & _ROW), axis=1).astype(np.int64)
 
@@ -118,13 +138,7 @@ def _find_nearest(a: NDArray[np.uint64], b: NDArray[np.uint64]) -> tuple[NDArray
     different = np.empty(m, np.int32)
     for i in range(n):
         for j in range(m):
-            bits = np.uint64(0)
-            for word in range(4):
-                bits += _count_by_byte(a[word, i] ^ b[word, j])  # at most 32 in a byte
-            bits = (bits & _EVEN_BYTES) + ((bits >> np.uint64(8)) & _EVEN_BYTES)
-            bits += bits >> np.uint64(16)
-            bits += bits >> np.uint64(32)
-            different[j] = np.int32(bits & np.uint64(0x1FF))
+            different[j] = _count_different(a, i, b, j)
         least = np.int32(_FARTHEST_KEY)
         for j in range(m):
             least = min(least, (different[j] << np.int32(_ROW_BITS)) | np.int32(j))
@@ -132,6 +146,42 @@ def _find_nearest(a: NDArray[np.uint64], b: NDArray[np.uint64]) -> tuple[NDArray
         for j in range(m):
             nearest_a[j] = min(nearest_a[j], (different[j] << np.int32(_ROW_BITS)) | np.int32(i))
     return nearest_b, nearest_a
+
+
+@njit(nogil=True, cache=True)
+def _find_nearest_near(
+    a: NDArray[np.uint64],
+    across_a: NDArray[np.float64],
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
+    b: NDArray[np.uint64],
+    across_b: NDArray[np.float64],
+    farthest: float,
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """``_find_nearest`` among b's rows ``first`` to ``last`` (excluded) of each descriptor of a, whose (M,) coordinates
+    across the image are near."""
+    n, m = a.shape[1], b.shape[1]
+    nearest_b, nearest_a = np.full(n, _FARTHEST_KEY, np.int32), np.full(m, _FARTHEST_KEY, np.int32)
+    for i in range(n):
+        for j in range(first[i], last[i]):
+            if abs(across_a[i] - across_b[j]) > farthest:
+                continue
+            key = _count_different(a, i, b, j) << np.int32(_ROW_BITS)
+            nearest_b[i] = min(nearest_b[i], key | np.int32(j))
+            nearest_a[j] = min(nearest_a[j], key | np.int32(i))
+    return nearest_b, nearest_a
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _count_different(a, i, b, j):  # type: ignore[no-untyped-def]
+    """The number of bits that differ between descriptor i of (4, N) a and j of (4, M) b."""
+    bits = np.uint64(0)
+    for word in range(4):
+        bits += _count_by_byte(a[word, i] ^ b[word, j])  # at most 32 in a byte
+    bits = (bits & _EVEN_BYTES) + ((bits >> np.uint64(8)) & _EVEN_BYTES)
+    bits += bits >> np.uint64(16)
+    bits += bits >> np.uint64(32)
+    return np.int32(bits & np.uint64(0x1FF))
 
 
 @njit(nogil=True, cache=True, inline="always")
