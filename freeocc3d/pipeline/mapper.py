@@ -31,7 +31,7 @@ from ..storage import map_files
 from ..storage.keyframes import Keyframes
 from ..tracking.base import Tracked, Tracker
 from ..tracking.upright.lattice import find_lattice_origin
-from ..tracking.upright.surface_patches import find_surface_patches
+from ..tracking.upright.surface_patches import SurfacePatches, find_surface_patches
 from ..tracking.upright.up_direction import turn_back
 from ..tracking.upright.upright_frame import UprightFrame, find_upright_frame
 from .frame_cache import FrameCache
@@ -108,13 +108,18 @@ class Mapper:
         """Make all poses so far consistent with each other, and let the map stand upright: z up, the floor at z = 0."""
         self.tracker.optimize()
         trajectory = self.tracker.trajectory(self.capture.timestamps)
-        poses, keyframes = trajectory.T_world_keyframe, self.mapped(trajectory)
         turned = np.array([self.capture.turned(index) for index in trajectory.keyframes.tolist()], np.int8)
-        patches = find_surface_patches(keyframes.depth_images(), poses)
-        self.upright = find_upright_frame(turn_back(poses, turned), patches)
-        voxel_size = self.settings.occupancy.voxel_size
-        self.origin = find_lattice_origin(patches.moved(self.upright.T_upright_world), voxel_size)
+        patches = self._patches(trajectory)
+        self.upright = find_upright_frame(turn_back(trajectory.T_world_keyframe, turned), patches)
+        self.origin = self._find_origin(self.upright, patches)
         self.refined = True
+
+    def _patches(self, trajectory: Trajectory) -> SurfacePatches:
+        """What is flat in the mapped keyframes, in the tracker's world."""
+        return find_surface_patches(self.mapped(trajectory).depth_images(), trajectory.T_world_keyframe)
+
+    def _find_origin(self, upright: UprightFrame, patches: SurfacePatches) -> NDArray[np.float64]:
+        return find_lattice_origin(patches.moved(upright.T_upright_world), self.settings.occupancy.voxel_size)
 
     @property
     def T_map_world(self) -> NDArray[np.float64]:
@@ -124,18 +129,24 @@ class Mapper:
     def state(self, done: int) -> dict[str, NDArray[Any]]:
         """What ``restore`` needs after ``done`` frames, apart from the keyframes' images, which are on the disk
         then."""
-        own = {"done": done, "refined": self.refined, "keyframes": self.keyframes.checkpoint(), "origin": self.origin}
+        own = {"done": done, "refined": self.refined, "keyframes": self.keyframes.checkpoint(),
+               "origin": self.origin, "voxel_size": self.settings.occupancy.voxel_size}  # fmt: skip
         frame = {} if self.upright is None else {"upright": self.upright.to_array()}
         return {**{name: np.array(value) for name, value in own.items()}, **frame, **self.tracker.state()}
 
     def restore(self, state: dict[str, NDArray[Any]]) -> int:
         """Continue from a ``state``, to the same map as without a stop. Returns the number of frames that were added.
-        Reads keyframes from the capture: those on disk are compressed. Raises CaptureError if one is unreadable now."""
+        Voxels may have another size than before. Reads keyframes from the capture: those on disk are compressed. Raises
+        CaptureError if one is unreadable now."""
         done, self.refined = int(state.pop("done")), bool(state.pop("refined"))
         checkpoint, self.origin = str(state.pop("keyframes")), state.pop("origin")
         self.upright = UprightFrame.from_array(state.pop("upright")) if "upright" in state else None
         self.keyframes = Keyframes.resumed(self.keyframes.folder, checkpoint, self._read, self.sensor)
+        same_voxels = float(state.pop("voxel_size")) == self.settings.occupancy.voxel_size
         self.tracker.restore(state, self._read)
+        if self.upright is not None and not same_voxels:
+            patches = self._patches(self.tracker.trajectory(self.capture.timestamps))
+            self.origin = self._find_origin(self.upright, patches)
         return done
 
     def trajectory(self) -> Trajectory:

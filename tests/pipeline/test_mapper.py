@@ -92,3 +92,7 @@ def test_a_restored_mapper_goes_on_where_it_was(layers, tmp_path: Path) -> None:
     assert again.restore(mapper.state(MOMENTS[-1])) == MOMENTS[-1]
     np.testing.assert_array_equal(again.trajectory().T_world_cam, mapper.trajectory().T_world_cam)
     np.testing.assert_array_equal(again.origin, mapper.origin)
+    larger = mapper.settings.changed("occupancy", voxel_size=0.2)
+    again = Mapper(larger, mapper.capture, mapper.keyframes.folder.parent)
+    again.restore(mapper.state(MOMENTS[-1]))
+    assert again.origin[2] == -0.1  # in the middle of a layer, as in a run that has these voxels from its start

@@ -91,6 +91,7 @@ def shown(*sheets) -> SurfacePatches:
 FLOOR = (0, 0, 0), (4, 0, 0), (0, 6, 0)
 WALL_X, WALL_Y = ((0, 0, 0.5), (0, 6, 0), (0, 0, 2)), ((0, 0, 0.5), (0, 0, 2), (4, 0, 0))
 TABLE = (1, 1, 0.75), (1.5, 0, 0), (0, 1, 0)
+SPECKS = (0, 0, 0.6), (0.2, 0, 0), (0, 0.1, 0)  # what noise of a wall may make: 8 level patches, no floor
 
 
 @pytest.mark.parametrize(
@@ -99,10 +100,11 @@ TABLE = (1, 1, 0.75), (1.5, 0, 0), (0, 1, 0)
         ((FLOOR, TABLE, WALL_X, WALL_Y), "floor", True, True),
         ((WALL_X, WALL_Y), "walls", False, True),
         ((WALL_X,), "cameras", False, True),
+        ((WALL_X, WALL_Y, SPECKS), "walls", False, True),
         ((((0, 0, 2.5), (0, 6, 0), (4, 0, 0)), WALL_X), "level surfaces", False, True),
         ((FLOOR,), "floor", True, False),
     ],
-    ids=["room", "two walls", "one wall", "ceiling", "floor"],
+    ids=["room", "two walls", "one wall", "specks", "ceiling", "floor"],
 )
 def test_the_surest_evidence_decides(sheets, by, floor, walls) -> None:
     """Cameras that are rolled by 2 degrees; what is level or upright corrects them."""

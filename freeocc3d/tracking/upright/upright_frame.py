@@ -131,9 +131,10 @@ def compute_start_frame(T_upright_map: NDArray[np.float64], T_map_cam: NDArray[n
 
 def estimate_floor_height(heights: NDArray[np.float64], camera_height: float) -> float | None:
     """Returns the height of the floor from the (N,) heights of points on level surfaces. It is the lowest peak of their
-    histogram below the cameras with at least a quarter of the largest peak's points. None without points there."""
+    histogram below the cameras with at least a quarter of the largest peak's points. None if hardly any points lie
+    below the cameras: the noise of a wall makes some."""
     below = heights[heights < camera_height - _BELOW_CAMERA]
-    return float(_find_peaks(below, _FLOOR_SHARE)[0]) if len(below) else None
+    return float(_find_peaks(below, _FLOOR_SHARE)[0]) if len(below) >= _LEAST_PATCHES else None
 
 
 def _find_peaks(heights: NDArray[np.float64], share: float) -> NDArray[np.float64]:
