@@ -22,7 +22,7 @@ from ..gaussians import anchors
 from ..language.feature_codec import Codec
 from ..occupancy import build
 from ..query.scan_map import Map, load_map
-from ..storage.manifest import UPRIGHT_FRAME, Manifest, Upright, matrix
+from ..storage.manifest import Manifest, Upright, matrix
 from ..storage.work_folder import WorkFolder
 from ..storage.writer import MapParts, write_changed_map
 from ..tracking.upright.lattice import find_lattice_origin
@@ -122,13 +122,13 @@ def read_keyframes(scan_map: Map, poses: NDArray[np.float64]) -> Iterator[PosedF
 
 def _manifest(scan_map: Map, frame: UprightFrame) -> Manifest:
     said, T_map_upright = scan_map.manifest, invert(frame.T_upright_world)
-    T_first_camera = scan_map.T_first_camera
+    T_first_camera, upright = scan_map.T_first_camera, Upright(**frame.evidence())
     return msgspec.structs.replace(
         said,
-        frame=UPRIGHT_FRAME,
+        frame=upright.in_words,
         world=said.world or said.frame,
         up=(0.0, 0.0, 1.0),
-        upright=Upright(**frame.evidence()),
+        upright=upright,
         T_world_map=matrix(np.array(said.T_world_map) @ T_map_upright),
         T_first_camera=None if T_first_camera is None else matrix(T_first_camera @ T_map_upright),
         T_gravity_map=matrix(np.eye(4)),

@@ -17,7 +17,6 @@ from ..language.encoders.base import Encoder
 from ..language.feature_codec import Codec
 from ..storage import map_files
 from ..storage.manifest import (
-    UPRIGHT_FRAME,
     CaptureRecord,
     EncoderRecord,
     MapFacts,
@@ -87,15 +86,16 @@ def save(
 
 
 def _facts(mapper: Mapper, trajectory: Trajectory, encoder: Encoder, vocabulary: dict[str, Any] | None) -> MapFacts:
-    capture, upright = mapper.capture, mapper.upright
-    assert upright is not None  # refined
+    capture = mapper.capture
+    assert mapper.upright is not None  # refined
+    upright = Upright(**mapper.upright.evidence())
     return MapFacts(
         capture=CaptureRecord(path=absolute(capture.path), format=capture.format, frames=len(capture)),
-        frame=UPRIGHT_FRAME,
+        frame=upright.in_words,
         world=mapper.tracker.world,
         scale=_scale(mapper),
         up=(0.0, 0.0, 1.0),
-        upright=Upright(**upright.evidence()),
+        upright=upright,
         T_world_map=matrix(invert(mapper.T_map_world)),
         T_first_camera=matrix(invert(trajectory.T_world_cam[np.flatnonzero(trajectory.has_pose)[0]])),
         T_gravity_map=matrix(np.eye(4)),

@@ -36,8 +36,6 @@ numbers lose their meaning."""
 _LEVELS, _ALMOST, _UNIT = 13, 1e-6, 1e-3
 _FILE = re.compile(r"(?:keyframes/)?(?!\.\.?$)[^/\\\0-\x1f]{1,200}")
 
-UPRIGHT_FRAME = "z up, the floor at z = 0, walls along x and y, meters"
-"""The frame of maps that stand upright, in words."""
 POSES = "camera to world"
 CODEC = "transform coding, 8, 4 and 2 bits a direction"
 
@@ -127,14 +125,20 @@ class SceneWords(msgspec.Struct, frozen=True, kw_only=True):
 
 class Upright(msgspec.Struct, frozen=True, kw_only=True):
     """How sure the upright frame of a map is. by: what up comes from, the surest first: "floor", "level surfaces",
-    "walls" or "cameras".  off_deg: degrees from that up to the up of the walls, or of the cameras where there are none;
-    for the cameras alone, by how much they were rolled.  floor: whether z = 0 is a floor, or else the level of the
-    lowest points.  walls: whether x and y lie along walls, or else along the first camera's view."""
+    "walls" or "cameras".  off_deg: degrees from that up to the up of the cameras; for the cameras alone, by how much
+    they were rolled.  floor: whether z = 0 is a floor, or else the level of the lowest points.  walls: whether x and y
+    lie along walls, or else x along the first camera's view."""
 
     by: str
     off_deg: float
     floor: bool
     walls: bool
+
+    @property
+    def in_words(self) -> str:
+        """The frame."""
+        bottom = "the floor" if self.floor else "the lowest points"
+        return f"z up, {bottom} at z = 0, {'walls along x and y' if self.walls else 'x along the first view'}"
 
 
 class Refined(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -52,7 +52,9 @@ def again(lying: Map, tmp_path_factory: pytest.TempPathFactory) -> Map:
 def test_the_frame_is_found_again(room: Map, again: Map) -> None:
     made, before = again.manifest, room.manifest
     assert made.upright is not None
-    assert made.upright.by == "floor"
+    assert (made.upright.by, made.frame) == ("floor", "z up, the floor at z = 0, walls along x and y")
+    unsure = msgspec.structs.replace(made.upright, floor=False, walls=False)
+    assert unsure.in_words == "z up, the lowest points at z = 0, x along the first view"
     np.testing.assert_allclose(again.trajectory.T_world_cam, room.trajectory.T_world_cam, atol=1e-3)
     for name in ("T_world_map", "T_first_camera"):
         np.testing.assert_allclose(getattr(made, name), getattr(before, name), atol=1e-3)
