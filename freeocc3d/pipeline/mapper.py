@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+from collections import deque
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,6 +43,8 @@ from .tracking_choice import choose_tracker
 _FINE = 0.01
 """Edge of cells over the usual depth, if the scale is unknown: about the finest detail that stereo resolves."""
 
+_AHEAD = 4  # keyframes that wait to be written
+
 _FITTED_PER_FRAME, _FITTED_PER_KEYFRAME = 0.45, 1.5
 """Small renderings that fitting may take for each frame and each keyframe. The rest of a run takes 35 ms of a processor
 for a frame and about 100 ms for a keyframe, a small rendering 25 to 50 ms: fitting stays below a third of the run."""
@@ -57,7 +61,9 @@ class Mapper:
         self.settings = settings
         self.capture = capture
         self.sensor = find_sensor(settings.capture.sensor)
-        self.keyframes = Keyframes(folder / map_files.KEYFRAMES, self.sensor)
+        self._keyframes = Keyframes(folder / map_files.KEYFRAMES, self.sensor)
+        self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="keyframes")
+        self._writing: deque[Future[None]] = deque()
         self.tracker: Tracker = settings.load_backend("tracking", capture)
         if self.tracker.needs_depth and not capture.has_depth:
             raise TrackingError(
@@ -91,18 +97,36 @@ class Mapper:
         if self.depth.offline:
             self.depth.prepare(self.tracker, folder, frames, progress)
 
+    @property
+    def keyframes(self) -> Keyframes:
+        """All keyframes, when their images are written. Raises OSError."""
+        while self._writing:
+            self._writing.popleft().result()
+        return self._keyframes
+
+    def settle(self) -> None:
+        """Wait until no image is being written; for the end of a run that fails, when the folder may be removed."""
+        wait(self._writing)
+
     def add(self, frame: Frame) -> Tracked:
-        """Track the next frame, and keep it if it is a keyframe."""
+        """Track the next frame, and keep it if it is a keyframe; images are written on other threads. Raises OSError,
+        which may be of an earlier frame."""
         frame = self.complete(frame)
         tracked = self.tracker.track(frame)
         self.refined = False
         if tracked.T_world_cam is not None:
             self.cache.keep(frame)
         if tracked.status == "keyframe":
-            self.keyframes.append(frame)
+            while len(self._writing) >= _AHEAD:
+                self._writing.popleft().result()
+            self._writing.append(self._writer.submit(self._keep, frame))
         if tracked.T_world_cam is None:
             return tracked
         return replace(tracked, T_world_cam=self.T_map_world @ tracked.T_world_cam)
+
+    def _keep(self, frame: Frame) -> None:
+        self._keyframes.append(frame)
+        self._keyframes.sync()
 
     def refine(self) -> None:
         """Make all poses so far consistent with each other, and let the map stand upright: z up, the floor at z = 0."""
@@ -141,7 +165,7 @@ class Mapper:
         done, self.refined = int(state.pop("done")), bool(state.pop("refined"))
         checkpoint, self.origin = str(state.pop("keyframes")), state.pop("origin")
         self.upright = UprightFrame.from_array(state.pop("upright")) if "upright" in state else None
-        self.keyframes = Keyframes.resumed(self.keyframes.folder, checkpoint, self._read, self.sensor)
+        self._keyframes = Keyframes.resumed(self._keyframes.folder, checkpoint, self._read, self.sensor)
         same_voxels = float(state.pop("voxel_size")) == self.settings.occupancy.voxel_size
         self.tracker.restore(state, self._read)
         if self.upright is not None and not same_voxels:

@@ -101,6 +101,7 @@ def _track_frames(run: Run, frames: range, first: int) -> None:
                 work.save_tracking(mapper.state(done))
     finally:
         stream.close()
+        mapper.settle()
     if done > first:
         work.save_tracking(mapper.state(done))
 

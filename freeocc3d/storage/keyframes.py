@@ -108,11 +108,15 @@ class Keyframes(Sequence[Frame]):
         chosen._entries = [entry for entry in self._entries if int(entry["frame"]) in wanted]
         return chosen
 
-    def checkpoint(self) -> str:
-        """What ``resumed`` needs, when all images are on the disk. Raises OSError."""
+    def sync(self) -> None:
+        """Wait until all images are on the disk. Raises OSError."""
         for path in self._unsynced:
             sync(path)
         self._unsynced.clear()
+
+    def checkpoint(self) -> str:
+        """What ``resumed`` needs, when all images are on the disk. Raises OSError."""
+        self.sync()
         return json.dumps({"entries": self._entries, "checksums": self._checksums})
 
     @classmethod

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 _WORDS, _SAMPLE, _ROUNDS = 512, 20_000, 6
 """Largest number of visual words, number of descriptors to learn them from, and rounds of k-means."""
@@ -30,9 +31,12 @@ class Vocabulary:
         words = sample[:_WORDS].copy()
         for _ in range(_ROUNDS):
             nearest = np.argmax(sample @ words.T, axis=1)
-            order = np.argsort(nearest, kind="stable")
-            used, first = np.unique(nearest[order], return_index=True)
-            words[used] = np.add.reduceat(sample[order], first, axis=0)
+            members = csr_matrix(
+                (np.ones(len(sample), np.float32), (nearest, np.arange(len(sample)))), (len(words), len(sample))
+            )
+            sums = members @ sample
+            used = members.getnnz(axis=1) > 0
+            words[used] = sums[used]
             words /= np.maximum(np.linalg.norm(words, axis=1, keepdims=True), _TINY)
         self._words = words
 
