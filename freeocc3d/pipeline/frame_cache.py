@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import tempfile
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
@@ -29,6 +30,8 @@ from .packed_depth import MOST_UNITS, pack_depth, unpack_depth
 
 _MOST_BYTES = 1 << 30
 """Of the cache's file: some 3000 frames of 640 x 480. Later frames are read from the capture."""
+_ROOM = 0.5
+"""Largest share of the disk's free space for it: keyframes and the map need the rest."""
 _AHEAD = 4  # frames that wait to be written or are read ahead
 _UNITS = 1000.0, 5000.0
 """Units per meter that stored depth usually has: if one of them represents a depth exactly, it is used."""
@@ -60,7 +63,7 @@ class FrameCache:
     def __init__(self, folder: Path, read: Callable[[int], Frame], shrink: Callable[[Frame], int]):
         self._folder, self._read, self._shrink = folder, read, shrink
         self._file: IO[bytes] | None = None
-        self._bytes = 0
+        self._bytes, self._most = 0, 0  # of the file
         self._at: dict[int, tuple[int, _Packed]] = {}  # place in the file, and the frame without its data
         self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frame-cache")
         self._waiting: deque[Future[None]] = deque()
@@ -78,6 +81,14 @@ class FrameCache:
             self._waiting.popleft().result()
         return call_ahead(lambda index: self._frame(index, color), indices, _AHEAD)
 
+    def clear(self) -> None:
+        """Give the disk's space back; frames that are asked for later are read from the capture."""
+        while self._waiting:
+            self._waiting.popleft().result()
+        if self._file is not None:
+            self._file.close()
+        self._file, self._bytes, self._at = None, 0, {}
+
     def _frame(self, index: int, color: bool) -> Frame | FrameError:
         if index in self._at:
             place, packed = self._at[index]
@@ -92,11 +103,14 @@ class FrameCache:
 
     def _write(self, packed: _Packed) -> None:
         """Writes a frame, if there is room. A full disk is no error: the frame will be read from the capture."""
-        if packed.bare.index in self._at or self._bytes + len(packed.data) > _MOST_BYTES:
+        if packed.bare.index in self._at:
             return
         with contextlib.suppress(OSError):
             if self._file is None:
+                self._most = min(_MOST_BYTES, int(_ROOM * shutil.disk_usage(self._folder).free))
                 self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115, it stays open
+            if self._bytes + len(packed.data) > self._most:
+                return
             written = os.pwrite(self._file.fileno(), packed.data, self._bytes)
             if written == len(packed.data):
                 self._at[packed.bare.index] = self._bytes, replace(packed, data=b"")

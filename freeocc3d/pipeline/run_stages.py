@@ -176,6 +176,7 @@ def build_occupancy(run: Run) -> None:
     with run.work.timed("occupancy"):
         occupancy = run.mapper.build_occupancy(run.gaussians, run.features, run.progress)
         occupancy = run.mapper.refine_occupancy(occupancy, run.gaussians, run.features, run.encoder, run.progress)
+    run.mapper.cache.clear()  # the map needs the disk's space
     if not len(occupancy.colors):
         raise TrackingError(
             f"No voxel of {run.mapper.capture.path} is occupied: is its depth in the right unit (capture.depth_scale), "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -95,15 +96,24 @@ def test_frames_that_were_not_kept_are_the_same_and_broken_ones_are_told(tmp_pat
     kept, asked = opened(tmp_path, frames)
     for each in frames:
         kept.keep(each)
-    monkeypatch.setattr(frame_cache, "_MOST_BYTES", 0)  # full from the start
-    full, also_asked = opened(tmp_path, frames)
-    full.keep(frames[0])
-    *found, broken = full.frames([0, 1, 2, 3, 4])
-    assert isinstance(broken, FrameError)
-    assert (asked, also_asked) == ([], [0, 1, 2, 3, 4])
-    for a, b in zip(found, kept.frames(range(4)), strict=True):
-        np.testing.assert_array_equal(a.color, b.color)
-        np.testing.assert_array_equal(a.depth_m, b.depth_m)
+    whole = list(kept.frames(range(4)))
+    assert not asked
+    kept.clear()
+    assert len(list(kept.frames(range(4)))) == 4
+    assert asked == [0, 1, 2, 3], "from the capture again"
+    free = shutil.disk_usage(tmp_path)._replace(free=2 * kept._bytes - 2)  # half of it holds all but the last
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: free)
+    for most, expected in ((frame_cache._MOST_BYTES, [3, 4]), (0, [0, 1, 2, 3, 4])):
+        monkeypatch.setattr(frame_cache, "_MOST_BYTES", most)
+        full, also_asked = opened(tmp_path, frames)
+        for each in frames:
+            full.keep(each)
+        *found, broken = full.frames([0, 1, 2, 3, 4])
+        assert isinstance(broken, FrameError)
+        assert also_asked == expected
+        for a, b in zip(found, whole, strict=True):
+            np.testing.assert_array_equal(a.color, b.color)
+            np.testing.assert_array_equal(a.depth_m, b.depth_m)
 
 
 def test_a_folder_that_cannot_be_written_is_no_error(tmp_path) -> None:
