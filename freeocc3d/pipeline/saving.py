@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -48,20 +49,16 @@ def save(
     vocabulary: dict[str, Any] | None,
     tracking_reason: str,
 ) -> None:
-    """Write the map of a run into its work folder."""
+    """Write the map of a run into its work folder. Its time "check" is what the check takes longer than the rest."""
     capture, metric, submaps = mapper.capture, mapper.tracker.metric, mapper.submaps()
     settings = mapper.settings
     if not metric:  # states how fine its Gaussians are, for projections on other lattices
         settings = settings.changed("gaussians", cell_size=mapper.cell_size)
-    with work.timed("saving"):
-        facts = _facts(mapper, trajectory, encoder, vocabulary)
-        count = len(trajectory.keyframes)
-        measured = mapper.views(trajectory, evenly(count, _MEASURED_VIEWS))
-        fidelity = rendered_views.measure_fidelity(gaussians, measured, mapper.rasterizer)
-    with work.timed("check"):
+
+    def check() -> dict[str, Any]:
         held = [agrees for submap in submaps for agrees in submap.held.tolist()]
         compared = prepare_compared_views(mapper.mapped(trajectory))
-        checked = check_agreement(compared, trajectory.T_world_keyframe, occupancy, held).summary()
+        return check_agreement(compared, trajectory.T_world_keyframe, occupancy, held).summary()
 
     def draw(folder: Path) -> None:
         path, up = folder / map_files.PATH_PICTURE, np.array(facts.up)
@@ -71,18 +68,29 @@ def save(
         picture = folder / map_files.RENDER_PICTURE
         render_pictures.write_render_picture(picture, gaussians, shown, mapper.rasterizer, capture.path, metric)
 
-    def report() -> dict[str, Any]:
-        return {
-            **report_of(work, mapper, trajectory, submaps, tracking_reason),
-            "rendering": dataclasses.asdict(fidelity),
-            "check": checked,
-        }
+    with ThreadPoolExecutor(1) as pool:
+        checking = pool.submit(check)  # while pictures are rendered and files are written
 
-    parts = MapParts(
-        facts, settings, report, occupancy, Codec.fit(features), features, gaussians, trajectory,
-        mapper.mapped(trajectory), draw=draw,
-    )  # fmt: skip
-    write_map(work, parts)
+        def report() -> dict[str, Any]:
+            with work.timed("check"):
+                checked = checking.result()
+            return {
+                **report_of(work, mapper, trajectory, submaps, tracking_reason),
+                "rendering": dataclasses.asdict(fidelity),
+                "check": checked,
+            }
+
+        with work.timed("saving"):
+            facts = _facts(mapper, trajectory, encoder, vocabulary)
+            count = len(trajectory.keyframes)
+            measured = mapper.views(trajectory, evenly(count, _MEASURED_VIEWS))
+            fidelity = rendered_views.measure_fidelity(gaussians, measured, mapper.rasterizer)
+            codec = Codec.fit(features)
+        parts = MapParts(
+            facts, settings, report, occupancy, codec, features, gaussians, trajectory, mapper.mapped(trajectory),
+            draw=draw,
+        )  # fmt: skip
+        write_map(work, parts)
 
 
 def _facts(mapper: Mapper, trajectory: Trajectory, encoder: Encoder, vocabulary: dict[str, Any] | None) -> MapFacts:
