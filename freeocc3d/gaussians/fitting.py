@@ -21,6 +21,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,7 @@ import torch
 from torch import Tensor
 
 from ..core.sampling import spread_evenly
+from ..core.threads import count_threads
 from ..core.types import Gaussians
 from ..settings.stages import FittingOptions as Options
 from .rasterizers.base import ALPHA_MIN, Rasterizer, Rendered, Splats
@@ -73,7 +75,9 @@ def fit_gaussians(
     judges = [halve_view(views[others[n]]) for n in spread_evenly(len(others), _JUDGES)]
     with _one_torch_thread():
         fit = _Fit(gaussians, rasterizer, options, progress)
-        large = [(views[row], fit.find_rows(views[row])) for row in chosen]
+        fitted = [views[row] for row in chosen]
+        with ThreadPoolExecutor(count_threads()) as pool:
+            large = list(zip(fitted, pool.map(fit.find_rows, fitted), strict=True))
         small, scores = [(halve_view(view), rows) for view, rows in large], [-math.inf]
         while len(scores) < passes and len(scores) - int(np.argmax(scores)) <= _PATIENCE:
             fit.show(small, 1.0)

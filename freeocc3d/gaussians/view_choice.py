@@ -13,11 +13,13 @@ import functools
 import heapq
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.threads import count_threads
 from ..core.types import Gaussians
 from .rasterizers.base import ALPHA_MIN, NEAR
 from .rendered_views import CapturedView
@@ -45,7 +47,8 @@ _REACH = math.sqrt(-2 * math.log(ALPHA_MIN))
 
 def choose_views(gaussians: Gaussians, views: Sequence[CapturedView]) -> list[int]:
     """Rows of the chosen views, ascending; of views with any measured depth, at least one."""
-    shown = [find_shown(gaussians.means, view) for view in views]
+    with ThreadPoolExecutor(count_threads()) as pool:
+        shown = list(pool.map(lambda view: find_shown(gaussians.means, view), views))
     seen = np.zeros(len(gaussians), np.int32)
     queue = [(-len(rows), view) for view, rows in enumerate(shown) if len(rows)]
     heapq.heapify(queue)

@@ -35,22 +35,29 @@ def lift_features(
 ) -> NDArray[np.float16]:
     """(N, D) unit features of the Gaussians from keyframes at their poses (K, 4, 4); zero where nothing is known.
 
-    A keyframe that cannot be encoded is left out, with a warning: the others see most of what it shows.
+    Keyframes are decoded and encoded on a second thread while the one before is fused. One that cannot be encoded is
+    left out, with a warning: the others see most of what it shows.
     """
     options, progress = options or Options(), progress or Progress()
     fusion = FeatureFusion(len(gaussians), encoder.dimension, options.disagreement)
     chosen = choose_encoded_keyframes(gaussians, frames, T_world_cam, options)
     progress.stage("language", len(chosen))
-    with contextlib.closing(call_ahead(frames.__getitem__, chosen, depth=1)) as decoded:
-        for done, (row, frame) in enumerate(zip(chosen, decoded, strict=True), start=1):
-            try:
-                features = encode_finite(encoder, frame)
-            except FrameError as error:
-                progress.warn(str(error))
+    with contextlib.closing(call_ahead(lambda row: _encode(encoder, frames[row]), chosen, depth=1)) as encoded:
+        for done, (row, (frame, features)) in enumerate(zip(chosen, encoded, strict=True), start=1):
+            if isinstance(features, FrameError):
+                progress.warn(str(features))
             else:
                 fusion.add(find_visible(gaussians, frame, T_world_cam[row], options), features)
             progress.advance(done)
     return fusion.features()
+
+
+def _encode(encoder: Encoder, frame: Frame) -> tuple[Frame, NDArray[np.float16] | FrameError]:
+    """The frame with its features, or why it has none."""
+    try:
+        return frame, encode_finite(encoder, frame)
+    except FrameError as error:
+        return frame, error.with_traceback(None)
 
 
 def encode_finite(encoder: Encoder, frame: Frame) -> NDArray[np.float16]:
