@@ -11,6 +11,7 @@ Code = Literal[
     "option-renamed",
     "option-removed",
     "option-clamped",
+    "options-unsuited",
     "images-left-out",
     "images-unreadable",
     "depth-scale-doubtful",

@@ -44,6 +44,19 @@ def check(settings: Settings) -> None:
             backend.check(options)
 
 
+def check_projection(settings: Settings) -> Notice | None:
+    """A warning if the projection misses the Gaussians' shape: thin discs mostly lie beside the centers of voxels."""
+    projection = settings.occupancy.projection
+    if settings.gaussians.initialization != "disc" or projection not in ("probabilistic", "poisson"):
+        return None
+    return Notice(
+        "options-unsuited",
+        f"occupancy.projection={projection} looks at the centers of voxels only, and discs (gaussians.initialization) "
+        "are thinner than voxels, so most of the surface will be missing: give gaussians.initialization=ray_aligned, "
+        "too.",
+    )
+
+
 def check_brightness(frames: Sequence[Frame], path: Path) -> Notice | None:
     """A warning if most of some frames of a capture are nearly black."""
     bright = [float(np.percentile(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), 95)) for frame in frames]

@@ -26,7 +26,7 @@ from ..settings.config import Settings
 from ..storage.work_folder import WorkFolder
 from ..tracking.rgbd.measured_pairs import MeasuredPair, measure_pairs
 from .calibration import estimate_unknown_focal, register_color
-from .checks import check, check_brightness
+from .checks import check, check_brightness, check_projection
 from .mapper import Mapper
 from .run_stages import STAGES, Run
 from .saving import absolute
@@ -56,7 +56,8 @@ def reconstruct(
     check(resolved)
     output = Path(output)
     work = WorkFolder.open(output, overwrite, resume)
-    work.warn(progress, *resolved.notices)
+    unsuited = check_projection(resolved)
+    work.warn(progress, *resolved.notices, *([unsuited] if unsuited else []))
     try:
         opened = _open(capture, resolved, progress, work)
         resolved, reason = choose_tracker(resolved, opened)

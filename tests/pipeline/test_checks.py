@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from freeocc3d.core.types import Frame, Intrinsics, Trajectory
-from freeocc3d.pipeline.checks import check_brightness, warn_of_trajectory
+from freeocc3d.pipeline.checks import check_brightness, check_projection, warn_of_trajectory
+from freeocc3d.settings import config
 
 
 def trajectory(*status: str) -> Trajectory:
@@ -40,6 +41,15 @@ def test_a_scan_that_is_mostly_dark_is_told(dark: int, told: bool) -> None:
     notice = check_brightness(frames[: max(dark, 4)], Path("scan"))
     assert (notice is not None) == told
     assert notice is None or f"{min(dark, 4)} of " in notice.text
+
+
+@pytest.mark.parametrize(
+    ("initialization", "projection", "told"),
+    [("disc", "integrated", False), ("disc", "probabilistic", True), ("ray_aligned", "probabilistic", False)],
+)
+def test_a_projection_that_misses_discs_is_told(initialization: str, projection: str, told: bool) -> None:
+    options = {"gaussians": {"initialization": initialization}, "occupancy": {"projection": projection}}
+    assert (check_projection(config.resolve(options)) is not None) == told
 
 
 def test_a_scan_that_is_mostly_lost_gets_advice() -> None:
