@@ -29,6 +29,7 @@ from ..core.voxel_keys import pack_voxels, unpack_voxels
 from ..gaussians.surface_cells import cell_keys
 from ..language.feature_codec import Codec
 from ..occupancy import build, carve, levels, splat
+from ..occupancy.confirmed_depth import confirm_depth
 from ..query.scan_map import Map, load_map
 from ..settings.config import Settings
 from ..storage.manifest import Refined
@@ -108,7 +109,8 @@ def build_adaptive(
     sizes = [base.voxel_size / 2**level for level in range(1, len(found) + 1)]
     seen = [carve.DepthEvidence(base.origin, size, carving, own) for size, own in zip(sizes, leaves, strict=True)]
     progress.stage("occupancy", len(T_world_keyframe))
-    for done, look in enumerate(posed(), 1):
+    confirmed = confirm_depth(posed(), gaussians, base.voxel_size, settings.gaussians.cell_size)
+    for done, look in enumerate(confirmed, 1):
         for evidence in seen:
             evidence.add(look.frame, look.T_world_cam)
         progress.advance(done)

@@ -21,6 +21,7 @@ from ..core.types import Gaussians, Occupancy, PosedFrame, Trajectory
 from ..gaussians import anchors
 from ..language.feature_codec import Codec
 from ..occupancy import build
+from ..occupancy.confirmed_depth import confirm_depth
 from ..query.scan_map import Map, load_map
 from ..storage.manifest import Manifest, Upright, matrix
 from ..storage.work_folder import WorkFolder
@@ -95,7 +96,7 @@ def _build_occupancy(
     occupancy = build.build_occupancy(
         gaussians,
         features,
-        read_keyframes(scan_map, poses),
+        confirm_depth(read_keyframes(scan_map, poses), gaussians, size, cell_size),
         options,
         settings.carving,
         origin=find_lattice_origin(patches, size),

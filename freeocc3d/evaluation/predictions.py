@@ -22,6 +22,7 @@ from ..gaussians import anchors
 from ..gaussians.splat_ply import read_standard_ply
 from ..language.encoders.base import TextEncoder, TextFeatures
 from ..occupancy import build, splat
+from ..occupancy.confirmed_depth import confirm_depth
 from ..query import word_query
 from ..query.scan_map import Map
 from ..settings.config import Settings
@@ -49,10 +50,12 @@ def predict_from_map(
     gaussians = anchors.align_gaussians(scan_map.gaussians, alignment.scale, alignment.rotation, alignment.translation)
     text, targets, note = _words(scan_map.text_encoder, classes, truth)
     features = scan_map.gaussian_features if text is not None else np.zeros((len(gaussians), 0), np.float16)
+    own, scale = settings.occupancy.voxel_size, alignment.scale
+    cell_size = settings.gaussians.cell_size or 0.5 * own
     occupancy = build.build_occupancy(
         gaussians,
         features,
-        _scaled(scan_map, alignment),
+        confirm_depth(_scaled(scan_map, alignment), gaussians, scale * own, scale * cell_size),
         splatting,
         settings.carving,
         origin=truth.origin,

@@ -28,6 +28,7 @@ from ..gaussians.rasterizers.base import Rasterizer
 from ..language import lifting
 from ..language.encoders.base import Encoder
 from ..occupancy import build
+from ..occupancy.confirmed_depth import confirm_depth
 from ..settings.config import Settings
 from ..storage import map_files
 from ..storage.keyframes import Keyframes
@@ -266,12 +267,13 @@ class Mapper:
         """Layer 4: voxels with probabilities, evidence, features and colors."""
         progress = progress or Progress()
         trajectory = self.trajectory()
-        carving = self.settings.carving
+        carving, voxel_size = self.settings.carving, self.settings.occupancy.voxel_size
         progress.stage("occupancy", len(self.frames_used(trajectory, carving.every)))
+        frames = self.posed(trajectory, carving.every, color=False)
         return build.build_occupancy(
             gaussians,
             features,
-            self.posed(trajectory, carving.every, color=False),
+            confirm_depth(frames, gaussians, voxel_size, self.cell_size),
             self.settings.occupancy,
             carving,
             origin=self.origin,
@@ -279,7 +281,7 @@ class Mapper:
             least_scale=anchors.compute_least_scale(
                 self.settings.gaussians,
                 self.cell_size,
-                self.settings.occupancy.voxel_size,
+                voxel_size,
             ),
         )
 

@@ -42,13 +42,12 @@ def test_a_voxel_is_in_the_air_without_a_neighbor() -> None:
 
 def test_who_has_left_is_counted_and_taken_away() -> None:
     looks, poses = looks_at_a_wall(40)
-    clean = air._occupied(looks, None, True)
-    brought, left = (
-        air._occupied(looks, disturbed_depth.stand_and_leave(poses), evidence) for evidence in (False, True)
-    )
+    clean, _ = air._map(looks, None, True)
+    brought, left = (air._map(looks, disturbed_depth.stand_and_leave(poses), evidence)[0] for evidence in (False, True))
     brought, left = (found[~air._beside(found, clean)] for found in (brought, left))
     seen_again = range(-3, 4)  # rows of voxels that stay in view until the camera is there
     assert np.isin(brought[:, 1], seen_again).sum() > 20
     assert not np.isin(left[:, 1], seen_again).any()
-    rows = [{"capture": "a", "disturbances": {"panes": {"brought": 7, "left": 2, "lost": 0.01}}}]
-    assert air.tabulate_air(rows)[-1] == "| a | panes | 7 | 2 | 1.0% |"
+    found = {"brought": 7, "left": 2, "lost": 0.01, "opened": 4}
+    rows = [{"capture": "a", "disturbances": {"panes": found}}]
+    assert air.tabulate_air(rows)[-1] == "| a | panes | 7 | 2 | 1.0% | 4 |"

@@ -1,7 +1,8 @@
 """What moving people, panes and mixed edges leave in the air of a map, and what is lost by taking it away.
 
 The disturbances are put into the depth of a capture, which is mapped at its own poses. A voxel is in the air if neither
-it nor a neighbor is occupied in the map of the undisturbed depth, and lost if it is the other way around.
+it nor a neighbor is occupied in the map of the undisturbed depth, and lost if it is the other way around. It is opened
+if only the map of the disturbed depth calls it free.
 """
 
 from __future__ import annotations
@@ -47,28 +48,33 @@ def measure_air(capture: str) -> Figures:
         "panes": panes,
         "mixed edges": mix_edges,
     }
-    clean = _occupied(looks, None, True)
+    clean, clean_free = _map(looks, None, True)
     figures: dict[str, Any] = {"frames": len(frames), "occupied": len(clean), "disturbances": {}}
     kept = np.ones(len(clean), bool)
     for name, change in changes.items():
         if change is panes:
             off = _centers(clean)[:, None] - middles
             kept = (np.linalg.norm(off, axis=2) > _NEAR_PANES_M).all(axis=1)
-        every, found = (_occupied(looks, change, evidence) for evidence in (False, True))
+        (every, _), (found, found_free) = (_map(looks, change, evidence) for evidence in (False, True))
         figures["disturbances"][name] = {
             "brought": int((~_beside(every, clean)).sum()),
             "left": int((~_beside(found, clean)).sum()),
             "lost": float((~_beside(clean, found) & kept).mean()),
+            "opened": _count_others(found_free, clean_free),
         }
         kept[:] = True
     return figures
 
 
-def _occupied(looks: Sequence[PosedFrame], change: Change | None, evidence: bool) -> NDArray[np.int32]:
-    """(V, 3) occupied voxels of the map of the frames with a change, at the usual options."""
-    from freeocc3d.core.types import OCCUPIED
+def _map(
+    looks: Sequence[PosedFrame], change: Change | None, evidence: bool
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """(V, 3) occupied and (F, 3) free voxels of the map of the frames with a change, at the usual options; without the
+    evidence of all frames, all depth makes surface and carves."""
+    from freeocc3d.core.types import FREE, OCCUPIED
     from freeocc3d.gaussians import anchors
     from freeocc3d.occupancy import build
+    from freeocc3d.occupancy.confirmed_depth import confirm_depth
     from freeocc3d.settings import config
 
     changed = list(disturb(looks, change))
@@ -80,8 +86,16 @@ def _occupied(looks: Sequence[PosedFrame], change: Change | None, evidence: bool
         cells.add(look)
     gaussians = cells.gaussians(changed)
     nothing = np.zeros((len(gaussians), 0), np.float16)
-    made = build.build_occupancy(gaussians, nothing, changed, settings.occupancy, settings.carving)
-    return made.voxels(OCCUPIED)
+    seen = confirm_depth(changed, gaussians, settings.occupancy.voxel_size) if evidence else changed
+    made = build.build_occupancy(gaussians, nothing, seen, settings.occupancy, settings.carving)
+    return made.voxels(OCCUPIED), made.voxels(FREE)
+
+
+def _count_others(voxels: NDArray[np.int32], known: NDArray[np.int32]) -> int:
+    """Voxels (V, 3) that are none of the known ones (K, 3)."""
+    from freeocc3d.core.voxel_keys import contains, pack_voxels
+
+    return int((~contains(np.sort(pack_voxels(known)), pack_voxels(voxels))).sum())
 
 
 def _centers(voxels: NDArray[np.int32]) -> NDArray[np.floating]:
@@ -104,9 +118,23 @@ def _beside(voxels: NDArray[np.int32], others: NDArray[np.int32]) -> NDArray[np.
 def tabulate_air(rows: Sequence[Figures]) -> list[str]:
     """A table of all captures."""
     return tabulate(
-        ("capture", "put into the depth", "voxels in the air without evidence", "with it", "surface lost"),
+        (
+            "capture",
+            "put into the depth",
+            "voxels in the air without evidence",
+            "with it",
+            "surface lost",
+            "opened",
+        ),
         [
-            (row["capture"], name, str(found["brought"]), str(found["left"]), f"{found['lost']:.1%}")
+            (
+                row["capture"],
+                name,
+                str(found["brought"]),
+                str(found["left"]),
+                f"{found['lost']:.1%}",
+                str(found["opened"]),
+            )
             for row in rows
             if "disturbances" in row
             for name, found in row["disturbances"].items()
