@@ -67,4 +67,4 @@ system:
 	@sh tools/system_libraries.sh
 
 clean:
-	rm -rf $(VENV) demo site build dist *.egg-info
+	rm -rf $(VENV) demo site build dist *.egg-info freeocc3d/core/compiled

@@ -18,5 +18,5 @@ def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
 
 def build_wheel(wheel_directory: str, config_settings: Any = None, metadata_directory: str | None = None) -> str:
     if subprocess.run([sys.executable, "-m", "freeocc3d.core.ahead_of_time"]).returncode:
-        print("The wheel has no compiled kernels: the first run will compile them.", file=sys.stderr)
+        print("The wheel lacks compiled kernels: the first run will compile what it lacks.", file=sys.stderr)
     return build_meta.build_wheel(wheel_directory, config_settings, metadata_directory)
