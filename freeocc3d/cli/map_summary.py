@@ -126,8 +126,9 @@ def _upright_text(upright: dict[str, Any] | None) -> str:
         return "upright    no: an earlier map, in the frame of its first camera or poses (see freeocc3d upright)"
     floor = "the floor at z = 0" if upright["floor"] else "no floor is seen"
     walls = "walls along x and y" if upright["walls"] else "x along the first view"
-    rolled = f"which were rolled by {upright['off_deg']:.1f} degrees"
-    off = rolled if upright["by"] == "cameras" else f"{upright['off_deg']:.1f} degrees from that of the cameras"
+    degrees = f"{upright['off_deg']:.1f} degrees"
+    alone = {"cameras": f"which were rolled by {degrees}", "one view": "whose pitch nothing tells"}
+    off = alone.get(upright["by"], f"{degrees} from that of the cameras")
     return f"upright    z up by the {upright['by']}, {off}; {floor}, {walls}"
 
 

@@ -125,9 +125,10 @@ class SceneWords(msgspec.Struct, frozen=True, kw_only=True):
 
 class Upright(msgspec.Struct, frozen=True, kw_only=True):
     """How sure the upright frame of a map is. by: what up comes from, the surest first: "floor", "level surfaces",
-    "walls" or "cameras".  off_deg: degrees from that up to the up of the cameras; for the cameras alone, by how much
-    they were rolled.  floor: whether z = 0 is a floor, or else the level of the lowest points.  walls: whether x and y
-    lie along walls, or else x along the first camera's view."""
+    "walls", "cameras", or "one view": cameras that all look the same way, which tell no pitch.  off_deg: degrees from
+    that up to the up of the cameras; for the cameras alone, by how much they were rolled.  floor: whether z = 0 is a
+    floor, or else the level of the lowest points.  walls: whether x and y lie along walls, or else x along the first
+    camera's view."""
 
     by: str
     off_deg: float

@@ -124,6 +124,16 @@ def test_the_surest_evidence_decides(sheets, by, floor, walls) -> None:
     np.testing.assert_array_equal(again.T_upright_world, found.T_upright_world)
 
 
+@pytest.mark.parametrize(("tilt_deg", "by"), [(30, "level surfaces"), (60, "level surfaces"), (15, "one view")])
+def test_one_camera_tells_up_by_a_table_it_looks_down_at(tilt_deg, by) -> None:
+    """tilt_deg: of a single plane's normal from the view, toward the image's top. At 15 degrees it may be a wall that
+    the camera looks up at, or a table almost straight below."""
+    cos, sin = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
+    found = find_upright_frame(np.eye(4)[None], shown(((0, 0, 1), (0, cos, -sin), (1, 0, 0))))
+    assert (found.by, found.floor) == (by, by != "one view")
+    np.testing.assert_allclose(found.T_upright_world[2, :3], (0, -sin, -cos) if found.floor else (0, -1, 0), atol=1e-6)
+
+
 def test_without_a_floor_or_anything_there_is_a_frame_still() -> None:
     assert estimate_floor_height(np.array((2.0, 3.0)), 1.5) is None
     nothing = gaussians(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -131,6 +141,7 @@ def test_without_a_floor_or_anything_there_is_a_frame_still() -> None:
         found = estimate_gravity_frame(poses, nothing)
         assert is_rigid(found)
         np.testing.assert_allclose(found[2, :3], (0, -1, 0), atol=1e-6)
+    assert find_upright_frame(np.eye(4)[None], shown(WALL_X)[np.zeros(0, int)]).by == "one view"
     down = np.eye(4)
     down[:3, :3] = np.diag((1.0, -1.0, -1.0))  # looks straight down, z up
     assert is_rigid(estimate_gravity_frame(down[None], room()))

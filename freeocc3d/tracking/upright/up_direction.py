@@ -43,6 +43,13 @@ def estimate_camera_up(T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.flo
     return up, float(np.degrees(np.sqrt((rolled**2).mean())))
 
 
+def look_one_way(T_world_cam: NDArray[np.float64]) -> bool:
+    """Whether all of (K, 4, 4) cameras, K > 0, look so nearly the same way that their level axes do not tell their
+    pitch."""
+    level_axes, _ = _held(T_world_cam)
+    return bool(np.linalg.eigvalsh(level_axes.T @ level_axes / len(level_axes))[1] < _ALL_ALIKE)
+
+
 def turn_to_levels(up: NDArray[np.float64], points_world: NDArray[np.floating]) -> NDArray[np.float64]:
     """Returns the (3,) ``up`` turned by up to 10 degrees to where the heights of (N, 3) surface points have the
     sharpest histogram, as on level surfaces."""

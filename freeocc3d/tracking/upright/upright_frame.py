@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ...core.transforms import invert
 from ...core.types import Gaussians
 from .surface_patches import CELL_M, SurfacePatches
-from .up_direction import estimate_camera_up
+from .up_direction import estimate_camera_up, look_one_way
 
-FLOOR, LEVELS, WALLS, CAMERAS = "floor", "level surfaces", "walls", "cameras"
+FLOOR, LEVELS, WALLS, CAMERAS, ONE_VIEW = "floor", "level surfaces", "walls", "cameras", "one view"
 """What up comes from, the surest first."""
 
 _SAMPLES = 20_000
@@ -35,7 +35,9 @@ _SMOOTHING = (0.25, 0.5, 1.0, 0.5, 0.25)  # smooths the histogram of heights, so
 _LEAST_FLOOR = 10  # smallest number of points for the floor's plane
 _LEAST_PATCHES = round(0.25 / CELL_M**2)  # a quarter of a square meter: less shows neither walls nor what is level
 _BANDS_DEG = (20.0, 10.0, 5.0, 3.0)  # largest slope of level surfaces, and of walls from upright, round after round
-_PITCHES_DEG, _CLEARLY = (0.0, -15.0, 15.0, -30.0, 30.0), 1.5  # pitches to try, and how much more must speak for one
+_PITCHES_DEG = (0.0, -15.0, 15.0, -30.0, 30.0, -45.0)
+"""Turns of the cameras' up toward their view to try; the last one for tables, at which people look steeply down."""
+_CLEARLY = 1.5  # how much more must speak for one of them than for no turn
 _TINY = 1e-9  # avoids division by 0 where the cameras' x axes cancel out
 _OPEN = 0.1  # smallest share of them that must speak against the next best direction
 _NEAR_PEAK_DEG = 3.0  # largest angle from the peak of the walls' directions for the median
@@ -55,8 +57,9 @@ class UprightFrame:
     nearest to that camera's view.
 
     T_upright_world: (4, 4), rigid.
-    by: what up comes from: "floor", "level surfaces", "walls" or "cameras".  off_deg: degrees from that up to the up of
-    the cameras; for the cameras alone, by how much they were rolled.
+    by: what up comes from: "floor", "level surfaces", "walls", "cameras", or "one view": cameras that all look the same
+    way, which tell no pitch.  off_deg: degrees from that up to the up of the cameras; for the cameras alone, by how
+    much they were rolled.
     floor: whether z = 0 is a floor, or else the level of the lowest points.
     walls: whether x lies along walls, or else along the first camera's view.
     """
@@ -92,13 +95,13 @@ def find_upright_frame(T_world_cam: NDArray[np.float64], patches: SurfacePatches
     by_normals = _find_by_normals(by_cameras, T_world_cam[:, :3, 0].mean(axis=0), patches.normals)
     near = by_cameras if by_normals is None else by_normals
     by_floor, height = _find_floor(near, patches, centers)
-    up, by = by_cameras, CAMERAS
+    up, by = by_cameras, ONE_VIEW if look_one_way(T_world_cam) else CAMERAS
     if by_floor is not None:
         up, by = by_floor, FLOOR
     elif by_normals is not None:
         level = patches[np.abs(patches.normals @ by_normals) > _LEVEL]
         up, by = (_fit_levels(near, level.points), LEVELS) if len(level) >= _LEAST_PATCHES else (by_normals, WALLS)
-    if by != CAMERAS:
+    if by not in (CAMERAS, ONE_VIEW):
         off_deg = float(np.degrees(np.arccos(np.clip(up @ by_cameras, -1, 1))))
     if height is None:
         z0 = float(np.percentile(patches.points @ up if len(patches) else centers @ up, 1))
