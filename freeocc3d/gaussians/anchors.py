@@ -3,9 +3,9 @@
 Dense pixels do not become Gaussians of their own: a wall seen by a hundred keyframes would be a hundred layers thick,
 which saturates the occupancy product and fills memory. Instead, the measurements in a cell are averaged, weighted by
 their depth uncertainty. The averages move to the surface that all depth maps together show (``denoising``) and are
-averaged by cell again, and to the planes of their neighbors as far as they are less certain (``local_planes``). Each
-result is anchored to the keyframe that measures it best. The number of Gaussians grows with the surface, not with the
-number of frames.
+averaged by cell again, and to the planes of their neighbors as far as they are less certain (``local_planes``). What a
+mirror shows is left out (``reflections``). Each result is anchored to the keyframe that measures it best. The number of
+Gaussians grows with the surface, not with the number of frames.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from ..core.types import Frame, Gaussians, PosedFrame
 from ..settings.stages import GaussianOptions as Options
 from . import denoising
 from .local_planes import fit_planes
+from .reflections import find_reflections
 from .surface_cells import Cells, CellSums
 
 _COLUMNS = 320
@@ -103,8 +104,11 @@ class AnchoredCells:
         spacing, sigma_m = np.maximum(self.cell_size, cells.footprint), 1.0 / np.sqrt(cells.weights)
         points, planes = cells.points, None
         if kind == "disc":
-            rays = points - T_world_keyframe[cells.keyframe, :3, 3]
-            planes = fit_planes(points, sigma_m, rays, spacing)
+            cameras = T_world_keyframe[cells.keyframe, :3, 3]
+            planes = fit_planes(points, sigma_m, points - cameras, spacing)
+            if self.options.denoise:
+                real = ~find_reflections(planes.points, planes.normals, cameras, self.cell_size)
+                cells, planes, spacing = cells[real], planes[real], spacing[real]
             points = planes.points
         else:
             spacing = np.hypot(spacing, self.options.uncertainty * sigma_m)

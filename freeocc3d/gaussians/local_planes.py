@@ -64,6 +64,9 @@ class LocalPlanes:
     normals: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
 
+    def __getitem__(self, rows: NDArray[np.bool_]) -> LocalPlanes:
+        return LocalPlanes(self.points[rows], self.normals[rows], self.sigma_m[rows])
+
 
 def fit_planes(
     points: NDArray[np.float64], sigma_m: NDArray[np.float64], rays: NDArray[np.float64], spacing: NDArray[np.floating]
