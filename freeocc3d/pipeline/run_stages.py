@@ -126,6 +126,7 @@ def refine_poses(run: Run) -> None:
         if not mapper.refined:
             mapper.refine()
             work.save_tracking(mapper.state(len(select_frames(mapper.capture))))
+        mapper.tracker.release()
     trajectory = mapper.trajectory()
     status = trajectory.status.copy()
     status[list(work.broken)] = "broken"

@@ -115,6 +115,9 @@ class Tracker(ABC):
         """Make all poses so far consistent with all measurements so far. The world frame is the first keyframe's;
         trackers with given poses keep their own world frame."""
 
+    def release(self) -> None:  # noqa: B027, most keep nothing else
+        """Forget what only ``track`` and ``optimize`` need; the run will call neither again."""
+
     @abstractmethod
     def restore(self, state: dict[str, NDArray[np.generic]], read: Callable[[int], Frame]) -> None:
         """Continue from a saved ``state``, to the same result as without a stop. read: gives a frame of the capture

@@ -129,6 +129,9 @@ class RgbdTracker(Tracker):
                 T[k] = pose
         self.records.pieces = pieces
 
+    def release(self) -> None:
+        self.keyframes, self._last = [], None  # 0.7 MB each
+
     def _follow(self, seen: _Seen) -> dense_alignment.ViewAlignment | None:
         """The alignment to the current keyframe; None if it is not reliable."""
         target = self.keyframes[self._current]
