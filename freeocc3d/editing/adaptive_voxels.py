@@ -29,7 +29,7 @@ from ..core.voxel_keys import pack_voxels, unpack_voxels
 from ..gaussians.surface_cells import cell_keys
 from ..language.feature_codec import Codec
 from ..occupancy import build, carve, levels, splat
-from ..occupancy.confirmed_depth import confirm_depth
+from ..occupancy.confirmed_depth import hide_unconfirmed
 from ..query.scan_map import Map, load_map
 from ..settings.config import Settings
 from ..storage.manifest import Refined
@@ -109,7 +109,7 @@ def build_adaptive(
     sizes = [base.voxel_size / 2**level for level in range(1, len(found) + 1)]
     seen = [carve.DepthEvidence(base.origin, size, carving, own) for size, own in zip(sizes, leaves, strict=True)]
     progress.stage("occupancy", len(T_world_keyframe))
-    confirmed = confirm_depth(posed(), gaussians, base.voxel_size, settings.gaussians.cell_size)
+    confirmed = hide_unconfirmed(posed(), gaussians, base.voxel_size, settings.gaussians.cell_size)
     for done, look in enumerate(confirmed, 1):
         for evidence in seen:
             evidence.add(look.frame, look.T_world_cam)

@@ -25,7 +25,7 @@ from ..gaussians import anchors
 from ..language import lifting
 from ..language.feature_codec import Codec
 from ..occupancy import build
-from ..occupancy.confirmed_depth import confirm_depth
+from ..occupancy.confirmed_depth import hide_unconfirmed
 from ..query.regions import Region
 from ..query.scan_map import Map, load_map
 from ..settings.config import Settings
@@ -112,7 +112,7 @@ def refine_box(
         occupancy = build.build_occupancy(
             gaussians,
             features,
-            confirm_depth(posed(), scan_map.gaussians, scan_map.manifest.voxel_size_m, settings.gaussians.cell_size),
+            hide_unconfirmed(posed(), scan_map.gaussians, scan_map.manifest.voxel_size_m, settings.gaussians.cell_size),
             settings.occupancy,
             settings.carving,
             origin=box.low,

@@ -21,7 +21,7 @@ from ..core.types import Gaussians, Occupancy, PosedFrame, Trajectory
 from ..gaussians import anchors
 from ..language.feature_codec import Codec
 from ..occupancy import build
-from ..occupancy.confirmed_depth import confirm_depth
+from ..occupancy.confirmed_depth import hide_unconfirmed
 from ..query.scan_map import Map, load_map
 from ..storage.manifest import Manifest, Upright, matrix
 from ..storage.work_folder import WorkFolder
@@ -96,7 +96,7 @@ def _build_occupancy(
     occupancy = build.build_occupancy(
         gaussians,
         features,
-        confirm_depth(read_keyframes(scan_map, poses), gaussians, size, cell_size),
+        hide_unconfirmed(read_keyframes(scan_map, poses), gaussians, size, cell_size),
         options,
         settings.carving,
         origin=find_lattice_origin(patches, size),

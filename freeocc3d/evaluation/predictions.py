@@ -22,7 +22,7 @@ from ..gaussians import anchors
 from ..gaussians.splat_ply import read_standard_ply
 from ..language.encoders.base import TextEncoder, TextFeatures
 from ..occupancy import build, splat
-from ..occupancy.confirmed_depth import confirm_depth
+from ..occupancy.confirmed_depth import hide_unconfirmed
 from ..query import word_query
 from ..query.scan_map import Map
 from ..settings.config import Settings
@@ -55,7 +55,7 @@ def predict_from_map(
     occupancy = build.build_occupancy(
         gaussians,
         features,
-        confirm_depth(_scaled(scan_map, alignment), gaussians, scale * own, scale * cell_size),
+        hide_unconfirmed(_scaled(scan_map, alignment), gaussians, scale * own, scale * cell_size),
         splatting,
         settings.carving,
         origin=truth.origin,

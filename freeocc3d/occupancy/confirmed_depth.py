@@ -27,7 +27,7 @@ HIDDEN_M = 1e-3
 """Depth of a pixel that is not confirmed: it hides all that is behind it, as far as its own frame can tell."""
 
 
-def confirm_depth(
+def hide_unconfirmed(
     frames: Iterable[PosedFrame], gaussians: Gaussians, voxel_size: float, cell_size: float | None = None
 ) -> Iterator[PosedFrame]:
     """Yields the frames with ``HIDDEN_M`` as the depth of pixels that end where no surface is.

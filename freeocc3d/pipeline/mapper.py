@@ -28,7 +28,7 @@ from ..gaussians.rasterizers.base import Rasterizer
 from ..language import lifting
 from ..language.encoders.base import Encoder
 from ..occupancy import build
-from ..occupancy.confirmed_depth import confirm_depth
+from ..occupancy.confirmed_depth import hide_unconfirmed
 from ..settings.config import Settings
 from ..storage import map_files
 from ..storage.keyframes import Keyframes
@@ -273,7 +273,7 @@ class Mapper:
         return build.build_occupancy(
             gaussians,
             features,
-            confirm_depth(frames, gaussians, voxel_size, self.cell_size),
+            hide_unconfirmed(frames, gaussians, voxel_size, self.cell_size),
             self.settings.occupancy,
             carving,
             origin=self.origin,

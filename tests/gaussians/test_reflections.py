@@ -8,7 +8,7 @@ from scenes import CAMERA, lifted, posed, wall_frame
 
 from freeocc3d.core.types import FREE, Gaussians, PosedFrame
 from freeocc3d.occupancy import build, carve, splat
-from freeocc3d.occupancy.confirmed_depth import confirm_depth
+from freeocc3d.occupancy.confirmed_depth import hide_unconfirmed
 
 DEPTH_M = 5.0  # of the room along y; the mirror hangs there
 ROOM = np.array([(0, 0, 0), (4, DEPTH_M, 2.5)])
@@ -60,7 +60,7 @@ def test_what_a_mirror_shows_is_unknown_and_what_a_door_shows_stays(opening: str
     looks = [look(number, opening) for number in range(24)]
     g, every = lift(looks), lift(looks, denoise=False)
     assert (every.means[:, 1] > DEPTH_M + 0.2).sum() > 3000
-    seen = confirm_depth(looks, g, 0.08)
+    seen = hide_unconfirmed(looks, g, 0.08)
     made = build.build_occupancy(g, np.zeros((len(g), 0), np.float16), seen, splat.Options(), carve.Options())
     free = (made.voxels(FREE) + 0.5) * made.voxel_size
     assert (free[:, 1] < DEPTH_M - 0.2).sum() > 40_000

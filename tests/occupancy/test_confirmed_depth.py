@@ -6,7 +6,7 @@ from scenes import CAMERA, lifted, posed, wall_frame, with_sigma
 from freeocc3d.core.transforms import back_project, transform
 from freeocc3d.core.types import FREE
 from freeocc3d.occupancy import build, carve, splat
-from freeocc3d.occupancy.confirmed_depth import confirm_depth
+from freeocc3d.occupancy.confirmed_depth import hide_unconfirmed
 
 
 def test_a_pixel_is_confirmed_by_gaussians_around_its_end() -> None:
@@ -18,7 +18,7 @@ def test_a_pixel_is_confirmed_by_gaussians_around_its_end() -> None:
     frame = with_sigma(wall_frame(2.0))
     frame.depth_m[:] = np.random.default_rng(0).uniform(1.5, 2.5, frame.depth_m.shape)
     frame.depth_sigma_m[:] = 0.04  # three of them are three cells, to be looked at in both directions
-    kept = next(confirm_depth(posed([frame], T[None]), g, 2 * edge)).frame.depth_m == frame.depth_m
+    kept = next(hide_unconfirmed(posed([frame], T[None]), g, 2 * edge)).frame.depth_m == frame.depth_m
 
     def cells(points: np.ndarray) -> np.ndarray:
         return np.floor(points / edge).astype(int)
@@ -46,7 +46,7 @@ def test_what_lies_behind_a_pane_with_specks_is_unknown() -> None:
     looks = posed(frames, np.tile(np.eye(4), (40, 1, 1)))
     g = lifted(frames, np.tile(np.eye(4), (40, 1, 1)), 0.04)
     states = []
-    for seen in (looks, confirm_depth(looks, g, 0.08)):
+    for seen in (looks, hide_unconfirmed(looks, g, 0.08)):
         made = build.build_occupancy(g, np.zeros((len(g), 0), np.float16), seen, splat.Options(), carve.Options())
         free = (made.voxels(FREE) + 0.5) * made.voxel_size
         states.append((free[:, 2] > 2.1).sum())

@@ -74,7 +74,7 @@ def _map(
     from freeocc3d.core.types import FREE, OCCUPIED
     from freeocc3d.gaussians import anchors
     from freeocc3d.occupancy import build
-    from freeocc3d.occupancy.confirmed_depth import confirm_depth
+    from freeocc3d.occupancy.confirmed_depth import hide_unconfirmed
     from freeocc3d.settings import config
 
     changed = list(disturb(looks, change))
@@ -86,7 +86,7 @@ def _map(
         cells.add(look)
     gaussians = cells.gaussians(changed)
     nothing = np.zeros((len(gaussians), 0), np.float16)
-    seen = confirm_depth(changed, gaussians, settings.occupancy.voxel_size) if evidence else changed
+    seen = hide_unconfirmed(changed, gaussians, settings.occupancy.voxel_size) if evidence else changed
     made = build.build_occupancy(gaussians, nothing, seen, settings.occupancy, settings.carving)
     return made.voxels(OCCUPIED), made.voxels(FREE)
 
