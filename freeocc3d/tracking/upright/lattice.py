@@ -18,10 +18,11 @@ wall at 2 m, averaged over frames, is less than this part of a voxel of 4 cm."""
 def find_lattice_origin(upright: SurfacePatches, voxel_size: float) -> NDArray[np.float64]:
     """Returns (3,) the lower corner of voxel (0, 0, 0) in an upright frame, meters, within one voxel of its origin.
 
-    upright: patches in that frame. z = 0 lies in the middle of a layer. Along x and y, the fewest walls lie near faces
-    between layers. Without walls, x = y = 0 is the middle of a voxel.
+    upright: patches in that frame. z = 0 lies a third of a voxel above a face: so it lies a third from a face of the
+    halves, the quarters and so on, too. Along x and y, the fewest walls lie near faces between layers. Without walls,
+    x = y = 0 is the middle of a voxel.
     """
-    origin = np.full(3, -0.5)
+    origin = np.array((-0.5, -0.5, -1 / 3))
     for axis in (0, 1):
         across = np.abs(upright.normals[:, axis]) > _FACING
         if across.any():
