@@ -49,7 +49,7 @@ def test_the_run_has_told_the_same(room: Map, checked: MapCheck, monkeypatch: py
     for name, said in report["measures"].items():
         value = told[name].value
         assert said["value"] == (value and pytest.approx(value, rel=1e-4)), name
-    assert room.report["seconds"]["check"] > 0
+    assert room.report["seconds"]["check"] >= 0  # what it takes longer than pictures and files
     assert f"check      {report['verdict']}, depth differs by" in summary_text(room)
     poor = {**report["measures"]["unmeasured"], "verdict": "poor"}
     changed = {**room.report, "check": {"verdict": "poor", "measures": {"unmeasured": poor}}}
@@ -102,7 +102,7 @@ def test_the_benchmark_compares_other_poses_of_the_same_keyframes(room: Map, che
     told = figures["agreement"]
     assert told["own"]["step_off_m"] == pytest.approx(measures(checked)["step"].value)
     assert told["given"]["step_off_m"] < told["drift 8 cm"]["step_off_m"]
-    assert 0 < figures["share_of_run"] < 1
+    assert 0 <= figures["share_of_run"] < 1
     # This walk never comes back, so that no line tells of revisits.
     lines = check_lines(figures)
     assert lines[0][0].startswith("  step: ")
