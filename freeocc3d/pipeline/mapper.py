@@ -46,7 +46,7 @@ _FINE = 0.01
 
 _AHEAD = 4  # keyframes that wait to be written
 
-_FITTED_PER_FRAME, _FITTED_PER_KEYFRAME = 0.4, 1.25
+_FITTED_PER_FRAME, _FITTED_PER_KEYFRAME = 0.45, 1.25
 """Small renderings that fitting may take for each frame and each keyframe. The rest of a run takes 30 ms of a processor
 for a frame and about 100 ms for a keyframe, a small rendering 25 to 50 ms: fitting stays below a third of the run."""
 
