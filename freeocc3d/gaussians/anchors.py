@@ -32,6 +32,7 @@ _COLUMNS = 320
 _SAMPLE = 32
 """Frames, at most, from which the registration error is estimated; a half of them at least if there are so many. A
 kitchen's error of 13.5 mm comes out as 10 to 12."""
+_NO_COLOR = np.zeros((0, 0, 3), np.uint8)  # no part of the frame's colors, which would stay in memory
 _SAMPLED = 4  # step between the pixels for a frame's median depth
 _BACKWARD = 1e-6  # smallest 1 + z of a ray, so that a ray exactly backward gives a quaternion
 _FINEST = 12.0
@@ -81,7 +82,7 @@ class AnchoredCells:
         stride = choose_stride(posed.frame, self.options, self.cell_size)
         self._sums.add_frame(posed, stride, self.options.edge)
         if self._added % self._every == 0:
-            self._sample.append(posed._replace(frame=replace(posed.frame, color=posed.frame.color[:0])))
+            self._sample.append(posed._replace(frame=replace(posed.frame, color=_NO_COLOR)))
         self._added += 1
         if len(self._sample) > _SAMPLE:
             self._sample, self._every = self._sample[::2], 2 * self._every

@@ -49,7 +49,7 @@ def test_the_run_has_told_the_same(room: Map, checked: MapCheck, monkeypatch: py
     for name, said in report["measures"].items():
         value = told[name].value
         assert said["value"] == (value and pytest.approx(value, rel=1e-4)), name
-    assert room.report["seconds"]["check"] >= 0  # what it takes longer than pictures and files
+    assert "check" in room.report["seconds"]  # what it takes longer than pictures and files
     assert f"check      {report['verdict']}, depth differs by" in summary_text(room)
     poor = {**report["measures"]["unmeasured"], "verdict": "poor"}
     changed = {**room.report, "check": {"verdict": "poor", "measures": {"unmeasured": poor}}}
