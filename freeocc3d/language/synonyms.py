@@ -11,64 +11,109 @@ import functools
 import re
 
 SYNONYMS: tuple[tuple[str, ...], ...] = (
-    ("sofa", "couch", "settee", "loveseat"),
-    ("television", "tv", "telly", "television set", "tv screen", "tv monitor", "television screen"),
+    ("sofa", "couch", "settee", "loveseat", "chesterfield", "sectional", "futon"),
+    (
+        "television", "tv", "telly", "television set", "tv set", "tv screen", "tv monitor", "television screen",
+        "flat screen",
+    ),
     (
         "trash can", "trash bin", "bin", "rubbish bin", "garbage can", "garbage bin", "waste bin", "dustbin",
-        "wastebasket", "waste paper basket",
+        "wastebasket", "waste paper basket", "recycling bin", "trash", "litter bin",
     ),
-    ("refrigerator", "fridge", "freezer"),
+    ("refrigerator", "fridge", "freezer", "icebox"),
     ("wardrobe", "closet", "armoire"),
-    ("rug", "carpet", "mat", "floor mat"),
-    ("plant", "potted plant", "house plant", "indoor plant", "pot plant"),
-    ("lamp", "light"),
-    ("ceiling light", "ceiling lamp"),
-    ("picture", "painting", "photograph", "photo", "poster", "wall art", "picture frame", "photo frame"),
-    ("cup", "mug"),
-    ("bookshelf", "bookcase"),
-    ("shelf", "shelf board", "shelving", "rack"),
-    ("cabinet", "cupboard"),
-    ("stove", "cooker", "hob", "cooktop", "oven"),
-    ("desk", "writing desk", "office desk", "work desk"),
-    ("nightstand", "bedside table", "night table", "bedside cabinet"),
+    ("rug", "carpet", "mat", "floor mat", "doormat", "bath mat"),
+    ("plant", "potted plant", "house plant", "indoor plant", "pot plant", "ficus", "indoor tree", "cactus"),
+    ("lamp", "light", "light fixture", "lighting"),
+    ("floor lamp", "standing lamp", "standard lamp", "torchiere"),
+    ("desk lamp", "table lamp", "reading lamp", "bedside lamp", "reading light"),
+    ("ceiling light", "ceiling lamp", "pendant lamp", "pendant light"),
+    (
+        "picture", "painting", "photograph", "photo", "poster", "wall art", "picture frame", "photo frame", "artwork",
+        "drawing", "canvas",
+    ),
+    ("cup", "mug", "teacup"),
+    ("bookshelf", "bookcase", "book rack"),
+    ("book", "novel", "textbook", "paperback"),
+    ("shelf", "shelf board", "shelving", "rack", "shelving unit"),
+    ("cabinet", "cupboard", "sideboard", "credenza"),
+    ("stove", "cooker", "hob", "cooktop", "oven", "stovetop", "range"),
+    ("desk", "writing desk", "office desk", "work desk", "workstation"),
+    ("nightstand", "bedside table", "night table", "bedside cabinet", "bedside stand"),
     ("side table", "end table"),
+    ("coffee table", "cocktail table"),
     ("dining table", "kitchen table", "dinner table"),
     ("chest of drawers", "dresser", "drawers", "commode", "bureau"),
-    ("curtain", "drape", "drapery"),
-    ("blind", "window blind", "roller blind", "venetian blind"),
-    ("laptop", "notebook computer"),
+    ("curtain", "drape", "drapery", "net curtain"),
+    ("blind", "window blind", "roller blind", "venetian blind", "roller shade", "window shade", "shutter"),
+    ("laptop", "notebook computer", "macbook"),
     ("monitor", "computer screen", "computer monitor", "display"),
-    ("floor", "ground", "flooring"),
+    ("computer keyboard", "keyboard"),
+    ("computer mouse", "mouse"),
+    ("computer", "pc", "desktop computer", "computer tower"),
+    ("floor", "ground", "flooring", "parquet"),
     ("wall", "wall panel"),
-    ("pillow", "cushion"),
-    ("blanket", "throw", "duvet", "comforter", "quilt", "bedspread"),
+    ("pillow", "cushion", "throw pillow", "bolster"),
+    ("blanket", "throw", "duvet", "comforter", "quilt", "bedspread", "bedcover"),
     ("bathtub", "bath", "tub"),
-    ("toilet", "wc", "lavatory"),
-    ("sink", "washbasin", "basin"),
+    ("toilet", "wc", "lavatory", "loo"),
+    ("sink", "washbasin", "basin", "hand basin"),
     ("tap", "faucet"),
-    ("counter", "countertop", "worktop", "kitchen counter"),
+    ("counter", "countertop", "worktop", "kitchen counter", "work surface"),
     ("seat", "chair"),
-    ("armchair", "easy chair", "lounge chair"),
-    ("office chair", "desk chair", "swivel chair"),
-    ("stool", "bar stool"),
-    ("range hood", "cooker hood", "extractor hood", "kitchen hood"),
+    ("armchair", "easy chair", "lounge chair", "recliner", "wing chair"),
+    ("office chair", "desk chair", "swivel chair", "computer chair"),
+    ("stool", "bar stool", "footstool", "ottoman", "pouf"),
+    ("range hood", "cooker hood", "extractor hood", "kitchen hood", "extractor fan"),
     ("air conditioner", "ac", "air conditioning", "air con"),
-    ("tv cabinet", "tv stand", "tv bench", "tv unit", "media console"),
-    ("tableware", "dishes", "crockery"),
-    ("person", "human", "man", "woman"),
+    ("fan", "ventilator", "ceiling fan"),
+    ("tv cabinet", "tv stand", "tv bench", "tv unit", "media console", "entertainment center"),
+    ("tableware", "dishes", "crockery", "dishware"),
+    ("person", "human", "man", "woman", "child", "boy", "girl", "somebody"),
     ("dumbbell", "barbell", "weights"),
     ("exercise bench", "weight bench"),
-    ("kitchen utensils", "utensils", "cutlery"),
-    ("heater", "radiator"),
+    ("kitchen utensils", "utensils", "cutlery", "silverware", "flatware"),
+    ("heater", "radiator", "space heater"),
     ("shoe rack", "shoe shelf", "shoe cabinet"),
+    ("shoe", "trainer", "sneaker", "boot", "slipper", "sandal", "footwear"),
+    ("clothes", "clothing", "garment", "apparel"),
+    ("backpack", "rucksack", "knapsack", "schoolbag"),
+    ("bag", "handbag", "purse", "tote", "shopping bag"),
+    ("suitcase", "luggage", "baggage"),
+    ("basket", "hamper", "laundry basket"),
+    ("box", "carton", "cardboard box", "crate"),
+    ("bicycle", "bike"),
+    ("telephone", "phone", "cell phone", "mobile phone", "mobile", "smartphone", "handset"),
+    ("power outlet", "socket", "electrical socket", "plug socket", "wall socket", "electrical outlet", "outlet"),
+    ("light switch", "switch", "wall switch"),
+    ("speaker", "loudspeaker", "soundbar", "stereo"),
+    ("stairs", "staircase", "stairway", "steps"),
+    ("door handle", "doorknob"),
+    ("door", "doorway"),
+    ("whiteboard", "marker board", "dry erase board", "blackboard", "chalkboard"),
+    ("toy", "teddy bear", "teddy", "doll", "stuffed animal", "plush toy", "plushie"),
+    ("clock", "wall clock", "alarm clock"),
+    ("washing machine", "washer", "clothes washer"),
+    ("microwave", "microwave oven"),
+    ("vacuum cleaner", "hoover", "vacuum"),
+    ("vase", "flower vase"),
+    ("candle", "candlestick"),
+    ("printer", "copier", "photocopier"),
+    ("mirror", "looking glass"),
+    ("window", "windowpane"),
+    ("towel", "bath towel", "hand towel"),
+    ("chandelier",),
+    ("fire extinguisher",),
 )  # fmt: skip
 """Words that people use for the same kind of thing indoors."""
 
 INCLUDES: dict[str, tuple[str, ...]] = {
     "chair": ("armchair", "stool"),
-    "lamp": ("chandelier", "ceiling light"),
+    "lamp": ("chandelier", "ceiling light", "floor lamp", "desk lamp"),
     "shelf": ("bookshelf",),
-    "tableware": ("cup", "plate", "bowl", "glass", "saucer", "teapot"),
+    "tableware": ("cup", "plate", "bowl", "glass", "wine glass", "saucer", "teapot"),
+    "kitchen utensil": ("knife", "fork", "spoon", "spatula", "ladle"),
+    "clothes": ("jacket", "coat", "shirt", "sweater", "dress", "trousers", "pants", "jeans", "hat"),
     "computer": ("laptop", "tablet", "monitor"),
     "screen": ("monitor", "television", "laptop", "tablet"),
     "bedding": ("pillow", "blanket", "sheet"),
@@ -84,42 +129,16 @@ table)."""
 
 _IRREGULAR = {
     "shelves": "shelf", "bookshelves": "bookshelf", "knives": "knife", "people": "person", "men": "man",
-    "women": "woman", "children": "child",
+    "women": "woman", "children": "child", "clothes": "clothes", "scissors": "scissors", "stairs": "stairs",
 }  # fmt: skip
 _ARTICLES = {"a", "an", "the", "my", "your", "our", "this", "that", "these", "those", "some", "any", "all", "every"}
-_PREPOSITIONS = {
-    "of", "on", "in", "at", "by", "with", "without", "near", "under", "above", "behind", "beside", "between", "next",
-    "from", "for", "to", "against", "that", "which",
-}  # fmt: skip
-_LONGEST_PHRASE = 16
 
 
 @functools.lru_cache(maxsize=4096)
 def normalize_phrase(phrase: str) -> str:
     """Lower case, no articles or punctuation, each word in the singular: "The Coffee-Tables" to "coffee table"."""
     words = re.findall(r"[^\W_]+", phrase.lower())
-    return " ".join(_singular(word) for word in words if word not in _ARTICLES)
-
-
-def match_names(phrase: str, names: list[str]) -> tuple[list[int], str]:
-    """Returns the class names that a phrase means, and the part of the phrase that was used; no match: ([], "").
-
-    The whole phrase is tried first, then the ends of the part before a preposition ("red chair by the window": "red
-    chair", "chair"), since the last word of an English noun phrase says what the thing is. A part means the names that
-    are equal to it or a kind of it ("table": "coffee table" and "side table"). If there are none, it means those of its
-    synonyms; if there are none either, the names of a wider word that includes it ("mug": "tableware").
-    """
-    known = [make_key(name) for name in names]
-    kinds = [_tail_keys(name) for name in names]
-    parts = split_phrase(phrase)
-    for part in parts:
-        for words in (frozenset((part,)), find_synonyms(part)):
-            if found := _named(words, known, kinds):
-                return found, part
-    for part in parts:
-        if found := _exactly({wide for word in find_synonyms(part) for wide in find_wider(word)}, known):
-            return found, part
-    return [], ""
+    return " ".join(make_singular(word) for word in words if word not in _ARTICLES)
 
 
 @functools.cache
@@ -150,41 +169,13 @@ def find_wider(word: str) -> frozenset[str]:
     )
 
 
-def split_phrase(phrase: str) -> list[str]:
-    """Normal forms to look up, most specific first."""
-    tokens = re.findall(r"[^\W_]+", phrase.lower())[:_LONGEST_PHRASE]
-    cut = next((at for at, token in enumerate(tokens) if at > 0 and token in _PREPOSITIONS), len(tokens))
-    head = normalize_phrase(" ".join(tokens[:cut])).split()
-    ends = [" ".join(head[start:]) for start in range(len(head))]
-    return list(dict.fromkeys(part for part in (normalize_phrase(" ".join(tokens)), *ends) if part))
-
-
-def _named(words: frozenset[str], known: list[str], kinds: list[frozenset[str]]) -> list[int]:
-    """Rows of the names that are in ``words``, or a kind of one of them."""
-    keys = {make_key(word) for word in words}
-    keys |= {make_key(name) for word in words for name in find_narrower(word)}
-    return [row for row, name in enumerate(known) if name in keys or kinds[row] & keys]
-
-
-def _exactly(words: set[str], known: list[str]) -> list[int]:
-    keys = {make_key(word) for word in words}
-    return [row for row, name in enumerate(known) if name in keys]
-
-
 def make_key(name: str) -> str:
     """A key that is equal for "night stand", "Nightstand" and "nightstands"."""
     return normalize_phrase(name).replace(" ", "")
 
 
-@functools.lru_cache(maxsize=4096)
-def _tail_keys(name: str) -> frozenset[str]:
-    """Keys of the names that a name of several words is a kind of: for "small office chair", "office chair" and
-    "chair"."""
-    words = normalize_phrase(name).split()
-    return frozenset("".join(words[start:]) for start in range(1, len(words)))
-
-
-def _singular(word: str) -> str:
+def make_singular(word: str) -> str:
+    """ "shelves" to "shelf", "boxes" to "box"."""
     if word in _IRREGULAR:
         return _IRREGULAR[word]
     if len(word) < 3 or not word.endswith("s") or word.endswith(("ss", "us", "is")):

@@ -299,7 +299,7 @@ def test_a_real_network_on_real_pictures(tmp_path: Path) -> None:
     score = features.astype(np.float32) @ table
     assert score[70:].mean() > 0.7
     assert score[:20].mean() < 0.4
-    assert made.text_state()["aliases"]["carton"] == made.classes.index("box")
+    assert made.text_state()["aliases"]["backpack"] == made.classes.index("bag")
     assert segmenter.NEEDS_CAPTURE is False
 
 

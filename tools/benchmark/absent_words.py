@@ -42,7 +42,7 @@ SEGMENTER = {
 
 def absent_names(names: list[str], present: list[str]) -> list[str]:
     """The names of nothing that is present, in alphabetical order."""
-    from freeocc3d.language.synonyms import match_names
+    from freeocc3d.language.class_names import match_names
 
     return sorted({name for name in names if not match_names(name, present)[0]})
 

@@ -20,7 +20,7 @@ from ...core.typed_documents import as_type
 from ...core.types import Frame
 from ...settings.option_types import FilePath, Stride
 from ...settings.typed_options import TypedOptions
-from .. import synonyms
+from .. import class_names
 from .base import Encoder, TextEncoder, TextFeatures
 
 REQUIRES: tuple[str, ...] = ()
@@ -126,7 +126,7 @@ class LabelWords(TextEncoder):
 
     def matching(self, word: str) -> tuple[list[int], str]:
         """The dimensions of the classes that a phrase means, and the part of the phrase that was used."""
-        return synonyms.match_names(word, self.classes[1:])
+        return class_names.match_names(word, self.classes[1:])
 
     def contrast_words(self) -> list[str]:
         return self.classes[1:]

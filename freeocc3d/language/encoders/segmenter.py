@@ -25,7 +25,7 @@ from ...core.types import Frame
 from ...settings.option_types import Device, FilePath, Stride
 from ...settings.registry import nearest
 from ...settings.typed_options import TypedOptions
-from .. import synonyms
+from .. import class_names, synonyms
 from ..name_embeddings import NameEmbeddings
 from .base import Encoder
 from .labels import LabelState, LabelWords
@@ -237,7 +237,7 @@ class SegmenterWords(LabelWords):
     def matching(self, word: str) -> tuple[list[int], str]:
         """Returns the first match among the parts of a phrase, most specific first."""
         found, used = super().matching(word)
-        for part in synonyms.split_phrase(word):
+        for part in class_names.split_phrase(word):
             if part == used:
                 break
             if synonyms.make_key(part) in self.aliases:
@@ -298,7 +298,7 @@ def _void(names: tuple[str, ...], options: Options) -> NDArray[np.bool_]:
 
 def _aliases(names: NameEmbeddings, classes: tuple[str, ...]) -> dict[str, int]:
     """Names that mean a class by their embeddings, and that the synonyms do not contain."""
-    known = {name: synonyms.match_names(name, list(classes))[1] for name in names.names}
+    known = {name: class_names.match_exactly(name, list(classes))[1] for name in names.names}
     whole = {synonyms.make_key(name) for name, part in known.items() if part == synonyms.normalize_phrase(name)}
     return {key: row for key, row in names.meaning(classes).items() if key not in whole}
 

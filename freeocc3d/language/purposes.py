@@ -1,0 +1,107 @@
+"""What things in rooms are for: "something to sit on" means seats, "where do I throw this away" the trash can.
+
+The table was written for this project. A phrase is read so only if it begins as such phrases do.
+"""
+
+from __future__ import annotations
+
+import re
+
+from .synonyms import make_singular
+
+_ASKS = re.compile(
+    r"\s*(?:(?:find|show|give|bring)\s+(?:me\s+)?|i\s+(?:need|want|am looking for)\s+)?"
+    r"(?:(?:some|any)(?:thing|where|place)|(?:an?|the|some|any)?\s*(?:\w+\s+)?(?:places?|things?|spots?|objects?|devices?|"
+    r"appliances?|tools?|items?|pieces? of furniture|furniture|ways?|way)\b|what|where|which|how)\b",
+    re.IGNORECASE,
+)
+_LEAST_STEM = 3
+
+PURPOSES: dict[tuple[str, ...], tuple[str, ...]] = {
+    ("sit", "sit down", "seat", "rest leg"): ("chair", "sofa", "armchair", "stool", "bench"),
+    ("sleep", "lie down", "lie", "nap", "lay down", "rest"): ("bed",),
+    ("head", "rest head"): ("pillow",),
+    ("cover", "warm bed", "wrap"): ("blanket",),
+    ("wash hand", "wash face", "rinse", "brush tooth", "water", "wash"): ("sink", "tap"),
+    ("drink", "tea", "coffee"): ("cup", "glass"),
+    ("eat", "dinner", "lunch", "breakfast", "meal", "dine"): ("dining table",),
+    ("put drink", "put cup", "put coffee", "put down"): ("coffee table", "side table", "table"),
+    ("read",): ("book",),
+    ("write", "draw", "note"): ("whiteboard", "desk"),
+    ("work", "study", "homework", "write letter"): ("desk",),
+    ("throw", "throw away", "trash", "garbage", "rubbish", "waste", "litter", "dispose", "recycle"): ("trash can",),
+    ("clothes", "clothing", "shirt", "dress", "put clothes", "keep clothes", "store clothes"): (
+        "wardrobe", "chest of drawers",
+    ),
+    ("hang coat", "coat", "jacket", "hang jacket", "hang clothes", "hang"): ("wardrobe", "coat rack", "hook"),
+    ("cook", "fry", "boil", "bake", "roast", "cooking", "heat soup"): ("stove",),
+    ("leftover", "reheat", "heat food", "heat leftover", "warm food", "heat meal", "popcorn"): ("microwave",),
+    ("cold", "keep fresh", "cool milk", "cool drink", "cool food", "milk", "beer", "keep cold", "keep cool", "ice"): (
+        "refrigerator",
+    ),
+    ("cool", "cool room", "cool air", "cool down", "hot day"): ("air conditioner", "fan"),
+    ("warm", "warm room", "heat", "heat room", "warm up", "keep warm"): ("heater", "fireplace"),
+    ("tell time", "time"): ("clock",),
+    ("film", "movie", "watch", "show", "watch film", "watch tv"): ("television",),
+    ("look myself", "see myself", "reflection", "shave", "makeup", "look face"): ("mirror",),
+    ("dry", "dry hand", "dry off", "dry myself", "dry hair"): ("towel",),
+    ("charge", "plug", "electricity", "charge phone", "plug in"): ("power outlet",),
+    ("fire", "extinguish", "put out fire", "put out"): ("fire extinguisher",),
+    ("out", "way out", "exit", "leave", "leave room", "enter", "get out", "go out", "walk through"): ("door",),
+    ("open door", "close door"): ("door handle",),
+    ("sun", "sunlight", "block sun", "keep sun out", "dark", "privacy", "shade", "keep light out", "block light"): (
+        "blind", "curtain",
+    ),
+    ("laundry", "wash clothes", "wash laundry", "clean clothes", "clean laundry"): ("washing machine",),
+    ("bath", "take bath", "bathe", "soak"): ("bathtub",),
+    ("shower", "take shower"): ("shower",),
+    ("carry", "pack", "carry thing", "travel"): ("bag", "backpack", "suitcase"),
+    ("flower", "put flower", "bouquet"): ("vase",),
+    ("light", "give light", "bright", "illuminate", "see dark", "make light"): ("lamp",),
+    ("turn light", "switch light", "turn on light", "turn off light"): ("light switch",),
+    ("climb", "upstairs", "go up", "go upstairs", "go down"): ("stairs", "ladder"),
+    ("type", "typing"): ("computer keyboard",),
+    ("rain", "dry rain", "keep dry", "keep dry rain"): ("umbrella",),
+    ("shoe", "put shoe", "keep shoe"): ("shoe rack",),
+    ("walk", "wear foot"): ("shoe",),
+    ("look outside", "look out", "see outside", "fresh air", "daylight", "let air in", "let light in"): ("window",),
+    ("music", "listen", "play music", "listen music", "sound"): ("speaker",),
+    ("exercise", "work out", "workout", "lift", "train", "muscle"): ("exercise bench", "dumbbell"),
+    ("print", "print page", "copy"): ("printer",),
+    ("call", "phone", "ring"): ("telephone",),
+    ("sweep", "vacuum", "clean floor", "dust"): ("broom", "vacuum cleaner"),
+    ("wash dish", "clean dish", "wash plate", "dirty dish"): ("dishwasher", "sink"),
+    ("put book", "keep book", "store book", "store"): ("bookshelf", "shelf", "cabinet"),
+    ("cut", "slice"): ("knife", "scissors"),
+    ("pee", "relieve myself", "toilet"): ("toilet",),
+    ("ride", "cycle", "pedal"): ("bicycle",),
+    ("play", "child play", "kid play"): ("toy",),
+    ("compute", "browse", "internet", "email"): ("laptop", "computer"),
+    ("smoke", "cooking smell", "suck fume"): ("range hood",),
+}  # fmt: skip
+"""What is done -> the things that it is done with. Words are in the form of ``_stem``; all of an entry's words must
+occur, and the entries with the most words win."""
+
+
+def find_purpose(phrase: str) -> tuple[str, ...]:
+    """The words for the things that a phrase describes by their purpose; none if it does not."""
+    if not (match := _ASKS.match(phrase)):
+        return ()
+    words = {_stem(word) for word in re.findall(r"[^\W_]+", phrase[match.end() :].lower())}
+    if match[0].strip().lower().endswith(("way", "ways")):
+        words.add("way")
+    most, found = 0, dict[str, None]()
+    for done, things in PURPOSES.items():
+        count = max((len(entry.split()) for entry in done if words >= set(entry.split())), default=0)
+        if count >= max(most, 1):
+            found = dict.fromkeys((*(found if count == most else ()), *things))
+            most = count
+    return tuple(found)
+
+
+def _stem(word: str) -> str:
+    """A word without the ending of a plural or of a verb: "hands" to "hand", "sitting" to "sit"."""
+    if word.endswith("ing") and len(word) >= _LEAST_STEM + 3:
+        word = word.removesuffix("ing")
+        return word[:-1] if len(word) > _LEAST_STEM and word[-1] == word[-2] else word
+    return make_singular(word)

@@ -1,0 +1,118 @@
+"""Which classes a phrase means: by name and synonym, by kind, by purpose, and despite mistakes."""
+
+from pathlib import Path
+
+import pytest
+
+from freeocc3d.language.class_names import match_names
+from freeocc3d.language.purposes import find_purpose
+from freeocc3d.language.typing_mistakes import correct_words
+
+HOUSE = [
+    "bed", "nightstand", "chair", "carpet", "coffee table", "dining table", "side table", "desk", "door", "door handle",
+    "sliding door", "kitchen cabinet", "tv cabinet", "lamp", "chandelier", "sofa", "tableware", "trash can",
+    "television", "refrigerator", "window", "wall",
+]  # fmt: skip
+
+
+def found(phrase: str, names: list[str] | None = None) -> set[str]:
+    names = HOUSE if names is None else names
+    return {names[row] for row in match_names(phrase, names)[0]}
+
+
+@pytest.mark.parametrize(
+    ("phrase", "names"),
+    [
+        ("sofa", {"sofa"}),
+        ("Couches", {"sofa"}),
+        ("TV", {"television"}),
+        ("bin", {"trash can"}),
+        ("garbage can", {"trash can"}),
+        ("fridge", {"refrigerator"}),
+        ("rug", {"carpet"}),
+        ("table", {"coffee table", "dining table", "side table"}),
+        ("dining table", {"dining table"}),
+        ("end table", {"side table"}),
+        ("door", {"door", "sliding door"}),
+        ("door handle", {"door handle"}),
+        ("cabinet", {"kitchen cabinet", "tv cabinet"}),
+        ("cupboards", {"kitchen cabinet", "tv cabinet"}),
+        ("light", {"lamp", "chandelier"}),
+        ("night stand", {"nightstand"}),
+        ("seating", {"chair", "sofa"}),
+        ("armchair", {"chair"}),
+        ("mug", {"tableware"}),
+        ("the chair by the window", {"chair"}),
+        ("cup of coffee", {"tableware"}),
+    ],
+)
+def test_phrases_find_the_classes_that_people_mean(phrase: str, names: set[str]) -> None:
+    assert found(phrase) == names
+
+
+@pytest.mark.parametrize("phrase", ["unicorn", "", "   ", "§$%", "handle bar", "wallpaper", "red", "on the"])
+def test_other_phrases_find_nothing(phrase: str) -> None:
+    assert match_names(phrase, HOUSE) == ([], "")
+
+
+@pytest.mark.parametrize(
+    ("phrase", "part"), [("the red chair", "chair"), ("large dining tables", "dining table"), ("couch", "couch")]
+)
+def test_the_part_that_was_understood(phrase: str, part: str) -> None:
+    assert match_names(phrase, HOUSE)[1] == part
+
+
+def test_a_class_of_the_very_name_comes_before_its_synonyms() -> None:
+    assert found("couch", ["sofa", "couch"]) == {"couch"}
+    assert found("chest of drawers", ["dresser", "chest"]) == {"dresser"}
+
+
+def test_class_names_of_other_data_sets() -> None:
+    assert found("nightstand", ["night stand", "otherfurniture"]) == {"night stand"}
+    assert found("plant", ["indoor-plant", "wall-plug"]) == {"indoor-plant"}
+    assert found("tv", ["tv-screen", "tv-stand"]) == {"tv-screen"}
+    assert found("curtain", ["shower curtain", "curtain", "blinds"]) == {"shower curtain", "curtain"}
+
+
+def test_a_phrase_of_thousands_of_words() -> None:
+    assert match_names("very " * 5000 + "sofa", HOUSE) == ([], "")
+
+
+def read_paraphrases() -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Names of classes, and phrases with the names that they mean: the one that must be found first."""
+    lines = (Path(__file__).parent / "paraphrases.txt").read_text().splitlines()
+    classes = next(line for line in lines if line.startswith("# classes = ")).split(" = ")[1].split(", ")
+    pairs = (line.split(" = ") for line in lines if not line.startswith("#"))
+    return classes, [(phrase, [] if names == "-" else names.split(", ")) for phrase, names in pairs]
+
+
+def test_what_people_say_is_understood() -> None:
+    classes, asked = read_paraphrases()
+    right = wrong = 0
+    for phrase, expected in asked:
+        names = found(phrase, classes)
+        fits = names <= set(expected) and (expected[0] in names if expected else True)
+        right, wrong = right + fits, wrong + bool(names and not fits)
+    assert len(asked) >= 150
+    assert right >= 0.95 * len(asked)
+    assert wrong <= 0.01 * len(asked)
+
+
+@pytest.mark.parametrize(
+    ("phrase", "corrected"),
+    [
+        ("Refridgerator", "refrigerator"),
+        ("an ofice chair", "an office chair"),
+        ("cable", "cable"),  # no table
+        ("sofe", "sofa"),
+        ("cht", "cht"),  # too short
+        ("blørgh", "blørgh"),  # like nothing
+    ],
+)
+def test_only_words_that_do_not_exist_are_corrected(phrase: str, corrected: str) -> None:
+    assert correct_words(phrase, ("table", "chair")) == corrected
+
+
+def test_a_purpose_is_read_only_of_a_phrase_that_asks_for_one() -> None:
+    assert find_purpose("where can I sit") == find_purpose("something for sitting") != ()
+    assert find_purpose("the sitting dog") == find_purpose("water bottle") == ()
