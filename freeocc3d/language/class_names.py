@@ -14,12 +14,22 @@ _PREPOSITIONS = {
     "of", "on", "in", "at", "by", "with", "without", "near", "under", "above", "behind", "beside", "between", "next",
     "from", "for", "to", "against", "that", "which",
 }  # fmt: skip
+_PARTICIPLES = {
+    "standing", "sitting", "lying", "hanging", "leaning", "facing", "placed", "mounted", "attached", "fixed", "left",
+    "made", "full", "filled", "covered", "belonging", "called", "used", "over", "inside", "beneath", "below", "along",
+    "around", "opposite", "across", "upon", "where", "who", "is", "are", "has",
+}  # fmt: skip
+_AMOUNTS = re.compile(
+    r"^(?:.*\s)?(?:pair|pile|stack|set|row|bunch|group|lot|number|couple|piece|kind|type|sort|heap|collection)s?\s+of\s+",
+    re.I,
+)
 _LONGEST_PHRASE = 16
 _OTHER_THINGS = {
-    "traffic light", "stop light", "flower bed", "river bed", "sea bed", "cable car", "power plant", "toilet seat",
-    "car seat", "mouse mat", "place mat", "table tennis table", "operating table", "bus stop", "hot dog", "chair lift",
-    "phone box", "letter box", "post box", "juke box", "street lamp", "street light", "tail light", "head light",
-    "ear phone", "computer game", "board game", "picture book", "shopping cart", "police man", "snow man",
+    "traffic light", "stop light", "water table", "multiplication table", "truck bed", "flower bed", "river bed",
+    "sea bed", "cable car", "power plant", "toilet seat", "car seat", "mouse mat", "place mat", "table tennis table",
+    "operating table", "bus stop", "hot dog", "chair lift", "phone box", "letter box", "post box", "juke box",
+    "street lamp", "street light", "tail light", "head light", "ear phone", "sea floor", "ocean floor",
+    "computer game", "board game", "picture book", "shopping cart", "police man", "snow man",
 }  # fmt: skip
 """Words whose last part is the name of a thing that they are not a kind of."""
 
@@ -80,11 +90,16 @@ class _Names:
 
 def split_phrase(phrase: str) -> list[str]:
     """Normal forms to look up, most specific first."""
-    tokens = re.findall(r"[^\W_]+", phrase.lower())[:_LONGEST_PHRASE]
-    cut = next((at for at, token in enumerate(tokens) if at > 0 and token in _PREPOSITIONS), len(tokens))
+    tokens = re.findall(r"[^\W_]+", _AMOUNTS.sub("", phrase).lower())[:_LONGEST_PHRASE]
+    cut = next((at for at, token in enumerate(tokens) if at > 0 and _ends_head(token)), len(tokens))
     head = normalize_phrase(" ".join(tokens[:cut])).split()
     ends = [" ".join(head[start:]) for start in range(len(head))]
     return list(dict.fromkeys(part for part in (normalize_phrase(" ".join(tokens)), *ends) if part))
+
+
+def _ends_head(token: str) -> bool:
+    """Whether what follows only describes the thing: "in the hall", "standing there"."""
+    return token in _PREPOSITIONS or token in _PARTICIPLES
 
 
 @functools.lru_cache(maxsize=4096)

@@ -22,7 +22,7 @@ _FRAME = re.compile(
     rf"(?:{_ARTICLE}\s+)?(?=.*\w)",
     re.IGNORECASE,
 )
-_THERE_IS = re.compile(rf"\s*(?:here|there)(?:'s| is| are)\s+(?:{_ARTICLE}\s+)?(?=.*\w)", re.IGNORECASE)
+_THERE_IS = re.compile(rf"\s*(?:here|there|where)(?:'s| is| are)\s+(?:{_ARTICLE}\s+)?(?=.*\w)", re.IGNORECASE)
 _IN_IMAGE = re.compile(r"\s+(?:in|from) (?:the|this|a|an) (?:scene|photo|picture|image|video)\s*$", re.IGNORECASE)
 
 _DENIALS = (

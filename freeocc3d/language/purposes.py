@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import re
 
-from .synonyms import make_singular
+from .synonyms import find_synonyms, make_singular
 
 _ASKS = re.compile(
-    r"\s*(?:(?:find|show|give|bring)\s+(?:me\s+)?|i\s+(?:need|want|am looking for)\s+)?"
+    r"\s*(?:(?:find|show|give|bring|get)\s+(?:me\s+)?|i\s+(?:need|want|am looking for)\s+|is there\s+)?"
     r"(?:(?:some|any)(?:thing|where|place)|(?:an?|the|some|any)?\s*(?:\w+\s+)?(?:places?|things?|spots?|objects?|devices?|"
-    r"appliances?|tools?|items?|pieces? of furniture|furniture|ways?|way)\b|what|where|which|how)\b",
+    r"appliances?|tools?|items?|machines?|gadgets?|containers?|surfaces?|pieces? of furniture|furniture|stuff|ways?)\b"
+    r"(?=\s+(?:to|for|that|which|where|i|you|we|one|out|in|on|with|of)\b)|what|where|which|how|to)\b",
     re.IGNORECASE,
 )
 _LEAST_STEM = 3
@@ -21,7 +22,7 @@ PURPOSES: dict[tuple[str, ...], tuple[str, ...]] = {
     ("sit", "sit down", "seat", "rest leg"): ("chair", "sofa", "armchair", "stool", "bench"),
     ("sleep", "lie down", "lie", "nap", "lay down", "rest"): ("bed",),
     ("head", "rest head"): ("pillow",),
-    ("cover", "warm bed", "wrap"): ("blanket",),
+    ("cover", "warm bed", "keep warm bed", "wrap"): ("blanket",),
     ("wash hand", "wash face", "rinse", "brush tooth", "water", "wash"): ("sink", "tap"),
     ("drink", "tea", "coffee"): ("cup", "glass"),
     ("eat", "dinner", "lunch", "breakfast", "meal", "dine"): ("dining table",),
@@ -59,15 +60,15 @@ PURPOSES: dict[tuple[str, ...], tuple[str, ...]] = {
     ("flower", "put flower", "bouquet"): ("vase",),
     ("light", "give light", "bright", "illuminate", "see dark", "make light"): ("lamp",),
     ("turn light", "switch light", "turn on light", "turn off light"): ("light switch",),
-    ("climb", "upstairs", "go up", "go upstairs", "go down"): ("stairs", "ladder"),
+    ("climb", "upstair", "go up", "get up", "upper floor", "go upstairs", "go down"): ("stairs", "ladder"),
     ("type", "typing"): ("computer keyboard",),
     ("rain", "dry rain", "keep dry", "keep dry rain"): ("umbrella",),
     ("shoe", "put shoe", "keep shoe"): ("shoe rack",),
     ("walk", "wear foot"): ("shoe",),
     ("look outside", "look out", "see outside", "fresh air", "daylight", "let air in", "let light in"): ("window",),
     ("music", "listen", "play music", "listen music", "sound"): ("speaker",),
-    ("exercise", "work out", "workout", "lift", "train", "muscle"): ("exercise bench", "dumbbell"),
-    ("print", "print page", "copy"): ("printer",),
+    ("exercise", "get fit", "work out", "workout", "lift", "train", "muscle"): ("exercise bench", "dumbbell"),
+    ("print", "print page", "copy", "make copy", "scan"): ("printer",),
     ("call", "phone", "ring"): ("telephone",),
     ("sweep", "vacuum", "clean floor", "dust"): ("broom", "vacuum cleaner"),
     ("wash dish", "clean dish", "wash plate", "dirty dish"): ("dishwasher", "sink"),
@@ -77,25 +78,29 @@ PURPOSES: dict[tuple[str, ...], tuple[str, ...]] = {
     ("ride", "cycle", "pedal"): ("bicycle",),
     ("play", "child play", "kid play"): ("toy",),
     ("compute", "browse", "internet", "email"): ("laptop", "computer"),
-    ("smoke", "cooking smell", "suck fume"): ("range hood",),
+    ("smoke", "suck", "fume", "cook smell", "extract"): ("range hood",),
 }  # fmt: skip
 """What is done -> the things that it is done with. Words are in the form of ``_stem``; all of an entry's words must
-occur, and the entries with the most words win."""
+occur, and the entries with the most words win, of these the ones that occur first: the verb of a phrase."""
 
 
 def find_purpose(phrase: str) -> tuple[str, ...]:
     """The words for the things that a phrase describes by their purpose; none if it does not."""
     if not (match := _ASKS.match(phrase)):
         return ()
-    words = {_stem(word) for word in re.findall(r"[^\W_]+", phrase[match.end() :].lower())}
-    if match[0].strip().lower().endswith(("way", "ways")):
-        words.add("way")
-    most, found = 0, dict[str, None]()
+    told = re.findall(r"[^\W_]+", phrase[match.end() :].lower())
+    place: dict[str, int] = {}
+    for at, word in enumerate((*(["way"] if "way" in match[0].lower() else []), *told)):
+        for form in (_stem(word), *find_synonyms(word)):
+            place.setdefault(form, at)
+    best, found = (0, 0), dict[str, None]()
     for done, things in PURPOSES.items():
-        count = max((len(entry.split()) for entry in done if words >= set(entry.split())), default=0)
-        if count >= max(most, 1):
-            found = dict.fromkeys((*(found if count == most else ()), *things))
-            most = count
+        for words in (entry.split() for entry in done):
+            if all(word in place for word in words):
+                fit = len(words), -min(place[word] for word in words)
+                if fit >= best:
+                    found = dict.fromkeys((*(found if fit == best else ()), *things))
+                    best = fit
     return tuple(found)
 
 

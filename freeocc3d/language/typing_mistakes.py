@@ -11,13 +11,13 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .synonyms import INCLUDES, SYNONYMS, normalize_phrase
+from .synonyms import INCLUDES, SYNONYMS, make_singular, normalize_phrase
 
 if TYPE_CHECKING:
     from symspellpy import SymSpell
 
 _WORD = re.compile(r"[^\W\d_]+")
-_SHORT, _LONG = 4, 8
+_SHORT, _LONG = 4, 7
 """Letters from which one mistake is corrected, and two."""
 
 
@@ -34,7 +34,7 @@ def _correct(word: str, names: tuple[str, ...]) -> str:
         return word
     from symspellpy import Verbosity
 
-    found = _index(known).lookup(word.lower(), Verbosity.TOP, max_edit_distance=mistakes)
+    found = _index(known).lookup(make_singular(word.lower()), Verbosity.TOP, max_edit_distance=mistakes)
     return found[0].term if found else word
 
 

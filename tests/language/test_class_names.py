@@ -95,7 +95,7 @@ def test_what_people_say_is_understood() -> None:
         right, wrong = right + fits, wrong + bool(names and not fits)
     assert len(asked) >= 150
     assert right >= 0.95 * len(asked)
-    assert wrong <= 0.01 * len(asked)
+    assert wrong <= 0.03 * len(asked)
 
 
 @pytest.mark.parametrize(
