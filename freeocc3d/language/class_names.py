@@ -53,8 +53,7 @@ def match_exactly(phrase: str, names: list[str]) -> tuple[list[int], str]:
     if things := find_purpose(phrase):
         found = [known.find(thing) for thing in things]
         if any(found):
-            named = ", ".join(thing for thing, rows in zip(things, found, strict=True) if rows)
-            return sorted({row for rows in found for row in rows}), named
+            return sorted({row for rows in found for row in rows}), normalize_phrase(phrase)
     parts = split_phrase(phrase)
     if any(make_key(other) == make_key(part) for part in parts for other in _OTHER_THINGS):
         return known.named(frozenset((parts[0],))), parts[0]

@@ -23,6 +23,7 @@ from ..core.types import Occupancy
 from ..language import word_matching
 from ..language.feature_codec import Features, compute_cosines, mask_known
 from ..language.phrases import read_phrase
+from ..language.synonyms import make_key
 from ..occupancy.connected_components import label_components
 from ..settings.option_types import Cosine, PositiveInt, PositiveShare, Share
 from ..settings.typed_options import TypedOptions, nearest
@@ -150,7 +151,8 @@ def query(
             allowed = meant >= compute_cosines(features[rows], excluded.features).max(axis=1)
             rows, confidence = rows[allowed], confidence[allowed]
         regions = find_regions(occupancy, rows, scores[rows], confidence, threshold, options, up, word)
-        note = _note(word, asked[w], part, text_encoder, scores, threshold, bool(regions))
+        taken = text.meant[w] if text.meant else ()
+        note = _note(word, asked[w], part, taken, text_encoder, scores, threshold, bool(regions))
         results.append(QueryResult(word, part, note, regions, np.ascontiguousarray(scores)))
     return results
 
@@ -276,6 +278,7 @@ def _note(
     word: str,
     phrase: str,
     understood: str,
+    meant: tuple[str, ...],
     text_encoder: TextEncoder,
     scores: NDArray[np.float32],
     threshold: float,
@@ -290,6 +293,11 @@ def _note(
         why = f"the best score is {highest:.2f}" + (f", below {threshold:.2f}" if highest < threshold else "")
         return f"Nothing in this map looks like '{understood}': {why}."
     asked = [token for token in re.findall(r"\w+", phrase.lower()) if token not in ("a", "an", "the")]
-    if len(asked) > len(re.findall(r"\w+", understood)):
-        return f"Only '{understood}' of '{word}' was understood."
+    partly = len(asked) > len(re.findall(r"\w+", understood))
+    named = make_key(understood if partly else phrase) in map(make_key, meant)
+    names = "" if named or not meant else f" as {', '.join(meant)}"
+    if partly:
+        return f"Only '{understood}' of '{word}' was understood{',' * bool(names)}{names}."
+    if names:
+        return f"'{word}' was understood{names}."
     return ""

@@ -172,9 +172,9 @@ def test_notes_say_why_nothing_or_only_a_part_was_found() -> None:
     assert not absent.matched
     assert absent.note.startswith("Nothing in this map looks like 'cup'")
     assert part.matched
-    assert part.note == "Only 'couch' of 'red couch' was understood."
+    assert part.note == "Only 'couch' of 'red couch' was understood, as sofa."
     assert whole.matched
-    assert whole.note == ""
+    assert whole.note == "'the couches' was understood as sofa."
 
 
 def test_a_prompt_asks_for_its_thing_and_a_denial_is_refused() -> None:
@@ -311,12 +311,15 @@ def test_words_in_other_scripts_are_not_understood_in_a_sentence(word: str) -> N
     assert "not understood" in result.note
 
 
-def test_a_misspelled_word_gets_suggestions() -> None:
-    sofa, canoe = query(occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1))), WORDS, ["Soffa", "canoe"])
-    assert sofa.note.startswith("'Soffa' is not understood (did you mean 'sofa'?): this map knows only")
+def test_a_misspelled_word_is_corrected_and_a_real_one_gets_suggestions() -> None:
+    room = occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1)))
+    sofa, canoe, short = query(room, WORDS, ["Soffa", "canoe", "coup"])
+    assert sofa.matched
+    assert sofa.note == "'Soffa' was understood as sofa."
     assert canoe.note.startswith("'canoe' is not understood: ")
-    with pytest.raises(FreeOccError, match="did you mean 'sofa'"):
-        query(occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1))), WORDS, ["table"], negative=["sofaa"])
+    assert short.note.startswith("'coup' is not understood (did you mean 'cup'?): this map knows only")
+    with pytest.raises(FreeOccError, match="did you mean 'cup'"):
+        query(room, WORDS, ["table"], negative=["coup"])
 
 
 def test_results_do_not_depend_on_the_size_of_the_work_chunks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,11 +29,13 @@ class TextFeatures:
     attainable: (W,) float32 in 0…1, the cosine of a thing that fits the word perfectly; None means 1. It is less than 1
         for a word that covers several kinds. If "table" covers coffee, dining and side tables, each an axis of its own,
         a coffee table reaches 1/√3. A query divides by it, so that general and specific words are comparable.
+    meant: the names of classes that each word was taken for; () where the encoder has no classes.
     """
 
     features: NDArray[np.float32]
     understood: tuple[str, ...]
     attainable: NDArray[np.float32] | None = None
+    meant: tuple[tuple[str, ...], ...] = ()
 
 
 class TextEncoder(ABC):

@@ -115,14 +115,15 @@ class LabelWords(TextEncoder):
     def encode_words(self, words: list[str]) -> TextFeatures:
         features = np.zeros((len(words), len(self.classes) - 1), np.float32)
         attainable = np.ones(len(words), np.float32)
-        understood = []
+        understood, meant = [], []
         for row, word in enumerate(words):
             matched, part = self.matching(word)
             understood.append(part)
+            meant.append(tuple(self.classes[1:][n] for n in matched))
             if matched:
                 attainable[row] = 1.0 / np.sqrt(len(matched))
                 features[row, matched] = attainable[row]
-        return TextFeatures(features, tuple(understood), attainable)
+        return TextFeatures(features, tuple(understood), attainable, tuple(meant))
 
     def matching(self, word: str) -> tuple[list[int], str]:
         """The dimensions of the classes that a phrase means, and the part of the phrase that was used."""
