@@ -21,15 +21,25 @@ app = typer.Typer(help="Fetch, export, list and verify the networks that encoder
 @app.command("pull")
 def models_pull(
     name: Annotated[
-        str, typer.Argument(metavar="NAME|REPO", help="OWNER/NAME on the Hugging Face hub, or a short name.")
+        str, typer.Argument(metavar="words|NAME|REPO", help="A short name, or OWNER/NAME on the Hugging Face hub.")
     ],
     revision: Annotated[str, typer.Option("--revision", metavar="NAME", help="Branch, tag or commit.")] = "main",
+    precision: Annotated[
+        Precision | None,
+        typer.Option("--precision", help="Of a ready-made ONNX export; int8 is the smallest.", show_default="int8"),
+    ] = None,
 ) -> None:
-    """Fetch a model package, or a checkpoint to export, from the Hugging Face hub."""
+    """Fetch a model from the Hugging Face hub: "words" is the recommended
+    one for any words.
+
+    A ready-made ONNX export becomes a model package, without torch; so do
+    clip-b16, clip-b32, siglip-b16 and siglip2-b16. A repository with a
+    model package is taken as it is. A checkpoint is fetched for export.
+    """
     from ..language import model_hub
 
     with ConsoleProgress() as progress:
-        folder = model_hub.pull_package(name, revision, progress)
+        folder = model_hub.pull_package(name, revision, progress, precision)
     if folder.parent.name == model_hub.CHECKPOINTS:
         print(f"{folder}: a checkpoint; export it: freeocc3d models export {folder} -o {folder.name}")
     else:

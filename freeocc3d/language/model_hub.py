@@ -1,8 +1,10 @@
-"""Fetches model packages, or checkpoints to export, from the Hugging Face hub.
+"""Fetches model packages, ready-made ONNX exports to make packages of, or checkpoints to export, from the Hugging Face
+hub.
 
-Every file is compared with the hub's hash before it gets its name. An interrupted download continues where it stopped.
-A package is fetched completely or not at all. Only ONNX, safetensors, JSON, YAML and plain text are fetched. The
-environment variable HF_ENDPOINT selects another hub.
+Every file is compared with the hub's hash before it gets its name; huggingface_hub compares sizes alone, except over
+its own Xet protocol. An interrupted download continues where it stopped. A package is fetched completely or not at all.
+Only ONNX, safetensors, JSON, YAML and plain text are fetched. The environment variable HF_ENDPOINT selects another hub,
+and FREEOCC3D_OFFLINE=1 none.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import os
 import re
 import shutil
 import urllib.request
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Annotated, Any
@@ -23,18 +26,35 @@ from ..core.errors import ModelError
 from ..core.progress import Progress
 from ..core.regular_files import check_regular
 from . import model_packages
+from .ready_made import export_layout
 from .timed_requests import Answer, NoAnswer, fetch
 from .vision_server import shorten_to_line
 
-NAMES = {
+RECOMMENDED = "clip-b16"
+"""What "words" stands for: the smallest of the models on which the papers of dense features agree."""
+
+EXPORTS = {
+    "clip-b16": "Xenova/clip-vit-base-patch16",
+    "clip-b32": "Xenova/clip-vit-base-patch32",
+    "siglip-b16": "Xenova/siglip-base-patch16-224",
+    "siglip2-b16": "onnx-community/siglip2-base-patch16-224-ONNX",
+}
+"""Short names of repositories with ready-made ONNX exports, of which packages are made without torch."""
+
+CHECKPOINT_NAMES = {
     "clip-b16-openai": "timm/vit_base_patch16_clip_224.openai",
     "clip-b16-laion": "laion/CLIP-ViT-B-16-laion2B-s34B-b88K",
-    "siglip-b16": "google/siglip-base-patch16-224",
+    "siglip-b16-google": "google/siglip-base-patch16-224",
     "dino-b16": "facebook/dino-vitb16",
     "dinov2-b14": "facebook/dinov2-base",
     "sam-b": "facebook/sam-vit-base",
 }
 """Short names of repositories whose checkpoints ``freeocc3d models export`` accepts."""
+
+NAMES = EXPORTS | CHECKPOINT_NAMES
+
+OFFLINE = "FREEOCC3D_OFFLINE"
+"""Environment variable that forbids to fetch anything."""
 
 CHECKPOINTS = ".checkpoints"
 """Subfolder of the models folder for what is not yet a package."""
@@ -48,8 +68,8 @@ _LARGEST_LISTING = 16 << 20
 _LARGEST = 1 << 40
 """Bytes of the largest file."""
 _ATTEMPTS = 5
-_PARTIAL = 206
-"""The status of an answer with the rest of a file."""
+_PARTIAL, _FORBIDDEN = 206, 403
+"""The status of an answer with the rest of a file, and of one to a user who has not accepted the repository's terms."""
 
 
 @dataclass(frozen=True)
@@ -74,26 +94,42 @@ class _Remote:
         return model_packages.hash_file(path, start) == self.blob
 
 
-def pull_package(name: str, revision: str = "main", progress: Progress | None = None) -> Path:
-    """Fetches the repository OWNER/NAME, or one of NAMES, and returns its folder: for a package, the one with its name
-    in the models folder; for a checkpoint, one in the subfolder CHECKPOINTS. Complete files are not fetched again.
+def pull_package(
+    name: str,
+    revision: str = "main",
+    progress: Progress | None = None,
+    precision: model_packages.Precision | None = None,
+) -> Path:
+    """Fetches the repository OWNER/NAME, or one of NAMES ("words" is the recommended one), and returns its folder: for
+    a package, the one with its name in the models folder; for a checkpoint, one in the subfolder CHECKPOINTS. Complete
+    files are not fetched again. precision: of a ready-made export; None = int8, or else fp32.
 
-    Raises ModelError if the network fails, the repository does not exist or has no usable files, or a hash differs.
+    Raises ModelError if the network fails, the repository does not exist or has no usable files, or a hash differs;
+    DependencyError if a package is missing that reads an export.
     """
     progress = progress or Progress()
+    name = RECOMMENDED if name == "words" else name
     repository = NAMES.get(name, name)
     if not re.fullmatch(r"[\w.-]+/\w[\w.-]*", repository):
         raise ModelError(
             f"'{name}' is not a repository OWNER/NAME of the hub{model_packages.nearest(name, NAMES)}. "
-            f"Short names are {', '.join(NAMES)}."
+            f"Short names are words, {', '.join(NAMES)}."
         )
     local = name if name in NAMES else repository.split("/")[1]
+    local += f"-{precision}" if precision else ""
+    if is_offline():
+        raise ModelError(
+            f"{repository} is not fetched, because {OFFLINE} is set: unset it, or copy the model's folder."
+        )
     remote = _listed(repository, revision)
     manifest = next((remote[n] for n in model_packages.MANIFESTS if n in remote), None)
-    root = model_packages.find_models_folder() if manifest else model_packages.find_models_folder() / CHECKPOINTS
+    sizes = {file: own.size for file, own in remote.items()}
+    exported = None if manifest else export_layout.choose_files(repository, sizes, precision)
+    root = model_packages.find_models_folder()
+    root = root if manifest or exported else root / CHECKPOINTS
     target, partial = root / local, root / f"{local}.partial"
     if target.exists():
-        if manifest:
+        if manifest or exported:
             model_packages.verify_files(model_packages.read_package(target))
         return target
     try:
@@ -104,11 +140,16 @@ def pull_package(name: str, revision: str = "main", progress: Progress | None = 
             package = model_packages.parse_manifest(model_packages.load_manifest(own), partial, own)
             wanted = list(package.files)
         else:
-            wanted = _checkpoint_files(repository, remote)
+            wanted = exported[1] if exported else _checkpoint_files(repository, remote)
         if lacking := [file for file in wanted if file not in remote]:
             raise ModelError(f"{repository} lacks files of its manifest: {', '.join(lacking)}.")
+        if exported:
+            _check_space([remote[file] for file in wanted], partial, repository)
         for file in wanted:
             _fetch(repository, revision, remote[file], partial, progress)
+        if exported:
+            _make_package(partial, target, repository, exported[0], progress)
+            return target
         if manifest:
             model_packages.verify_files(model_packages.read_package(partial))
         for rest in partial.glob("*.incomplete"):  # from another revision
@@ -117,6 +158,33 @@ def pull_package(name: str, revision: str = "main", progress: Progress | None = 
     except OSError as error:
         raise ModelError(f"Cannot write to {error.filename or partial}: {error.strerror}.") from error
     return target
+
+
+def is_offline() -> bool:
+    """Whether the user forbids to fetch anything."""
+    return os.environ.get(OFFLINE, "") not in ("", "0")
+
+
+def _check_space(files: Iterable[_Remote], folder: Path, repository: str) -> None:
+    """Raises ModelError if the files do not fit beside a package that is made of them."""
+    free = shutil.disk_usage(folder).free
+    if (needed := 2 * sum(file.size for file in files)) > free:
+        raise ModelError(
+            f"{repository} needs {needed:,} bytes while its package is made, but {folder} has {free:,} free: make room."
+        )
+
+
+def _make_package(
+    fetched: Path, target: Path, repository: str, precision: model_packages.Precision, progress: Progress
+) -> None:
+    """Makes the package of a fetched export, and removes what was fetched."""
+    from .ready_made.export_packages import package_of_export
+
+    progress.stage("cutting the vision graph before its last attention")
+    _, lacks = package_of_export(fetched, target, repository, precision)
+    if lacks:
+        progress.warn(lacks)
+    shutil.rmtree(fetched)
 
 
 def _checkpoint_files(repository: str, remote: dict[str, _Remote]) -> list[str]:
@@ -149,7 +217,7 @@ class _Listing(msgspec.Struct):
 
 
 def _listed(repository: str, revision: str) -> dict[str, _Remote]:
-    """The repository's files by name, without those in subfolders. Raises ModelError."""
+    """The repository's files by name, without those in subfolders but ``export_layout.FOLDER``. Raises ModelError."""
     url = f"{_endpoint()}/api/models/{repository}/revision/{quote(revision, safe='')}?blobs=true"
     received = bytearray()
 
@@ -172,7 +240,8 @@ def _listed(repository: str, revision: str) -> dict[str, _Remote]:
     return {
         remote.name: remote
         for remote in remotes
-        if model_packages.is_plain_name(remote.name) and (remote.sha256 or remote.blob)
+        if model_packages.is_plain_name(remote.name.removeprefix(export_layout.FOLDER))
+        and (remote.sha256 or remote.blob)
     }
 
 
@@ -184,6 +253,7 @@ def _digest(stated: object) -> str | None:
 def _fetch(repository: str, revision: str, remote: _Remote, folder: Path, progress: Progress) -> None:
     """Fetches one file into the folder; continues an earlier download of the same content."""
     path = folder / remote.name
+    path.parent.mkdir(exist_ok=True)
     if path.exists() and remote.is_content_of(path):
         return
     progress.stage(f"{remote.name} ({remote.size / 1e6:.1f} MB)")
@@ -249,7 +319,11 @@ def _request(url: str) -> urllib.request.Request:
 
 
 def _refused(status: int, repository: str, revision: str) -> ModelError:
-    if status in (401, 403, 404):
+    if status == _FORBIDDEN:
+        return ModelError(
+            f"{repository} is gated: accept its terms at {_endpoint()}/{repository}, and log in with 'hf auth login'."
+        )
+    if status in (401, 404):
         return ModelError(
             f"{_endpoint()} has no readable repository {repository} with revision {revision}: check its name, or log "
             "in with 'hf auth login'."

@@ -59,6 +59,7 @@ KINDS: dict[str, dict[str, Graph]] = {
         "head": Graph(("mixed", "stream"), ("features", "reduced", "pooled")),
         "text": _TEXT,
     },
+    "windows": {"image": Graph(("image",), ("pooled",)), "text": _TEXT},
     "dense": {"image": Graph(("image",), ("features",)), "text": _TEXT},
     "masks": {"image": Graph(("image",), ("masks", "embeddings")), "text": _TEXT},
     "backbone": {"image": Graph(("image",), ("features",))},
@@ -74,6 +75,7 @@ clip (CLIP and SigLIP): ``image`` (B, 3, H, W), normalized, runs up to the last 
 mixes the values to ``mixed`` (B, N, heads d), the input of ``head``, which returns ``features`` (B, N, D) with the
 block's residual and feed-forward part, ``reduced`` (B, N, D) without both, and ``pooled`` (B, D), the embedding of the
 whole image. ``text``: ``tokens`` (T, L) int64 to ``features`` (T, D).
+windows: ``pooled`` (B, D) alone, for images of the size of the training's.
 dense: patch ``features`` (B, h, w, D) that are already in the text's space.
 masks: ``masks`` (B, Q, h, w) logits and ``embeddings`` (B, Q, D) in the text's space.
 backbone: patch ``features`` (B, h, w, C) in their own space.

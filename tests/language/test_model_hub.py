@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import ready_made
+from made_once import make_once
 from model_folders import dense_package, graph, succeed, write_manifest
 
 from freeocc3d.cli.main import main
@@ -27,7 +29,7 @@ class Hub(http.server.ThreadingHTTPServer):
 
     cut: file -> bytes after which its connections are cut.  down: answer 503 to further downloads after a cut.
     spoilt: files of which another content is sent than the listing's hash says.  ranges: honor Range, or send whole
-    files.  requested: (file, Range) so far.
+    files.  gated: answer 403 to downloads.  requested: (file, Range) so far.
     """
 
     def __init__(self, folder: Path):
@@ -37,6 +39,7 @@ class Hub(http.server.ThreadingHTTPServer):
         self.down = False
         self.spoilt: set[str] = set()
         self.ranges = True
+        self.gated = False
         self.requested: list[tuple[str, str | None]] = []
 
     @property
@@ -61,8 +64,8 @@ class Handler(http.server.BaseHTTPRequestHandler):
     def _file(self, name: str) -> None:
         wanted = self.headers.get("Range")
         self.server.requested.append((name, wanted))
-        if self.server.down:
-            self.send_error(503)
+        if self.server.down or self.server.gated:
+            self.send_error(403 if self.server.gated else 503)
             return
         content = (self.server.folder / name).read_bytes()
         if name in self.server.spoilt:
@@ -205,6 +208,77 @@ def test_pickled_weights_are_refused(server: Hub) -> None:
             path.unlink()
     with pytest.raises(ModelError, match=r"neither a model package .* nor weights as safetensors"):
         model_hub.pull_package(REPOSITORY)
+
+
+@pytest.fixture
+def words(server: Hub, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Hub:
+    """The hub with a tiny CLIP in the layout of the recommended model, and in its place."""
+    made = make_once(
+        tmp_path_factory, "export-clip-int8-sdpa", lambda path: ready_made.write_export(path, "clip", "int8", "sdpa")
+    )
+    shutil.rmtree(server.folder)
+    shutil.copytree(made, server.folder)
+    (server.folder / "onnx" / "model_q4.onnx").write_bytes(b"not fetched")
+    monkeypatch.setitem(model_hub.NAMES, "clip-b16", REPOSITORY)
+    return server
+
+
+def test_words_are_pulled_as_a_ready_made_export(words: Hub, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    succeed(["models", "pull", "words"])
+    assert capsys.readouterr().out.strip() == str(home / "clip-b16")
+    package = model_packages.read_package(home / "clip-b16")
+    assert (package.kind, package.precision, package.source) == ("clip", "int8", REPOSITORY)
+    assert {path.name for path in home.iterdir()} == {"clip-b16"}
+    fetched = [name for name, _ in words.requested]
+    assert "onnx/vision_model_quantized.onnx" in fetched
+    assert "onnx/model_q4.onnx" not in fetched
+    model_hub.pull_package("words")
+    assert [name for name, _ in words.requested] == fetched
+
+
+def test_an_interrupted_export_goes_on_where_it_stopped(words: Hub, home: Path) -> None:
+    words.cut["onnx/vision_model_quantized.onnx"] = 9000
+    with pytest.raises(ModelError, match="answered 503"):
+        model_hub.pull_package("words")
+    assert not (home / "clip-b16").exists()
+    words.cut, words.down, words.requested = {}, False, []
+    model_packages.verify_files(model_packages.read_package(model_hub.pull_package("words")))
+    assert dict(words.requested)["onnx/vision_model_quantized.onnx"] == "bytes=9000-"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda hub: (hub.folder / "tokenizer.json").unlink(), "lacks tokenizer.json, which its graphs need"),
+        (
+            lambda hub: (hub.folder / "onnx" / "text_model_quantized.onnx").unlink(),
+            r"is laid out otherwise .* it has onnx/model_q4\.onnx, onnx/vision_model_quantized\.onnx, but not",
+        ),
+        (
+            lambda hub: (hub.folder / "tokenizer.json").write_bytes(b" " * 100_000_000),
+            r"tokenizer\.json of someone/tiny has 100,000,000 bytes, more than",
+        ),
+        (lambda hub: setattr(hub, "gated", True), r"someone/tiny is gated: accept its terms at http.*/someone/tiny"),
+        (lambda hub: hub.spoilt.add("onnx/text_model_quantized.onnx"), "does not match the hub's hash"),
+    ],
+)
+def test_exports_that_cannot_be_pulled(words: Hub, home: Path, change: Any, message: str) -> None:
+    change(words)
+    with pytest.raises(ModelError, match=message):
+        model_hub.pull_package("words")
+    assert not (home / "clip-b16").exists()
+
+
+def test_a_full_disk_and_what_is_forbidden_are_told(words: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10, 9, 1))
+        with pytest.raises(ModelError, match=r"needs [\d,]+ bytes while its package is made, but .* has 1 free"):
+            model_hub.pull_package("words")
+    with pytest.raises(ModelError, match="has no graphs of fp16, only of int8"):
+        model_hub.pull_package("words", precision="fp16")
+    monkeypatch.setenv("FREEOCC3D_OFFLINE", "1")
+    with pytest.raises(ModelError, match="is not fetched, because FREEOCC3D_OFFLINE is set"):
+        model_hub.pull_package("words")
 
 
 @pytest.mark.parametrize(

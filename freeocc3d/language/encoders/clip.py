@@ -27,7 +27,8 @@ class Options(PatchOptions, frozen=True):
     """The model, and how its patches become features of pixels."""
 
     model: str = ""
-    """Folder of a model package of kind "clip", or its name in the models folder (see freeocc3d models list)."""
+    """Folder of a model package of kind "clip" or "windows", or its name in the models folder (see freeocc3d models
+    list)."""
     attention: Advanced[Attention] = "naclip"
     """Attention of the last block; "naclip" has the best results in the papers."""
     threshold: Cosine = 0.15
@@ -44,7 +45,9 @@ class ClipEncoder(Encoder):
         self.package = package
         self.options = options
         self.dimension = package.dimension
-        self._image, self._head = (package.session(part, options.device) for part in ("image", "head"))
+        self._image = package.session("image", options.device)
+        if package.kind == "clip":
+            self._head = package.session("head", options.device)
 
     def encode(self, frame: Frame) -> NDArray[np.float16]:
         """(ceil(H / stride), ceil(W / stride), D) float16; (rows, columns, D) of patches if stride is 0."""
@@ -101,18 +104,40 @@ class ClipEncoder(Encoder):
         return self.options.wording.state(self.package)
 
 
+class WindowsEncoder(ClipEncoder):
+    """The embeddings of whole windows, for a network that could not be cut before its last attention. All patches of a
+    window get its embedding, and those of overlapping windows their mean."""
+
+    def patches(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """(rows, columns, D) unit features of the patches of (H, W, 3) pixels."""
+        from ..patch_features import encode_windows
+
+        side = self.package.input_size
+        return encode_windows(rgb, self.package, max(self.options.short_side, side), side, self._window_features)
+
+    def _window_features(self, images: NDArray[np.float32], tiling: Tiling) -> NDArray[np.float32]:
+        shape = len(images), *tiling.window, self.dimension
+        return np.broadcast_to(self.pooled(images)[:, None, None], shape)
+
+    def pooled(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(B, D) embeddings of (B, 3, H, W) normalized images, both of the size of the training images."""
+        (pooled,) = self._image.run(["pooled"], {"image": images}, {"pooled": (len(images), self.dimension)})
+        return pooled
+
+
 NEEDS_CAPTURE = False
 """Encoding keyframes again needs only the keyframes."""
 
 
 def check(options: Options) -> model_packages.Package:
     """Finds the model that the options name. Raises ModelError if it does not exist."""
-    return model_packages.find_model(options.model, ("clip",), "language.clip.model")
+    return model_packages.find_model(options.model, ("clip", "windows"), "language.clip.model")
 
 
 def load(options: Options, capture: object = None) -> ClipEncoder:
     """Makes the encoder; it needs nothing from the capture. Raises ModelError."""
-    return ClipEncoder(check(options), options)
+    package = check(options)
+    return (ClipEncoder if package.kind == "clip" else WindowsEncoder)(package, options)
 
 
 def load_text(state: dict[str, Any]) -> ModelWords:

@@ -4,7 +4,6 @@ is unpickled."""
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 from torch import Tensor, nn
@@ -125,10 +124,3 @@ def _normalization(folder: Path, kind: str) -> tuple[list[float], list[float]]:
     stated = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     usual = {"clip": (CLIP_MEAN, CLIP_STD), "siglip": ([0.5] * 3, [0.5] * 3)}.get(kind, (DINO_MEAN, DINO_STD))
     return list(stated.get("image_mean", usual[0])), list(stated.get("image_std", usual[1]))
-
-
-def stated_licence(source: str) -> str:
-    """The license that a model card states, if it exists."""
-    card = Path(source) / "README.md"
-    found = re.search(r"^license:\s*(\S+)", card.read_text(encoding="utf-8"), re.M) if card.is_file() else None
-    return found[1] if found else "not stated: see the source"

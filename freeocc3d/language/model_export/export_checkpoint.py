@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ...core.errors import DependencyError
 from .. import model_packages
+from ..package_files import stated_licence
 
 _NEEDED = ("onnx", "onnxscript", "safetensors", "tokenizers", "transformers")
 
@@ -35,10 +36,10 @@ def export_checkpoint(
         raise DependencyError(
             f"Exporting a model needs {', '.join(missing)}: install with pip install 'freeocc3d[export]'."
         )
-    from .checkpoint_files import read_checkpoint, stated_licence
+    from .checkpoint_files import read_checkpoint
     from .package_writer import write_package
 
     folder = model_packages.find_models_folder() / output if Path(output).name == output else Path(output)
     checkpoint = read_checkpoint(source, tokenizer, text, text_head)
-    write_package(checkpoint, folder, folder.name, source, licence or stated_licence(source), precision)
+    write_package(checkpoint, folder, folder.name, source, licence or stated_licence(Path(source)), precision)
     return model_packages.read_package(folder)

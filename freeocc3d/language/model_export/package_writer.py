@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
-import os
-import tempfile
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-import yaml
 
-from ...core.errors import ModelError
 from .. import model_packages
+from ..package_files import write_files
 from .checkpoint_networks import Checkpoint, CheckpointNetwork
 
 _OPSET = 18
@@ -30,36 +28,17 @@ def write_package(
     precision: model_packages.Precision = "fp32",
 ) -> None:
     """Writes a package, completely or not at all. Raises ModelError."""
-    if folder.exists():
-        raise ModelError(f"{folder} already exists: choose another folder for the package.")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
-        made = Path(temporary) / "package"
-        made.mkdir()
-        parts = {}
-        for part, network in checkpoint.networks.items():
-            parts[part] = f"{part}.onnx"
-            write_onnx(network, made / parts[part])
-            change_precision(made / parts[part], precision)
-        if checkpoint.tokenizer is not None:
-            parts["tokenizer"] = "tokenizer.json"
-            (made / parts["tokenizer"]).write_text(checkpoint.tokenizer, encoding="utf-8")
-        manifest = {
-            "format": model_packages.FORMAT,
-            "name": name,
-            "kind": checkpoint.kind,
-            **checkpoint.facts,
-            "precision": precision,
-            "licence": licence,
-            "source": source,
-            "parts": parts,
-            "files": {file: model_packages.hash_file(made / file) for file in parts.values()},
-        }
-        (made / model_packages.MANIFESTS[0]).write_text(yaml.safe_dump(manifest, sort_keys=False), encoding="utf-8")
-        package = model_packages.read_package(made)
-        for part in checkpoint.networks:
-            package.session(part)  # fails if the written network cannot run
-        os.replace(made, folder)
+
+    def write(network: CheckpointNetwork, path: Path) -> None:
+        write_onnx(network, path)
+        change_precision(path, precision)
+
+    networks = {part: functools.partial(write, network) for part, network in checkpoint.networks.items()}
+    manifest = {
+        "name": name, "kind": checkpoint.kind, **checkpoint.facts, "precision": precision, "licence": licence,
+        "source": source,
+    }  # fmt: skip
+    write_files(folder, manifest, networks, checkpoint.tokenizer)
 
 
 def write_onnx(network: CheckpointNetwork, path: Path) -> None:

@@ -20,8 +20,9 @@ def end_token(stated: int, tokenizer: str) -> int:
     return int(Tokenizer.from_str(tokenizer).get_vocab_size()) - 1
 
 
-def clip_tokenizer(tokenizer: str, length: int) -> str:
-    """tokenizer.json that cuts texts like CLIP, with the end token last, and pads them to the longest."""
+def clip_tokenizer(tokenizer: str, length: int, fixed: bool = False) -> str:
+    """tokenizer.json that cuts texts like CLIP, with the end token last, and pads them to the longest; all to
+    ``length`` if that is fixed."""
     from tokenizers import Tokenizer
 
     made = Tokenizer.from_str(tokenizer)
@@ -29,20 +30,22 @@ def clip_tokenizer(tokenizer: str, length: int) -> str:
     if end is None:
         raise ModelError("The tokenizer has no <|endoftext|>: it is not a CLIP tokenizer.")
     made.enable_truncation(length)
-    made.enable_padding(pad_id=end, pad_token="<|endoftext|>")
+    made.enable_padding(pad_id=end, pad_token="<|endoftext|>", length=length if fixed else None)
     return str(made.to_str())
 
 
-def siglip_tokenizer(tokenizer: str, length: int, pad_id: int) -> str:
-    """tokenizer.json that, like SigLIP, lowers texts, removes punctuation, and cuts and pads texts to ``length``."""
+def siglip_tokenizer(tokenizer: str, length: int, pad_id: int, without_punctuation: bool = True) -> str:
+    """tokenizer.json that, like SigLIP, lowers texts, removes punctuation (SigLIP 2 keeps it), and cuts and pads texts
+    to ``length``."""
     from tokenizers import Regex, Tokenizer, normalizers
 
     made = Tokenizer.from_str(tokenizer)
     own = [] if made.normalizer is None else [made.normalizer]
-    made.normalizer = normalizers.Sequence(
-        [normalizers.Lowercase(), normalizers.Replace(Regex(_SIGLIP_PUNCTUATION), ""),
-         normalizers.Replace(Regex(r"\s+"), " "), normalizers.Strip(), *own]
-    )  # fmt: skip
+    cleaning = [
+        normalizers.Replace(Regex(_SIGLIP_PUNCTUATION), ""), normalizers.Replace(Regex(r"\s+"), " "),
+        normalizers.Strip(),
+    ] if without_punctuation else []  # fmt: skip
+    made.normalizer = normalizers.Sequence([normalizers.Lowercase(), *cleaning, *own])
     made.enable_truncation(length)
     made.enable_padding(pad_id=pad_id, pad_token=made.id_to_token(pad_id) or "", length=length)
     return str(made.to_str())

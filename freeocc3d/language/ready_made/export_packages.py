@@ -1,0 +1,202 @@
+"""Makes a model package of a folder with a ready-made ONNX export of CLIP or SigLIP."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import onnx
+from msgspec import Meta
+
+from ...core.errors import ModelError
+from ...core.onnx_files import find_external_files
+from ...core.regular_files import read_text
+from ...core.typed_documents import InvalidDocument, as_type, parse_json
+from .. import model_packages
+from ..model_export.tokenizer_files import clip_tokenizer, siglip_tokenizer
+from ..package_files import stated_licence, write_files
+from .export_layout import LARGEST_TOKENIZER, graph_names
+from .onnx_graphs import FLOAT, Additions, CutError, OnnxGraph, join, run_model
+from .text_cut import cut_text
+from .vision_cut import cut_vision
+
+_LARGEST_CONFIG = 1 << 20
+_OUTPUTS = {"clip": ("image_embeds", "text_embeds"), "siglip": ("pooler_output", "pooler_output")}
+_TOKENS = {"clip": 77, "siglip": 64}
+_SIDE = 224
+_STATISTICS = {
+    "clip": ([0.48145466, 0.4578275, 0.40821073], [0.26862954, 0.26130258, 0.27577711]),
+    "siglip": ([0.5] * 3, [0.5] * 3),
+}
+_FIRST_VOCABULARY = 32_000
+"""Tokens of SigLIP; SigLIP 2 has more."""
+_SCALES = {"clip": 100.0, "siglip": 117.3308, "siglip2": 112.6689}
+"""exp(logit_scale) of the published base models; the graphs of single towers do not hold it. CLIP's training bounds it
+by 100, which all published models reach."""
+
+_Side = Annotated[int, Meta(ge=16, le=4096)]
+_Length = Annotated[int, Meta(ge=8, le=4096)]
+
+
+class _Size(msgspec.Struct):
+    height: _Side | None = None
+    shortest_edge: _Side | None = None
+
+
+class _TextConfig(msgspec.Struct):
+    max_position_embeddings: _Length | None = None
+    vocab_size: int | None = None
+    pad_token_id: int | None = None
+
+
+class _VisionConfig(msgspec.Struct):
+    image_size: _Side | None = None
+
+
+class _Config(msgspec.Struct):
+    """What matters of config.json."""
+
+    model_type: str
+    text_config: _TextConfig = msgspec.field(default_factory=_TextConfig)
+    vision_config: _VisionConfig = msgspec.field(default_factory=_VisionConfig)
+
+
+class _Preprocessing(msgspec.Struct):
+    """What matters of preprocessor_config.json."""
+
+    image_mean: tuple[float, float, float] | None = None
+    image_std: tuple[float, float, float] | None = None
+    crop_size: _Size | _Side | None = None
+    size: _Size | _Side | None = None
+
+
+def package_of_export(
+    folder: Path, target: Path, source: str, precision: model_packages.Precision
+) -> tuple[model_packages.Package, str]:
+    """Writes the package ``target`` of the export in ``folder``; returns it, and what it lacks in a sentence.
+
+    Where the vision graph cannot be cut, the package is of kind "windows". Raises ModelError.
+    """
+    config = _read(folder / "config.json", _Config)
+    preprocessing = _read(folder / "preprocessor_config.json", _Preprocessing)
+    family = "siglip" if config.model_type.startswith("siglip") else config.model_type
+    if family not in _OUTPUTS:
+        raise ModelError(f"{source} is a model of type '{config.model_type[:40]}': clip and siglip can be used.")
+    side = _side(preprocessing.crop_size) or _side(preprocessing.size) or config.vision_config.image_size or _SIDE
+    longest = config.text_config.max_position_embeddings or _TOKENS[family]
+    graphs = [_load(folder, name, source) for name in graph_names(precision)]
+    for graph, name, output in zip(graphs, graph_names(precision), _OUTPUTS[family], strict=True):
+        if output not in (found := [own.name for own in graph.graph.output]):
+            raise ModelError(
+                f"{name} of {source} gives {', '.join(found)[:80]} instead of {output}: it is no {family}."
+            )
+    lacks = ""
+    try:
+        cut = cut_vision(graphs[0], _OUTPUTS[family][0], side, precision)
+        kind, vision = "clip", {"image": cut.image, "head": cut.head}
+        facts = {"dimension": cut.dimension, "patch": cut.patch, "prefix_tokens": cut.prefix_tokens}
+    except CutError as error:
+        kind, vision, facts = "windows", *_whole_windows(graphs[0], _OUTPUTS[family][0], side, source)
+        lacks = (
+            f"{graph_names(precision)[0]} cannot be cut, because {error}. So it gives one feature to a window of "
+            f"{side} pixels instead of one to each patch: small things are lost, and edges are coarse."
+        )
+    try:
+        text, fixed = cut_text(graphs[1], _OUTPUTS[family][1], facts["dimension"], longest, side)
+    except CutError as error:
+        raise ModelError(f"{graph_names(precision)[1]} of {source} cannot be used: {error}.") from error
+    usual = _STATISTICS[family]
+    second = family == "siglip" and (config.text_config.vocab_size or _FIRST_VOCABULARY) > _FIRST_VOCABULARY
+    manifest = {
+        "name": target.name, "kind": kind, **facts, "input_size": side, "precision": precision,
+        "mean": list(preprocessing.image_mean or usual[0]), "std": list(preprocessing.image_std or usual[1]),
+        "logit_scale": _SCALES["siglip2" if second else family], "licence": stated_licence(folder), "source": source,
+    }  # fmt: skip
+    tokenizer = _tokenizer(folder, family, longest, fixed, second, config.text_config.pad_token_id)
+    networks = {part: functools.partial(_save, network) for part, network in {**vision, "text": text}.items()}
+    return write_files(target, manifest, networks, tokenizer), lacks
+
+
+def _read(path: Path, kind: Any) -> Any:
+    """A JSON file as a typed document. Raises ModelError."""
+    try:
+        return as_type(parse_json(read_text(path, _LARGEST_CONFIG)), kind)
+    except OSError as error:
+        raise ModelError(f"Cannot read {path}: {error.strerror}.") from error
+    except (ValueError, InvalidDocument) as error:
+        raise ModelError(
+            f"{path} is not the configuration of a CLIP or SigLIP: {' '.join(str(error).split())}."
+        ) from error
+
+
+def _side(size: _Size | int | None) -> int | None:
+    return (size.height or size.shortest_edge) if isinstance(size, _Size) else size
+
+
+def _load(folder: Path, name: str, source: str) -> onnx.ModelProto:
+    """A graph of the export, with weights that it keeps beside it. Raises ModelError."""
+    path = folder / name
+    try:
+        for outside in find_external_files(path):
+            if not model_packages.is_plain_name(outside) or not (path.parent / outside).is_file():
+                raise ModelError(
+                    f"{name} of {source} keeps weights in '{outside[:80]}', which is no file beside it: it is refused."
+                )
+        return onnx.load(path)
+    except OSError as error:
+        raise ModelError(f"Cannot read {path}: {error.strerror}.") from error
+    except ModelError:
+        raise
+    except Exception as error:  # protobuf's errors share no base class
+        raise ModelError(f"{name} of {source} is not an ONNX network that can be read.") from error
+
+
+def _save(model: onnx.ModelProto, path: Path) -> None:
+    onnx.save(model, path)
+
+
+def _whole_windows(
+    model: onnx.ModelProto, output: str, side: int, source: str
+) -> tuple[dict[str, onnx.ModelProto], dict[str, int]]:
+    """The network ``image`` of a package of kind "windows", and its facts. Raises ModelError."""
+    graph, ends = OnnxGraph(model), Additions("ends")
+    try:
+        if len(graph.inputs) != 1:
+            raise CutError(f"it takes {', '.join(graph.inputs)[:80]} instead of an image alone")
+        kind = next(own.type.tensor_type.elem_type for own in model.graph.input if own.name == graph.inputs[0])
+        given = ends.cast("image", onnx.helper.tensor_dtype_to_np_dtype(kind))
+        ends.cast(output, np.dtype(np.float32), "pooled")
+        inputs = {"image": (FLOAT, ["images", 3, side, side])}
+        made = join(graph, inputs, {"pooled": ["images", "size"]}, [ends], {graph.inputs[0]: given})
+        (pooled,) = run_model(made, ["pooled"], {"image": np.zeros((2, 3, side, side), np.float32)})
+        if pooled.ndim != 2:
+            raise CutError(f"it gives {output} of {pooled.ndim} axes")
+    except CutError as error:
+        raise ModelError(f"The vision graph of {source} cannot be used: {error}.") from error
+    patch = next(size for size in (16, 14, side) if side % size == 0)
+    return {"image": made}, {"dimension": pooled.shape[1], "patch": patch, "prefix_tokens": 0}
+
+
+def _tokenizer(folder: Path, family: str, longest: int, fixed: bool, second: bool, pad_id: int | None) -> str:
+    """tokenizer.json that cuts and pads texts. Raises ModelError."""
+    from tokenizers import Tokenizer
+
+    path = folder / "tokenizer.json"
+    try:
+        text = read_text(path, LARGEST_TOKENIZER)
+        made = Tokenizer.from_str(text)
+    except OSError as error:
+        raise ModelError(f"Cannot read {path}: {error.strerror}.") from error
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # tokenizers raises bare Exceptions, and panics that are none
+        raise ModelError(f"{path} is not a tokenizer.json: {' '.join(str(error).split())[:200]}.") from error
+    if family == "clip":
+        return clip_tokenizer(text, longest, fixed)
+    stated = (made.padding or {}).get("pad_id")
+    own = made.token_to_id("<pad>" if second else "</s>")
+    pad = next((number for number in (stated, pad_id, own) if number is not None), 1)
+    return siglip_tokenizer(text, longest, pad, without_punctuation=not second)

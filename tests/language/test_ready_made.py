@@ -1,0 +1,201 @@
+"""Ready-made ONNX exports become model packages: against the same network in PyTorch, at sizes of no training image."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import ready_made
+import tiny_models
+import torch
+from made_once import make_once
+from onnx import TensorProto, helper
+
+from freeocc3d.core.errors import ModelError
+from freeocc3d.language import clip_attention
+from freeocc3d.language.encoders import clip
+from freeocc3d.language.model_export import transformer_graphs as graphs
+from freeocc3d.language.patch_features import Tiling
+from freeocc3d.language.ready_made.export_packages import package_of_export
+from freeocc3d.language.text_networks import TextNetwork
+
+TOLERANCE = {"fp32": 1e-3, "fp16": 5e-3, "int8": 0.05}
+TEXTS = ["a photo of a red chair.", "the table by the window"]
+
+
+def exported(tmp_path_factory: pytest.TempPathFactory, target: Path, *choices: str) -> Path:
+    """A copy of an export that is written once for all tests."""
+    made = make_once(tmp_path_factory, f"export-{'-'.join(choices)}", lambda p: ready_made.write_export(p, *choices))
+    return Path(shutil.copytree(made, target))
+
+
+@pytest.fixture
+def clip_export(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return exported(tmp_path_factory, tmp_path / "export", "clip", "fp32", "sdpa")
+
+
+def in_torch(kind: str, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(B, N, D) features of patches with naclip's and sclip's attention."""
+    model = ready_made.model_of(kind)
+    trunk = graphs.ImageTrunk(model.vision_model)
+    head = (graphs.ClipHead if kind == "clip" else graphs.SiglipHead)(model)
+    with torch.no_grad():
+        q, k, v, stream = trunk(torch.from_numpy(images))
+        grid = images.shape[2] // 8, images.shape[3] // 8
+        mixed = [clip_attention.mix_values(own, *(x.numpy() for x in (q, k, v)), grid) for own in ("naclip", "sclip")]
+        reduced, features = head(torch.from_numpy(mixed[0]), stream)[1], head(torch.from_numpy(mixed[1]), stream)[0]
+    return reduced.numpy(), features.numpy()
+
+
+def unit(features: np.ndarray) -> np.ndarray:
+    return features / np.linalg.norm(features, axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "fp16", "int8"])
+@pytest.mark.parametrize(("kind", "attention"), [("clip", "sdpa"), ("siglip", "eager")])
+def test_an_export_equals_its_network(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, kind: str, attention: str, precision: str
+) -> None:
+    folder = exported(tmp_path_factory, tmp_path / "export", kind, precision, attention)
+    package, lacks = package_of_export(folder, tmp_path / "tiny", "someone/tiny", precision)
+    assert (package.kind, package.precision, package.patch, package.licence) == ("clip", precision, 8, "mit")
+    assert (package.prefix_tokens, lacks) == (int(kind == "clip"), "")
+    assert package.mean == (0.5, 0.4, 0.3)
+    images = np.random.default_rng(0).normal(size=(2, 3, 40, 24)).astype(np.float32)
+    tiling = Tiling((5, 3), (5, 3), (0,), (0,), 8)
+    for replaced, reference in zip(("naclip", "sclip"), in_torch(kind, images), strict=True):
+        encoder = clip.load(clip.Options(model=str(package.folder), attention=replaced))
+        found = encoder._window_features(images, tiling).reshape(2, 15, -1)
+        assert np.linalg.norm(unit(found) - unit(reference[:, -15:]), axis=-1).max() < TOLERANCE[precision]
+    text = TextNetwork(package)
+    model = ready_made.model_of(kind)
+    with torch.no_grad():
+        words = ready_made.Text(model)(torch.from_numpy(text.tokens(TEXTS)))
+    words = (words if kind == "clip" else words[1]).numpy()
+    assert np.linalg.norm(text.embed(TEXTS) - unit(words), axis=-1).max() < TOLERANCE[precision]
+    assert (text.tokens(TEXTS).shape[1] == ready_made.LENGTH[kind]) == (kind == "siglip")
+
+
+def changed(path: Path, change: Any) -> None:
+    model = onnx.load(path)
+    change(model.graph)
+    onnx.save(model, path)
+
+
+def without_softmax(graph: Any) -> None:
+    """Writes each softmax as its parts, which nobody recognizes."""
+    nodes = []
+    for node in graph.node:
+        if node.op_type != "Softmax":
+            nodes.append(node)
+            continue
+        (x,), (y,) = node.input, node.output
+        nodes.append(helper.make_node("Exp", [x], [f"{y}/exp"]))
+        nodes.append(helper.make_node("ReduceL1", [f"{y}/exp"], [f"{y}/sum"], axes=[-1]))
+        nodes.append(helper.make_node("Div", [f"{y}/exp", f"{y}/sum"], [y]))
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+def test_a_graph_that_cannot_be_cut_encodes_windows(clip_export: Path, tmp_path: Path) -> None:
+    changed(clip_export / "onnx" / "vision_model.onnx", without_softmax)
+    package, lacks = package_of_export(clip_export, tmp_path / "tiny", "someone/tiny", "fp32")
+    assert package.kind == "windows"
+    assert "vision_model.onnx cannot be cut, because it has no row of equal blocks with attention" in lacks
+    assert "one feature to a window of 32 pixels instead of one to each patch" in lacks
+    encoder = clip.load(clip.Options(model=str(package.folder), stride=0, short_side=32))
+    frame = tiny_models.frame(32, 48)
+    found = encoder.encode(frame).astype(np.float32)
+    assert found.shape == (2, 3, 24)
+    normal = (frame.color / np.float32(255) - np.array(package.mean, np.float32)) / np.array(package.std, np.float32)
+    left = torch.from_numpy(normal.transpose(2, 0, 1)[None, :, :, :32].astype(np.float32))
+    with torch.no_grad():
+        expected = unit(ready_made.Vision(ready_made.model_of("clip"))(left).numpy())[0]
+    assert np.linalg.norm(found[0, 0] - expected) < 2e-3
+
+
+def test_a_text_graph_may_list_an_image_and_a_mask(clip_export: Path, tmp_path: Path) -> None:
+    plain, _ = package_of_export(clip_export, tmp_path / "plain", "someone/tiny", "fp32")
+
+    def more(graph: Any) -> None:
+        graph.input.append(helper.make_tensor_value_info("pixel_values", TensorProto.FLOAT, ["b", 3, 32, 32]))
+        graph.input.append(helper.make_tensor_value_info("attention_mask", TensorProto.INT64, ["b", "l"]))
+        masked = helper.make_node("Mul", ["input_ids", "attention_mask"], ["masked"])
+        for node in graph.node:
+            node.input[:] = ["masked" if name == "input_ids" else name for name in node.input]
+        graph.node.insert(0, masked)
+
+    changed(clip_export / "onnx" / "text_model.onnx", more)
+    package, _ = package_of_export(clip_export, tmp_path / "tiny", "someone/tiny", "fp32")
+    np.testing.assert_allclose(TextNetwork(package).embed(TEXTS), TextNetwork(plain).embed(TEXTS), atol=1e-6)
+
+
+def rename_output(graph: Any) -> None:
+    graph.output[0].name = "logits"
+    graph.node[-1].output[0] = "logits"
+
+
+def rename_input(graph: Any) -> None:
+    graph.input[0].name = "words"
+    for node in graph.node:
+        node.input[:] = ["words" if name == "input_ids" else name for name in node.input]
+
+
+def keep_weights_outside(graph: Any) -> None:
+    weight = graph.initializer[0]
+    weight.ClearField("raw_data")
+    weight.data_location = TensorProto.EXTERNAL
+    weight.external_data.add(key="location", value="../../secrets.bin")
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "message"),
+    [
+        (
+            "vision_model.onnx",
+            rename_output,
+            r"vision_model\.onnx of someone/tiny gives logits instead of image_embeds",
+        ),
+        ("text_model.onnx", rename_output, r"text_model\.onnx of someone/tiny gives logits instead of text_embeds"),
+        (
+            "text_model.onnx",
+            keep_weights_outside,
+            r"keeps weights in '\.\./\.\./secrets\.bin', which is no file beside",
+        ),
+        (
+            "text_model.onnx",
+            rename_input,
+            r"text_model\.onnx of someone/tiny cannot be used: it takes words instead of",
+        ),
+    ],
+)
+def test_graphs_of_another_kind_are_refused(
+    clip_export: Path, tmp_path: Path, file: str, change: Any, message: str
+) -> None:
+    changed(clip_export / "onnx" / file, change)
+    with pytest.raises(ModelError, match=message):
+        package_of_export(clip_export, tmp_path / "tiny", "someone/tiny", "fp32")
+    assert not (tmp_path / "tiny").exists()
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("config.json", json.dumps({"model_type": "bert"}), "is a model of type 'bert': clip and siglip can be used"),
+        ("config.json", "[1]", "is not the configuration of a CLIP or SigLIP"),
+        ("tokenizer.json", "{}", r"tokenizer\.json is not a tokenizer\.json"),
+        ("onnx/vision_model.onnx", "\x00\x01 none", "is not an ONNX network that can be read"),
+    ],
+)
+def test_files_that_are_none_are_refused(
+    clip_export: Path, tmp_path: Path, file: str, content: str, message: str
+) -> None:
+    (clip_export / file).write_text(content)
+    with pytest.raises(ModelError, match=message):
+        package_of_export(clip_export, tmp_path / "tiny", "someone/tiny", "fp32")
+    assert not (tmp_path / "tiny").exists()
