@@ -35,7 +35,7 @@ def demo(
     from ..settings import config
     from ..viewer import map_pictures
 
-    settings = config.load(None, [f"capture.synthetic.frames={frames}"])
+    settings = config.load(None, [f"capture.synthetic.frames={frames}", "language.encoder=color"])
     with ConsoleProgress() as progress:
         made = run.reconstruct("builtin:room", output / "map", settings, overwrite=overwrite, progress=progress)
     print(summary_text(made))

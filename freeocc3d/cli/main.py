@@ -26,6 +26,7 @@ from .list import list_backends
 from .query import query
 from .reconstruct import reconstruct
 from .refine import refine
+from .relabel import relabel
 from .scale import scale
 from .stopping import Stopping
 from .upright import upright
@@ -76,6 +77,7 @@ for _command in (
     check,
     export,
     refine,
+    relabel,
     scale,
     upright,
     evaluate,

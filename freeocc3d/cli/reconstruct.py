@@ -10,6 +10,7 @@ import typer
 from ..core.errors import ConfigError
 from .console import ConsoleProgress, NewMap, Overwrite, Set, flag
 from .map_summary import summary_text
+from .words import Words, obtain_words
 
 if TYPE_CHECKING:
     from ..settings.config import Settings
@@ -26,6 +27,7 @@ def reconstruct(
         typer.Option("--config", metavar="FILE|NAME", help="YAML file with options, or a preset such as mono."),
     ] = None,
     overrides: Set = None,
+    words: Words = None,
     resume: Annotated[bool, flag("--resume", "Continue an interrupted run.")] = False,
     overwrite: Overwrite = False,
     device: Annotated[
@@ -42,6 +44,7 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Turn a captured scan into a map."""
+    from ..language.word_models import use_package
     from ..pipeline import run
     from ..settings import config
 
@@ -51,6 +54,8 @@ def reconstruct(
     if device is not None:
         settings = _move(settings, device)
     with ConsoleProgress() as progress:
+        if words is not None:
+            settings = use_package(settings, obtain_words(words, progress))
         made = run.reconstruct(capture, output, settings, overwrite=overwrite, resume=resume, progress=progress)
     print(summary_text(made))
 

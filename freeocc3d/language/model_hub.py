@@ -30,8 +30,8 @@ from .ready_made import export_layout
 from .timed_requests import Answer, NoAnswer, fetch
 from .vision_server import shorten_to_line
 
-RECOMMENDED = "clip-b16"
-"""What "words" stands for: the smallest of the models on which the papers of dense features agree."""
+WORDS, RECOMMENDED = "words", "clip-b16"
+"""A name for the recommended model, and that model: with it the papers of training-free dense features report."""
 
 EXPORTS = {
     "clip-b16": "Xenova/clip-vit-base-patch16",
@@ -108,15 +108,11 @@ def pull_package(
     DependencyError if a package is missing that reads an export.
     """
     progress = progress or Progress()
-    name = RECOMMENDED if name == "words" else name
+    name = RECOMMENDED if name == WORDS else name
     repository = NAMES.get(name, name)
-    if not re.fullmatch(r"[\w.-]+/\w[\w.-]*", repository):
-        raise ModelError(
-            f"'{name}' is not a repository OWNER/NAME of the hub{model_packages.nearest(name, NAMES)}. "
-            f"Short names are words, {', '.join(NAMES)}."
-        )
-    local = name if name in NAMES else repository.split("/")[1]
-    local += f"-{precision}" if precision else ""
+    if not is_repository(name):
+        raise unknown_name(name)
+    local = local_name(name) + (f"-{precision}" if precision else "")
     if is_offline():
         raise ModelError(
             f"{repository} is not fetched, because {OFFLINE} is set: unset it, or copy the model's folder."
@@ -158,6 +154,25 @@ def pull_package(
     except OSError as error:
         raise ModelError(f"Cannot write to {error.filename or partial}: {error.strerror}.") from error
     return target
+
+
+def is_repository(name: str) -> bool:
+    """Whether a name stands for a repository of the hub: a short one, or OWNER/NAME."""
+    return name == WORDS or name in NAMES or re.fullmatch(r"[\w.-]+/\w[\w.-]*", name) is not None
+
+
+def unknown_name(name: str) -> ModelError:
+    """The error for a name that is no repository."""
+    return ModelError(
+        f"'{name}' is neither an installed model nor a repository OWNER/NAME of the hub"
+        f"{model_packages.nearest(name, NAMES)}. Short names are {WORDS}, {', '.join(NAMES)}."
+    )
+
+
+def local_name(name: str) -> str:
+    """The name of a repository's folder in the models folder."""
+    name = RECOMMENDED if name == WORDS else name
+    return name.split("/")[1] if name not in NAMES and is_repository(name) else name
 
 
 def is_offline() -> bool:

@@ -81,6 +81,23 @@ def build_blocks(
     )
 
 
+def compute_features(
+    occupancy: Occupancy, gaussians: Gaussians, features: NDArray[np.float16], splatting: splat.Options, scale: float
+) -> NDArray[np.float16]:
+    """Returns (V, D) features of the V occupied voxels of a map of one voxel size, as ``build_blocks`` computes them.
+    features: (N, D) of the Gaussians.  scale: meters; finer Gaussians are widened to it."""
+    packed = pack_voxels(occupancy.keys)
+    slots = np.full(occupancy.state.shape, -1, np.int32)
+    slots[occupancy.state == OCCUPIED] = np.arange(len(occupancy.colors))
+    order = np.argsort(packed)
+    bins = splat.bin_gaussians(gaussians, occupancy.origin, splatting, None, scale).only(packed[order])
+    rows = order[np.searchsorted(packed[order], bins.packed)]
+    means = splat.compute_posterior_mean(bins, unpack_voxels(bins.packed), slots[rows], features)
+    whole = np.zeros((len(occupancy.colors), features.shape[1]), np.float32)
+    whole[: len(means)] = means  # the last voxels may have no Gaussian near them
+    return normalize_rows(whole)
+
+
 def classify(
     probability: NDArray[np.float32],
     free: NDArray[np.uint16],

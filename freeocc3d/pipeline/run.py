@@ -20,6 +20,7 @@ from ..core.progress import Progress
 from ..core.sampling import spread_evenly
 from ..core.types import Frame
 from ..language.encoders.base import Encoder
+from ..language.word_models import choose_encoder
 from ..query.scan_map import Map, load_map
 from ..settings import config
 from ..settings.config import Settings
@@ -62,6 +63,8 @@ def reconstruct(
         opened = _open(capture, resolved, progress, work)
         resolved, reason = choose_tracker(resolved, opened)
         progress.note(reason)
+        resolved, words = choose_encoder(resolved)
+        progress.note(words)
         opened, resolved = _know_camera(opened, resolved, progress, work)
         resolved, sensed = choose_sensor(resolved, opened)
         progress.note(sensed)

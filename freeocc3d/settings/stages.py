@@ -160,8 +160,9 @@ class FittingOptions(TypedOptions, frozen=True):
 class LanguageOptions(TypedOptions, frozen=True):
     """Layer 3: what the Gaussians mean in words."""
 
-    encoder: str = "color"
-    """Turns images and words into features. "color" needs no network and knows color names only."""
+    encoder: str = "auto"
+    """Turns images and words into features. "auto": the best model that is installed (freeocc3d models list), else
+    "color", which needs no network and knows color names only."""
     keyframes: Annotated[float, Meta(gt=0, le=1e6)] = 1.0
     """Keyframes to encode: a value up to 1 is a share of all keyframes, a larger one a number. If not all are encoded,
     sharp keyframes that together show the most surface are chosen. The time of layer 3 is proportional to this

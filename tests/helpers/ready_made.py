@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import shutil
 import warnings
 from pathlib import Path
 from typing import Any
 
 import onnx
+import pytest
 import tiny_models
 import torch
+from made_once import make_once
 from torch import Tensor, nn
 
 NAMES = {"clip": ("image_embeds", "text_embeds"), "siglip": ("pooler_output", "pooler_output")}
@@ -45,6 +48,13 @@ def model_of(kind: str, attention: str = "sdpa") -> Any:
     model = getattr(tiny_models, kind)()
     model.set_attn_implementation(attention)
     return model
+
+
+def copy_export(factory: pytest.TempPathFactory, target: Path, kind: str, precision: str, attention: str) -> Path:
+    """A copy of an export that is written once for all tests."""
+    name = f"export-{kind}-{precision}-{attention}"
+    made = make_once(factory, name, lambda path: write_export(path, kind, precision, attention))
+    return Path(shutil.copytree(made, target))
 
 
 def write_export(folder: Path, kind: str, precision: str = "fp32", attention: str = "sdpa") -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import pytest
 import ready_made
 import tiny_models
 import torch
-from made_once import make_once
 from onnx import TensorProto, helper
 
 from freeocc3d.core.errors import ModelError
@@ -28,15 +26,9 @@ TOLERANCE = {"fp32": 1e-3, "fp16": 5e-3, "int8": 0.05}
 TEXTS = ["a photo of a red chair.", "the table by the window"]
 
 
-def exported(tmp_path_factory: pytest.TempPathFactory, target: Path, *choices: str) -> Path:
-    """A copy of an export that is written once for all tests."""
-    made = make_once(tmp_path_factory, f"export-{'-'.join(choices)}", lambda p: ready_made.write_export(p, *choices))
-    return Path(shutil.copytree(made, target))
-
-
 @pytest.fixture
 def clip_export(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return exported(tmp_path_factory, tmp_path / "export", "clip", "fp32", "sdpa")
+    return ready_made.copy_export(tmp_path_factory, tmp_path / "export", "clip", "fp32", "sdpa")
 
 
 def in_torch(kind: str, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +53,7 @@ def unit(features: np.ndarray) -> np.ndarray:
 def test_an_export_equals_its_network(
     tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, kind: str, attention: str, precision: str
 ) -> None:
-    folder = exported(tmp_path_factory, tmp_path / "export", kind, precision, attention)
+    folder = ready_made.copy_export(tmp_path_factory, tmp_path / "export", kind, precision, attention)
     package, lacks = package_of_export(folder, tmp_path / "tiny", "someone/tiny", precision)
     assert (package.kind, package.precision, package.patch, package.licence) == ("clip", precision, 8, "mit")
     assert (package.prefix_tokens, lacks) == (int(kind == "clip"), "")

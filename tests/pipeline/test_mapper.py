@@ -21,7 +21,7 @@ MOMENTS = (4, 9)
 @pytest.fixture(scope="module")
 def layers(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Mapper, Gaussians, np.ndarray, Occupancy]]:
     """The mapper after the last frame, and at each moment the Gaussians, their features and the occupancy."""
-    settings = config.resolve(ROOM)
+    settings = config.resolve({**ROOM, "language": {"encoder": "color"}})
     capture = open_capture("builtin:room", settings.capture, settings.backends["capture"])
     mapper = Mapper(settings, capture, tmp_path_factory.mktemp("live"))
     encoder = settings.load_backend("language", capture)

@@ -250,7 +250,7 @@ def test_what_is_given_at_its_default_imports_no_backend() -> None:
 
 
 def test_a_section_loads_its_backend_with_its_options() -> None:
-    settings = config.resolve({"language": {"color": {"stride": 2}}})
+    settings = config.resolve({"language": {"encoder": "color", "color": {"stride": 2}}})
     assert settings.load_backend("language", None).options.stride == 2
     assert config.resolve({}).load_backend("fitting").device.type == "cpu"
     assert settings.has_backend_option("language", "stride")

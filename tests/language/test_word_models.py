@@ -1,0 +1,113 @@
+"""From nothing to words: which model is used, fetching it by the commands, and giving a map its words later."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ready_made
+from command_line import refused, run
+from hubs import Hub, serve
+from model_folders import dense_package
+
+from freeocc3d import load_map
+from freeocc3d.editing import relabeling
+from freeocc3d.gaussians import anchors
+from freeocc3d.language import model_hub, word_models
+from freeocc3d.language.ready_made.export_packages import package_of_export
+from freeocc3d.occupancy import build
+from freeocc3d.query.scan_map import Map
+from freeocc3d.settings import config
+
+QUICK = ["capture.stride=12", "capture.color_focal=1", "capture.synthetic.width=160", "capture.synthetic.height=120",
+         "tracking.backend=known", "fitting.passes=0", "language.keyframes=3"]  # fmt: skip
+SET = [part for value in QUICK for part in ("--set", value)]
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("FREEOCC3D_MODELS", str(tmp_path / "models"))
+    return tmp_path / "models"
+
+
+@pytest.fixture
+def hub(tmp_path: Path, home: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch):
+    folder = ready_made.copy_export(tmp_path_factory, tmp_path / "remote", "clip", "int8", "sdpa")
+    with serve(folder, model_hub.NAMES["clip-b16"]) as running:
+        monkeypatch.setenv("HF_ENDPOINT", running.url)
+        yield running
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Map:
+    folder = tmp_path_factory.mktemp("words") / "room"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FREEOCC3D_MODELS", str(folder.parent / "none"))
+        said = run("reconstruct", "builtin:room", "-o", folder, *SET)
+    assert "'freeocc3d models pull words' gets one" in said.stderr
+    return load_map(folder)
+
+
+def test_the_best_installed_model_is_used(home: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    plain = config.resolve({})
+    assert word_models.choose_encoder(plain)[0].language.encoder == "color"
+    export = ready_made.copy_export(tmp_path_factory, tmp_path / "export", "clip", "int8", "sdpa")
+    for name in ("another", "clip-b16"):
+        package_of_export(export, home / name, "someone/tiny", "int8")
+    dense_package(home / "dino")
+    chosen, said = word_models.choose_encoder(plain)
+    assert (chosen.language.encoder, chosen.given("language", "clip")["model"]) == ("clip", "clip-b16")
+    assert said == "Words: the model clip-b16 (clip), the best that is installed."
+    shutil.rmtree(home / "clip-b16")
+    assert word_models.choose_encoder(plain)[0].given("language", "clip")["model"] == "another"
+    named = config.resolve({"language": {"clip": {"model": "mine"}}})
+    assert word_models.choose_encoder(named)[0].given("language", "clip")["model"] == "mine"
+    color = config.resolve({"language": {"encoder": "color"}})
+    assert word_models.choose_encoder(color) == (color, "")
+
+
+def test_from_nothing_to_an_answer_in_two_commands(hub: Hub, home: Path, tmp_path: Path) -> None:
+    run("reconstruct", "builtin:room", "-o", tmp_path / "map", "--words", "words", *SET)
+    assert (home / "clip-b16").is_dir()
+    answer = json.loads(run("query", tmp_path / "map", "chair", "--threshold", "-1", "--json").stdout)
+    assert answer["results"][0]["word"] == "chair"
+    assert load_map(tmp_path / "map").manifest.encoder.name == "clip"
+
+
+def test_a_map_gets_words_later(room: Map, hub: Hub, tmp_path: Path) -> None:
+    run("relabel", room.path, "-o", tmp_path / "map", "--words", "clip-b16")
+    made = load_map(tmp_path / "map")
+    assert (made.manifest.encoder.name, made.occupancy.features.shape[1]) == ("clip", 24)
+    np.testing.assert_array_equal(made.occupancy.state, room.occupancy.state)
+    np.testing.assert_array_equal(made.occupancy.colors, room.occupancy.colors)
+    np.testing.assert_array_equal(made.trajectory.T_world_cam, room.trajectory.T_world_cam)
+    assert made.query_words(["chair"], threshold=-1.0)[0].word == "chair"
+    assert "exists: choose another folder" in refused("relabel", room.path, "-o", tmp_path / "map")
+
+
+def test_voxels_get_the_features_that_a_run_gives_them(room: Map) -> None:
+    settings, occupancy = relabeling.read_settings(room), room.occupancy
+    edge = settings.occupancy.voxel_size
+    scale = anchors.compute_least_scale(settings.gaussians, 0.5 * edge, edge)
+    found = build.compute_features(occupancy, room.gaussians, room.gaussian_features, settings.occupancy, scale)
+    expected = np.asarray(occupancy.features, np.float32)
+    cosine = np.einsum("vd,vd->v", found.astype(np.float32), expected)
+    known = expected.any(axis=1)
+    assert known.mean() > 0.5
+    assert (found.any(axis=1) == known).mean() > 0.999
+    assert np.quantile(cosine[known], 0.001) > 0.99
+
+
+def test_without_a_network_and_a_model_it_is_one_sentence(
+    room: Map, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FREEOCC3D_OFFLINE", "1")
+    out = ["-o", tmp_path / "map"]
+    assert "is not fetched, because FREEOCC3D_OFFLINE is set" in refused("relabel", room.path, *out)
+    unknown = refused("reconstruct", "builtin:room", *out, "--words", "clip-b17")
+    assert "'clip-b17' is neither an installed model nor a repository OWNER/NAME of the hub (did you mean" in unknown
+    (home / "clip-b16").mkdir(parents=True)
+    assert "is not a model package" in refused("relabel", room.path, *out)
