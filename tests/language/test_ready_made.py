@@ -132,6 +132,10 @@ def rename_output(graph: Any) -> None:
     graph.node[-1].output[0] = "logits"
 
 
+def make_a_circle(graph: Any) -> None:
+    graph.node[1].input[0] = graph.node[-1].output[0]
+
+
 def rename_input(graph: Any) -> None:
     graph.input[0].name = "words"
     for node in graph.node:
@@ -152,6 +156,11 @@ def keep_weights_outside(graph: Any) -> None:
             "vision_model.onnx",
             rename_output,
             r"vision_model\.onnx of someone/tiny gives logits instead of image_embeds",
+        ),
+        (
+            "vision_model.onnx",
+            make_a_circle,
+            r"vision graph of someone/tiny cannot be used: the nodes that make .* a circle",
         ),
         ("text_model.onnx", rename_output, r"text_model\.onnx of someone/tiny gives logits instead of text_embeds"),
         (

@@ -162,8 +162,9 @@ def _whole_windows(
     model: onnx.ModelProto, output: str, side: int, source: str
 ) -> tuple[dict[str, onnx.ModelProto], dict[str, int]]:
     """The network ``image`` of a package of kind "windows", and its facts. Raises ModelError."""
-    graph, ends = OnnxGraph(model), Additions("ends")
+    ends = Additions("ends")
     try:
+        graph = OnnxGraph(model)
         if len(graph.inputs) != 1:
             raise CutError(f"it takes {', '.join(graph.inputs)[:80]} instead of an image alone")
         kind = next(own.type.tensor_type.elem_type for own in model.graph.input if own.name == graph.inputs[0])

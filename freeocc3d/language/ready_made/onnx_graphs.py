@@ -179,6 +179,7 @@ def _sort_needed(nodes: list[onnx.NodeProto], given: set[str], outputs: list[str
     """The nodes that the outputs need, each after those that it needs. Raises CutError if a tensor has no maker."""
     makers = {name: index for index, node in enumerate(nodes) for name in node.output if name}
     order: dict[int, None] = {}
+    begun: set[int] = set()
     stack: list[tuple[str, bool]] = [(name, False) for name in reversed(outputs)]
     while stack:
         name, done = stack.pop()
@@ -190,6 +191,9 @@ def _sort_needed(nodes: list[onnx.NodeProto], given: set[str], outputs: list[str
         if done:
             order[index] = None
         elif index not in order:
+            if index in begun:
+                raise CutError(f"the nodes that make '{name[:80]}' form a circle")
+            begun.add(index)
             stack.append((name, True))
             stack.extend((taken, False) for taken in taken_by(nodes[index]))
     return [nodes[index] for index in order]
