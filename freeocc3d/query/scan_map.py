@@ -21,6 +21,7 @@ from . import word_query
 if TYPE_CHECKING:
     from .best_views import RegionView
     from .conditions import Where
+    from .objects.object import Object
     from .oriented_boxes import OrientedBox
     from .regions import Region
     from .word_query import Options, QueryResult
@@ -72,6 +73,14 @@ class Map(SavedMap):
             lambda asked: [image_query.query_feature(self.occupancy, feature, name, asked, self.up)], where, options
         )
         return found[0]
+
+    def objects(self, **options: Any) -> list[Object]:
+        """Returns the things of the room, best described first; see ``query.objects.finding``. ``options``: fields of
+        ``query.objects.object.Options``."""
+        from .objects import finding
+        from .objects.object import Options as ObjectOptions
+
+        return finding.find_objects(self, typed_options.build(ObjectOptions, options))
 
     def labels(self) -> NDArray[np.uint8]:
         """Returns the (V,) class of each occupied voxel: 0 = nothing known, k = ``vocabulary[k - 1]``."""
