@@ -19,7 +19,7 @@ from .word_query import QueryResult
 
 PICKS = ("largest", "highest", "lowest", "best")
 _ON_GAP = -0.5, 1.5  # voxels: a tilted lattice rounds surfaces up or down
-_LOWEST = 1.0  # voxels above a region's lowest point that belong to its underside
+_LOWEST = 1.0 + 1e-6  # voxels above a region's lowest point that belong to its underside
 _OVERLAP = 1.0 - 1e-6
 _FARTHEST_M = 1e6
 
@@ -92,7 +92,7 @@ def only_where(
     up: (3,) unit vector, map frame.  references: the answers to ``where.words``. Raises MapError for a box outside of
     the map.
     """
-    there = _Space(occupancy, up)
+    there = SolidVoxels(occupancy, up)
     if where.within is not None:
         there.refuse_outside(where.within)
     conditions = _conditions(there, where, dict(zip(where.words, references, strict=True)))
@@ -112,7 +112,7 @@ def only_where(
 
 
 def _conditions(
-    there: _Space, where: Where, by_word: dict[str, QueryResult]
+    there: SolidVoxels, where: Where, by_word: dict[str, QueryResult]
 ) -> list[tuple[Callable[[Region], bool], str]]:
     """Returns, for each condition, a test of a region and the words for a note."""
     conditions: list[tuple[Callable[[Region], bool], str]] = []
@@ -151,7 +151,7 @@ def _picked(regions: list[Region], pick: str | None, up: NDArray[np.float64]) ->
     return [max(regions, key=values[pick])]
 
 
-class _Space:
+class SolidVoxels:
     """The occupied voxels as solid cubes."""
 
     def __init__(self, occupancy: Occupancy, up: NDArray[np.float64]):
@@ -183,23 +183,29 @@ class _Space:
 
     def on(self, region: Region, references: _References) -> bool:
         """Whether some voxel of the underside stands over a voxel of the references; see ``Where``."""
+        return bool(self.supported(region.rows, references.apart(references.shared(region))).any())
+
+    def supported(self, rows: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Returns, for each voxel of the underside of voxels, whether it stands over one of the others; see ``Where``.
+        rows: (n,) and others: (m,), rows of occupied voxels."""
         size = self.occupancy.voxel_size
-        mine, edges = self._level(region.rows)
+        mine, edges = self.level(rows)
         bottom = mine[:, 2] - edges / 2
-        under = bottom <= bottom.min() + _LOWEST * size
-        theirs, their_edges = self._level(references.apart(references.shared(region)))
+        under = bottom <= bottom.min(initial=np.inf) + _LOWEST * size
+        mine, edges = mine[under], edges[under]
+        theirs, their_edges = self.level(others)
+        stands = np.zeros(len(mine), bool)
         middle, half = sum(_ON_GAP) / 2 * size, (_ON_GAP[1] - _ON_GAP[0]) / 2 * size
-        for edge in np.unique(edges[under]):
+        for edge in np.unique(edges):
             for their_edge in np.unique(their_edges):
                 reach = (edge + their_edge) / 2
                 scale = 1.0, 1.0, reach / half  # makes one distance of all three conditions
-                above = (mine[under & (edges == edge)] - (0.0, 0.0, reach + middle)) * scale
+                above = (mine[edges == edge] - (0.0, 0.0, reach + middle)) * scale
                 below = theirs[their_edges == their_edge] * scale
                 below = below[((below > above.min(axis=0) - reach) & (below < above.max(axis=0) + reach)).all(axis=1)]
                 gaps = _tree(below).query(above, p=np.inf, distance_upper_bound=reach * _OVERLAP)[0]
-                if np.isfinite(gaps).any():
-                    return True
-        return False
+                stands[edges == edge] |= np.isfinite(gaps)
+        return stands
 
     @functools.cached_property
     def _every_level(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -207,7 +213,8 @@ class _Space:
         centers = self.occupancy.centers(self.voxels, self.edges)
         return centers @ self.R_level_map.T, np.asarray(self.edges * self.occupancy.finest, np.float64)
 
-    def _level(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def level(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns the (n, 3) centers and (n,) edges of voxels, meters, in a frame with z up."""
         centers, edges = self._every_level
         return centers[rows], edges[rows]
 
@@ -225,7 +232,7 @@ class _Space:
 class _References:
     """The regions of a word that a condition names."""
 
-    def __init__(self, there: _Space, regions: Sequence[Region]):
+    def __init__(self, there: SolidVoxels, regions: Sequence[Region]):
         self._regions = regions
         self._owner = np.full(len(there.voxels), -1, np.int64)
         for number, region in enumerate(regions):

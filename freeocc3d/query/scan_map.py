@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .best_views import RegionView
     from .conditions import Where
     from .objects.object import Object
+    from .objects.relations import Relation
     from .oriented_boxes import OrientedBox
     from .regions import Region
     from .word_query import Options, QueryResult
@@ -85,6 +86,12 @@ class Map(SavedMap):
     def labels(self) -> NDArray[np.uint8]:
         """Returns the (V,) class of each occupied voxel: 0 = nothing known, k = ``vocabulary[k - 1]``."""
         return self._class_labels
+
+    def relations_of(self, objects: Sequence[Object]) -> list[list[Relation]]:
+        """Returns how each of some objects stands to the others and to the walls; see ``query.objects.relations``."""
+        from .objects.relations import find_relations
+
+        return find_relations(self.occupancy, objects, self.T_gravity_map)
 
     def box_of(self, region: Region) -> OrientedBox:
         """Returns the oriented bounding box of a region: upright, with the least level area."""

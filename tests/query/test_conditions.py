@@ -8,7 +8,7 @@ from worded_voxels import SIZE, WORDS, box, feature, occupancy
 
 from freeocc3d.core.errors import ConfigError, FreeOccError, MapError
 from freeocc3d.core.types import BLOCK, OCCUPIED, Occupancy
-from freeocc3d.query.conditions import Where, _References, _Space, near_word, only_where
+from freeocc3d.query.conditions import SolidVoxels, Where, _References, near_word, only_where
 from freeocc3d.query.regions import Region
 from freeocc3d.query.word_query import Options, query
 
@@ -138,7 +138,7 @@ def gap(made: Occupancy, a: Region, b: Region) -> float:
 def test_gaps_are_those_of_all_pairs_in_a_map_of_two_sizes(seed: int) -> None:
     made, a, b = mixed(seed, apart=seed)
     a, b = (Region(1.0, 1.0, r.centroid, r.box_min, r.box_max, 1.0, r.rows[::3]) for r in (a, b))
-    true, space = gap(made, a, b), _Space(made, UP)
+    true, space = gap(made, a, b), SolidVoxels(made, UP)
     assert space.near(a, _References(space, [b]), true)
     if true > 0:
         assert not space.near(a, _References(space, [b]), true - 0.01 * SIZE)
@@ -157,7 +157,7 @@ def test_standing_on_is_that_of_all_pairs_in_a_map_of_two_sizes(seed: int) -> No
         for j in b.rows:
             over = (voxels[i] < voxels[j] + edges[j])[:2].all() and (voxels[j] < voxels[i] + edges[i])[:2].all()
             stands |= bool(over and -1 < voxels[i, 2] - voxels[j, 2] - edges[j] < 3)
-    space = _Space(made, UP)
+    space = SolidVoxels(made, UP)
     assert space.on(a, _References(space, [b])) == stands
 
 
