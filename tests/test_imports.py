@@ -41,7 +41,11 @@ FAST = (
 )
 """Rooms and modules that have to be imported in no time, for a query starts with them."""
 
-SLOW = {"storage.keyframes", "storage.work_folder", "storage.writer", "query.best_views", "query.standing_places"}
+SLOW = {
+    *("storage.keyframes", "storage.work_folder", "storage.writer", "query.best_views", "query.standing_places"),
+    *("query.objects.agglomeration", "query.objects.structure", "query.objects.surface_instances"),
+    "query.objects.surfels",
+}
 """Modules of fast rooms that a query does not start with."""
 
 

@@ -53,7 +53,7 @@ class Region:
 def best_regions(
     occupancy: Occupancy,
     rows: NDArray[np.int64],
-    component: NDArray[np.int32],
+    component: NDArray[np.integer],
     scores: NDArray[np.float32],
     confidence: NDArray[np.float32],
     min_voxels: int,

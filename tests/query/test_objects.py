@@ -1,5 +1,7 @@
 """Objects of a map: which voxels, names, places and keyframes they have."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import worded_voxels as cells
@@ -32,7 +34,7 @@ def test_objects_are_separate_things_with_names_and_places(saved) -> None:
         np.testing.assert_allclose(thing.centroid, centers[thing.rows].mean(axis=0))
         assert np.isclose(np.linalg.norm(thing.feature), 1)
         assert {view.frame for view in thing.keyframes} <= frames
-    assert all(a.confidence >= b.confidence for a, b in zip(objects, objects[1:], strict=False))
+    assert all(a.confidence >= b.confidence for a, b in pairwise(objects))
 
 
 def test_an_object_has_the_mean_feature_of_its_voxels_and_its_nearest_name() -> None:

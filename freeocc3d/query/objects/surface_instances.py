@@ -1,0 +1,79 @@
+"""Divides the surface of a map into things by its shape and colors, where no classes are known.
+
+Without floor, walls and ceiling, things meet each other and themselves in corners. A part of the surface without
+corners belongs to one thing. Two such parts are one thing if their colors are alike and the corner between them is
+blunt, such as between a sofa's seat and back; a chair at a table and a cup on it differ in color or meet it in a sharp
+corner.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...core.transforms import transform
+from ...storage.saved_map import SavedMap
+from .agglomeration import agglomerate
+from .structure import find_floor, find_structure
+from .surfels import Surfels, take_surfels
+
+_SMOOTH, _PART, _THING = 0.17, 0.3, 1.0
+"""Concavity that ends a smooth surface, a part of a thing, and a thing: corners that turn by 10 degrees (as in LCCP),
+17 and 60 degrees. Normals that are averaged over neighbors halve the concavity of a sharp corner."""
+_STEP = 0.35
+"""Spacings by which one surface may lie above another without a step: three standard deviations of the Gaussians."""
+_DIFFERENT = 10.0
+"""CIE76 difference of two colors, with half the lightness because of shading, that are of different things."""
+_LIGHTNESS = 0.5
+_LEAST_WEIGHT = -4.0  # one corner must not outweigh a long smooth seam
+
+
+def divide_surface(scan_map: SavedMap) -> NDArray[np.int64]:
+    """Returns the (V,) thing of each occupied voxel; -1 for those of floor, walls and ceiling."""
+    occupancy = scan_map.occupancy
+    if not len(scan_map.gaussians):
+        return np.full(len(occupancy.occupied_voxels()), -1)
+    surfels = take_surfels(scan_map)
+    floor = find_floor(surfels, occupancy.voxel_size)
+    smooth = _parts(surfels, ~floor, _SMOOTH)
+    structure = floor | find_structure(surfels, smooth, occupancy, scan_map.T_gravity_map)
+    thing = _merge_alike(surfels, _parts(surfels, ~structure, _PART))
+    centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
+    return _vote(surfels.points, thing, transform(scan_map.T_gravity_map, centers))
+
+
+def _parts(surfels: Surfels, chosen: NDArray[np.bool_], concavity: float) -> NDArray[np.int64]:
+    """Returns the (N,) part of each chosen surfel, -1 for others: surface without corners or steps."""
+    pairs = surfels.pairs[chosen[surfels.pairs].all(axis=1)]
+    steps = np.maximum(surfels.steps(pairs) - _STEP, 0)
+    weights = 1 - np.maximum(surfels.concavities(pairs), 0) / concavity - steps
+    part = agglomerate(len(surfels), pairs, np.maximum(weights, _LEAST_WEIGHT))
+    return np.where(chosen, part, -1)
+
+
+def _merge_alike(surfels: Surfels, part: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Returns the (N,) thing of each surfel: parts whose colors are alike and that meet in blunt corners."""
+    number, part = np.unique(part, return_inverse=True)
+    size = np.bincount(part)
+    lab = np.stack([np.bincount(part, values) for values in surfels.lab.T], axis=1) / size[:, None]
+    none = number[0] < 0
+    pairs = surfels.pairs[~(none & (part[surfels.pairs] == 0)).any(axis=1)]
+    a, b = part[pairs].T
+    between = a != b
+    pairs, a, b = pairs[between], a[between], b[between]
+    difference = np.linalg.norm((lab[a] - lab[b]) * (_LIGHTNESS, 1, 1), axis=1)
+    weights = 1 - np.maximum(surfels.concavities(pairs), 0) / _THING - difference / _DIFFERENT
+    thing = agglomerate(len(size), np.stack((a, b), axis=1), weights)[part]
+    return np.where(none & (part == 0), -1, thing)
+
+
+def _vote(points: NDArray[np.float64], thing: NDArray[np.int64], centers: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Returns the (V,) thing of each voxel: that of most surfels to which it is the nearest voxel; if there are none,
+    that of the nearest surfel."""
+    voxel = KDTree(centers).query(points)[1]
+    votes, count = np.unique(np.stack((voxel, thing), axis=1), axis=0, return_counts=True)
+    order = np.argsort(count, kind="stable")  # of each voxel the last, the most frequent, stays
+    found = thing[KDTree(points).query(centers)[1]]
+    found[votes[order, 0]] = votes[order, 1]
+    return found
