@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -21,12 +21,14 @@ from numpy.typing import NDArray
 from ..core.errors import FreeOccError, MapError
 from ..core.types import Occupancy
 from ..language import word_matching
+from ..language.encoders.color import ColorWords, encode_colors
 from ..language.feature_codec import Features, compute_cosines, mask_known
 from ..language.phrases import read_phrase
 from ..language.synonyms import make_key
 from ..occupancy.connected_components import label_components
 from ..settings.option_types import Cosine, PositiveInt, PositiveShare, Share
 from ..settings.typed_options import TypedOptions, nearest
+from .colored_things import choose_colored, read_colors, read_only_colors
 from .region_splitting import cut_necks
 from .regions import Region, best_regions
 
@@ -143,18 +145,53 @@ def query(
     candidates = says[:, None] & (every_score >= min(options.grow * threshold, threshold)) & understood
     best = _not_beaten(features, cosine, candidates, others, competes, text_encoder.temperature)
     results = []
+    classes = bool(text.meant) and len(occupancy.colors) > 0  # whose things have colors beside
     for w, (word, part) in enumerate(zip(words, text.understood, strict=True)):
+        if classes and not part and (colors := read_only_colors(asked[w])):
+            results.append(replace(_query_color(occupancy, colors, options, up), word=word))
+            continue
         scores = every_score[:, w]
         rows, confidence = best[w]
         if negative and len(rows):
             meant = compute_cosines(features[rows], text.features[w : w + 1])[:, 0]
             allowed = meant >= compute_cosines(features[rows], excluded.features).max(axis=1)
             rows, confidence = rows[allowed], confidence[allowed]
-        regions = find_regions(occupancy, rows, scores[rows], confidence, threshold, options, up, word)
         taken = text.meant[w] if text.meant else ()
+        colors = read_colors(asked[w], part) if classes and part else ""
+        wanted = options.changed(top_k=max(len(rows), 1)) if colors else options
+        regions = find_regions(occupancy, rows, scores[rows], confidence, threshold, wanted, up, word)
         note = _note(word, asked[w], part, taken, text_encoder, scores, threshold, bool(regions))
-        results.append(QueryResult(word, part, note, regions, np.ascontiguousarray(scores)))
+        result = QueryResult(word, part, note, regions, np.ascontiguousarray(scores))
+        results.append(_in_color(occupancy, result, colors, taken, options, up) if colors and regions else result)
     return results
+
+
+def _in_color(
+    occupancy: Occupancy,
+    result: QueryResult,
+    colors: str,
+    taken: tuple[str, ...],
+    options: Options,
+    up: Sequence[float] | NDArray[np.float64],
+) -> QueryResult:
+    """Leaves of the things of a class those that have colors, or what of them has. taken: the class names."""
+    regions, rows, confidence = choose_colored(occupancy, result.regions, colors)
+    if not regions:
+        found = find_regions(occupancy, rows, result.scores[rows], confidence, -1.0, options, up, result.word)
+        regions = [region for region in found if region.voxels >= options.min_voxels]
+    part = result.understood if colors in result.understood else f"{colors} {result.understood}"
+    note = "" if regions else f"'{result.understood}' is in this map, but not in {colors}."
+    if regions and make_key(part) not in (make_key(f"{colors} {name}") for name in taken):
+        note = f"'{result.word}' was understood as {', '.join(f'{colors} {name}' for name in taken)}."
+    return replace(result, understood=part, note=note, regions=regions[: options.top_k])
+
+
+def _query_color(
+    occupancy: Occupancy, word: str, options: Options, up: Sequence[float] | NDArray[np.float64]
+) -> QueryResult:
+    """Answers a word that only names colors, from the colors of the voxels."""
+    colored = occupancy.replace(features=encode_colors(occupancy.colors).astype(np.float16))
+    return query(colored, ColorWords(), [word], options.changed(threshold=None), up=up)[0]
 
 
 def find_regions(

@@ -275,6 +275,12 @@ def parse_colors(phrase: str) -> dict[str, Meaning | str]:
     return meanings
 
 
+def encode_colors(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(..., 3) sRGB to (..., D) features, without a correction of colors."""
+    bins = _channel_bins(None)
+    return np.sqrt(_table()[bins[0][rgb[..., 0]] + bins[1][rgb[..., 1]] + bins[2][rgb[..., 2]]])
+
+
 def base_color(token: str) -> str:
     """The color name that a lower-case token is a form of ("reddish", "greys", "redcolored"), or an empty string."""
     for ending in ("", "s", "coloured", "colored"):
