@@ -17,7 +17,7 @@ QUICK  := tests/test_imports.py tests/core tests/settings tests/capture tests/oc
 
 .PHONY: help demo quick test lint fuzz docs wheel-test benchmark mutants setup system clean
 
-demo: setup  ## map the built-in room, ask three words, write pictures to demo/
+demo: setup  ## map the built-in room, ask it by words, write pictures to demo/
 	$(BIN)/freeocc3d demo -o demo --overwrite
 
 help:  ## list the targets

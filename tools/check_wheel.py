@@ -20,7 +20,7 @@ from pathlib import Path
 REPOSITORY = Path(__file__).resolve().parents[1]
 SOURCES = ("freeocc3d", "configs", "setup.cfg", "pyproject.toml", "tools/build_backend.py", "README.md", "LICENSE")
 FRAMES = 12
-PICTURES = ("map.png", "query_red_cup.png", "query_blue_chair.png", "query_green_plant.png")
+PICTURES = ("map.png", "query_red_cup.png", "query_blue_chair.png", "query_something_to_sit_on.png")
 
 
 def build_wheel(folder: Path) -> Path:

@@ -1,4 +1,4 @@
-"""``freeocc3d demo``: maps the built-in room, asks three words, and draws pictures."""
+"""``freeocc3d demo``: maps the built-in room, asks some words, and draws pictures."""
 
 from __future__ import annotations
 
@@ -11,8 +11,17 @@ from .console import ConsoleProgress, Overwrite
 from .map_summary import summary_text
 from .query_answers import answers_text
 
-WORDS = "red cup", "blue chair", "green plant"
-"""The words that the demo asks."""
+WORDS = "red cup", "blue chair", "something to sit on", "bathtub"
+"""The words that the demo asks: the last one names nothing in the room."""
+
+STAND_IN = """\
+No network has seen this room. Class images, drawn with it, stand in for one, as if its encoder knew 22 words and never
+erred. Colors are those of the voxels."""
+
+REAL = """\
+A real encoder finds whatever is named in any scan, less surely than here, and needs no class images:
+  freeocc3d models pull words
+  freeocc3d relabel {} -o {} --words words"""
 
 
 def demo(
@@ -30,20 +39,23 @@ def demo(
     ] = 240,
     overwrite: Overwrite = False,
 ) -> None:
-    """Map the built-in room, ask three words, and draw pictures."""
+    """Map the built-in room, ask some words, and draw pictures."""
     from ..pipeline import run
     from ..settings import config
     from ..viewer import map_pictures
 
-    settings = config.load(None, [f"capture.synthetic.frames={frames}", "language.encoder=color"])
+    settings = config.load(None, [f"capture.synthetic.frames={frames}", "language.encoder=labels"])
     with ConsoleProgress() as progress:
         made = run.reconstruct("builtin:room", output / "map", settings, overwrite=overwrite, progress=progress)
     print(summary_text(made))
     written = [output / "map.png"]
     map_pictures.write_map_picture(made, written[0], overwrite=overwrite)
-    results = made.query_words(list(WORDS), top_k=5)
+    results = made.query_words(list(WORDS), top_k=4)
+    print(f"\n{STAND_IN}\n")
     print(answers_text(results))
     for result in results:
-        written.append(output / f"query_{result.word.replace(' ', '_')}.png")
-        map_pictures.write_query_picture(made, [result], written[-1], overwrite)
+        if result.matched:
+            written.append(output / f"query_{result.word.replace(' ', '_')}.png")
+            map_pictures.write_query_picture(made, [result], written[-1], overwrite)
+    print(f"\n{REAL.format(output / 'map', output / 'map-with-words')}")
     print("pictures: " + ", ".join(str(path) for path in written))

@@ -130,7 +130,7 @@ def test_the_demo_thins_the_walk_answers_its_words_and_compiles_nothing_that_was
     assert "blue chair: " in done.stdout
     assert "blue chair: no match" not in done.stdout
     assert {path.name for path in out.iterdir()} == {
-        "map", "map.png", "query_red_cup.png", "query_blue_chair.png", "query_green_plant.png"
+        "map", "map.png", "query_red_cup.png", "query_blue_chair.png", "query_something_to_sit_on.png"
     }  # fmt: skip
     assert "2" in run("demo", "-o", out, "--frames", 1, code=2).stderr
 
