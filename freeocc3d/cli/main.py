@@ -23,6 +23,7 @@ from .ground_truth_command import ground_truth
 from .info import info
 from .inspect import inspect
 from .list import list_backends
+from .objects import objects
 from .query import query
 from .reconstruct import reconstruct
 from .refine import refine
@@ -72,6 +73,7 @@ for _command in (
     inspect,
     reconstruct,
     query,
+    objects,
     view,
     info,
     check,

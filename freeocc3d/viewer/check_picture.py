@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,7 +15,8 @@ from ..core.transforms import invert, transform
 from ..core.voxel_keys import pack_voxels
 from ..query.scan_map import Map
 from ..tracking.view_agreement import Agreement, ComparedView, PairAgreement, compare_views
-from .scene_rendering import BACKGROUND, choose_cut_height, turn_lengthwise
+from .floor_plans import FloorPlan
+from .scene_rendering import BACKGROUND
 
 SIZE = 1600, 960
 """Width and height of the picture, pixels."""
@@ -107,25 +107,10 @@ def _draw_plan(
     found = _look_up(cells, off, centers, edge)
     colors[np.isfinite(found)] = _colors(found[np.isfinite(found)], top)
 
-    R = turn_lengthwise(scan_map.T_gravity_map[:3, :3], centers)
-    turned, way = centers @ R.T, trajectory.T_world_cam[trajectory.has_pose][:, :3, 3] @ R.T
-    low, high = turned[:, :2].min(axis=0), turned[:, :2].max(axis=0)
-    room = np.array((_PLAN - 2 * _MARGIN, SIZE[1] - _BAR - _LEGEND - 2 * _MARGIN))
-    scale = float((room / np.maximum(high - low + edge, 1e-9)).min())
-
-    def pixel(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        middle = np.array((_PLAN / 2, _BAR + (SIZE[1] - _BAR - _LEGEND) / 2))
-        return np.asarray(middle + (points[:, :2] - 0.5 * (low + high)) * (scale, -scale))
-
-    drawn = np.flatnonzero(turned[:, 2] <= choose_cut_height(turned[:, 2], occupancy.voxel_size))
-    drawn = drawn[np.argsort(turned[drawn, 2], kind="stable")]
-    size = max(1, math.ceil(scale * occupancy.finest))
-    u, v = np.rint(pixel(turned[drawn]) - 0.5 * size).astype(np.int64).T
-    inside = (u >= 0) & (v >= _BAR) & (u <= _PLAN - size) & (v <= SIZE[1] - _LEGEND - size)
-    for dv in range(size):
-        for du in range(size):
-            picture[v[inside] + dv, u[inside] + du] = colors[drawn[inside]]
-    cv2.polylines(picture, [np.rint(8 * pixel(way)).astype(np.int32)], False, _PATH, 1, cv2.LINE_AA, shift=3)
+    plan = FloorPlan(scan_map, (0, _BAR, _PLAN, SIZE[1] - _LEGEND), _MARGIN)
+    plan.draw_voxels(picture, plan.drawn, colors[plan.drawn])
+    way = plan.pixel(trajectory.T_world_cam[trajectory.has_pose][:, :3, 3])
+    cv2.polylines(picture, [np.rint(8 * way).astype(np.int32)], False, _PATH, 1, cv2.LINE_AA, shift=3)
 
 
 def _draw_pair(

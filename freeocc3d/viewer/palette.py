@@ -41,6 +41,15 @@ def highlight_regions(colors: NDArray[np.uint8], words: list[list[Region]]) -> N
     return out
 
 
+def color_by_number(count: int) -> NDArray[np.uint8]:
+    """Returns (count, 3) RGB: one color for each number from 0. Neighbors differ: hues turn by the golden ratio, which
+    divides the circle most evenly, whatever the count, and every other color is darker."""
+    number = np.arange(count)
+    hue = 6 * (number * (5**0.5 - 1) / 2 % 1)
+    ramp = np.clip(np.abs((hue[:, None] + (3.0, 5.0, 1.0)) % 6 - 3) - 1, 0, 1)  # of red, green and blue
+    return np.asarray(np.where(number % 2, 175, 235)[:, None] * (0.25 + 0.75 * ramp), np.float64).astype(np.uint8)
+
+
 def color_by_height(occupancy: Occupancy, up: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Returns the (V, 3) color of each occupied voxel by its height along ``up``, from dark blue to yellow."""
     height = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges()) @ up

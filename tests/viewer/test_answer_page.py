@@ -18,6 +18,7 @@ from freeocc3d.query.best_views import RegionView
 from freeocc3d.query.scan_map import Map
 from freeocc3d.storage.manifest import MapScale
 from freeocc3d.viewer import answer_page
+from freeocc3d.viewer.self_contained_pages import crop_view
 
 
 @pytest.fixture(scope="module")
@@ -92,14 +93,14 @@ def test_the_page_shows_regions_map_and_crops(room: Map, tmp_path: Path, monkeyp
 def test_a_crop_holds_the_box_in_the_words_color() -> None:
     image = np.full((120, 160, 3), 90, np.uint8)
     image[40:60, 50:90] = 255
-    crop = decoded(answer_page._crop(image, RegionView(0, (50, 40, 89, 59), 1.0), (255, 60, 30)))
+    crop = decoded(crop_view(image, RegionView(0, (50, 40, 89, 59), 1.0), (255, 60, 30)))
     red = (crop[..., 0] > 200) & (crop[..., 1] < 130)
     white = crop.min(axis=-1) > 200
     rows, columns = np.nonzero(red)
     assert rows.min() < np.nonzero(white)[0].min()
     assert columns.max() > np.nonzero(white)[1].max()
     assert white.mean() > 0.2
-    edge = decoded(answer_page._crop(image, RegionView(0, (0, 0, 159, 119), 1.0), (255, 60, 30)))
+    edge = decoded(crop_view(image, RegionView(0, (0, 0, 159, 119), 1.0), (255, 60, 30)))
     assert edge.shape == (240, 320, 3)
 
 

@@ -1,0 +1,115 @@
+"""Draws the objects of a map from above, each in a color of its own, with its number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.atomic_files import write_whole
+from ..core.errors import ExportError
+from ..core.transforms import transform
+from ..query.objects.object import Object
+from ..query.scan_map import Map
+from .floor_plans import FloorPlan
+from .palette import color_by_number
+from .scene_rendering import BACKGROUND
+
+SIZE = 1600, 960
+"""Width and height of the picture, pixels."""
+
+_PLAN, _BAR, _MARGIN, _ROW = 1180, 56, 30, 22  # width of the plan; the heading; around the plan; lines of the list
+_TEXT = (40, 40, 40)
+_FLOOR, _WALL = 236, 170  # gray of the lowest and the highest voxels of no object
+_LABEL, _NUMBER = (255, 255, 255), 0.5  # color behind a number, and its scale
+_CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
+_LONGEST_NAME = 22
+_AROUND = ((0, 0), (0, -1), (0, 1), (1, 0), (-1, 0), (1, -1), (-1, 1), (1, 1), (-1, -1), (0, -2), (0, 2), (2, 0))
+"""Places of a number that others leave no room at its object's middle, in sizes of the number."""
+
+
+def write_objects_picture(
+    scan_map: Map, objects: Sequence[Object], shown: Sequence[int], path: Path, overwrite: bool = False
+) -> None:
+    """Writes a PNG. shown: rows of the objects to draw. Raises ExportError: an empty map, another ending than .png, or
+    an unwritable target."""
+    if path.suffix.lower() != ".png":
+        raise ExportError(f"Pictures are written as PNG: use the name {path.with_suffix('.png')} in place of {path}.")
+    png = draw_objects(scan_map, objects, shown)
+
+    def write(target: Path) -> None:
+        target.write_bytes(png)
+
+    write_whole(path, write, overwrite)
+
+
+def draw_objects(scan_map: Map, objects: Sequence[Object], shown: Sequence[int]) -> bytes:
+    """Returns the PNG that ``write_objects_picture`` writes: a plan, and a list of numbers, names and sizes."""
+    if not len(scan_map.occupancy.colors):
+        raise ExportError(f"The map {scan_map.path} has no occupied voxels to draw.")
+    picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
+    colors = color_by_number(len(objects))
+    _draw_plan(picture, scan_map, objects, shown, colors)
+    name = Path(scan_map.manifest.capture.path).name
+    count = f"{len(shown)} of {len(objects)}" if len(shown) < len(objects) else str(len(objects))
+    _put(picture, f"{name}: {count} objects from above", (16, 36), 0.62)
+    room = (SIZE[1] - _BAR - _MARGIN) // _ROW
+    listed = shown if len(shown) <= room else shown[: room - 1]
+    for line, row in enumerate(listed):
+        thing, y = objects[row], _BAR + 14 + line * _ROW
+        cv2.rectangle(picture, (_PLAN, y - 12), (_PLAN + 14, y + 2), colors[row].tolist(), -1)
+        name = thing.name if len(thing.name) <= _LONGEST_NAME else thing.name[: _LONGEST_NAME - 3] + "..."
+        size = " x ".join(f"{edge:.2f}" for edge in thing.box.extent)
+        _put(picture, f"{row + 1} {name}, {size}{' m' if scan_map.metric else ''}", (_PLAN + 22, y), 0.45)
+    if len(listed) < len(shown):
+        _put(picture, f"and {len(shown) - len(listed)} more", (_PLAN + 22, _BAR + 14 + len(listed) * _ROW), 0.45)
+    return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
+
+
+def _draw_plan(
+    picture: NDArray[np.uint8],
+    scan_map: Map,
+    objects: Sequence[Object],
+    shown: Sequence[int],
+    colors: NDArray[np.uint8],
+) -> None:
+    """Draws the room pale, and the objects above it, the highest on top; things near the ceiling only as outlines."""
+    plan = FloorPlan(scan_map, (0, _BAR, _PLAN - _MARGIN, SIZE[1]), _MARGIN)
+    height = plan.heights
+    level = (height - height.min()) / max(float(np.ptp(height)), 1e-9)
+    pale = np.repeat((_FLOOR + (_WALL - _FLOOR) * level)[:, None], 3, axis=1).astype(np.uint8)
+    plan.draw_voxels(picture, plan.drawn, pale[plan.drawn])
+    below = np.zeros(len(height), bool)
+    below[plan.drawn] = True
+    tops = [float((thing.box.T_map_box[:3, 3] @ scan_map.up) + thing.box.extent[2] / 2) for thing in objects]
+    order = sorted(shown, key=tops.__getitem__)
+    for row in order:
+        rows = objects[row].rows
+        if below[rows].mean() > 0.5:
+            shade = 0.75 * colors[row] + 0.25 * scan_map.occupancy.colors[rows]
+            plan.draw_voxels(picture, rows, shade.astype(np.uint8))
+    for row in order:
+        box = objects[row].box
+        corners = np.column_stack((_CORNERS * box.extent[:2], np.zeros(4)))
+        outline = np.rint(8 * plan.pixel(transform(box.T_map_box, corners))).astype(np.int32)
+        dark = (0.6 * colors[row]).tolist()
+        cv2.polylines(picture, [outline], True, dark, 2, cv2.LINE_AA, shift=3)
+    taken: list[NDArray[np.float64]] = []
+    for row in sorted(shown, key=lambda row: -len(objects[row].rows)):
+        place = plan.pixel(objects[row].centroid[None])[0]
+        (width, height), _ = cv2.getTextSize(str(row + 1), cv2.FONT_HERSHEY_SIMPLEX, _NUMBER, 1)
+        size = np.array((width + 8, height + 8))
+        free = [place + size * step for step in _AROUND]
+        at = next((one for one in free if all((abs(one - other) >= size).any() for other in taken)), place)
+        taken.append(at)
+        low, high = np.rint(at - size / 2).astype(int), np.rint(at + size / 2).astype(int)
+        cv2.rectangle(picture, low.tolist(), (high - 1).tolist(), _LABEL, -1)
+        _put(picture, str(row + 1), (int(low[0]) + 4, int(high[1]) - 5), _NUMBER)
+
+
+def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: float) -> None:
+    printable = text.encode("ascii", "replace").decode()
+    cv2.putText(picture, printable, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _TEXT, 1, cv2.LINE_AA)
