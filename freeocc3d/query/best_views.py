@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,17 @@ from numpy.typing import NDArray
 from ..core.transforms import invert, project, transform
 from ..core.types import Occupancy, Trajectory
 from ..storage.keyframes import Keyframes
-from .regions import Region
 
 MOST = 3
 """Most keyframes to return for a region."""
+
+
+class VoxelSet(Protocol):
+    """A region or an object."""
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """(n,) rows of ``Occupancy.occupied_voxels()``."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +39,7 @@ class RegionView:
 
 
 def best_views(
-    occupancy: Occupancy, trajectory: Trajectory, keyframes: Keyframes, regions: Sequence[Region], most: int = MOST
+    occupancy: Occupancy, trajectory: Trajectory, keyframes: Keyframes, regions: Sequence[VoxelSet], most: int = MOST
 ) -> list[list[RegionView]]:
     """Returns, for each region, up to ``most`` keyframes that show a part of it. Keyframes that show more voxels come
     first, with counts rounded to a tenth of the best count; of equal ones, the larger box in its image comes first.
