@@ -22,24 +22,34 @@ def agglomerate(count: int, edges: NDArray[np.int64], weights: NDArray[np.float6
 
     edges: (E, 2) nodes; an edge that occurs several times counts as often.  weights: (E,), positive to join.
     """
-    part = np.arange(count, dtype=np.int64)
     total = weights + np.random.default_rng(0).uniform(0, _TIE, len(weights))
     number = np.ones(len(edges))
-    pairs, parts = edges.astype(np.int64), count
+    pairs, member = edges.astype(np.int64), np.arange(count)  # member: a node of each part that still has edges
+    merges = [np.zeros((0, 2), np.int64)]
     while True:
         kept = pairs[:, 0] != pairs[:, 1]
-        low, high = pairs[kept].min(axis=1, initial=parts), pairs[kept].max(axis=1, initial=0)
-        keys, which = np.unique(low * parts + high, return_inverse=True)
+        active, pairs = np.unique(pairs[kept], return_inverse=True)
+        member, pairs = member[active], pairs.reshape(-1, 2)
+        keys, which = np.unique(pairs.min(axis=1) * len(active) + pairs.max(axis=1), return_inverse=True)
         total = np.asarray(np.bincount(which, total[kept]), np.float64)
         number = np.asarray(np.bincount(which, number[kept]), np.float64)
-        pairs = np.stack((keys // parts, keys % parts), axis=1)
+        pairs = np.stack((keys // max(len(active), 1), keys % max(len(active), 1)), axis=1)
         mean = total / number
-        best = np.zeros(parts)
+        best = np.zeros(len(active))
         np.maximum.at(best, pairs[:, 0], mean)
         np.maximum.at(best, pairs[:, 1], mean)
         joined = (mean > 0) & (mean[:, None] == best[pairs]).all(axis=1)
         if not joined.any():
-            return part
-        graph = coo_array((joined[joined], tuple(pairs[joined].T)), shape=(parts, parts))
-        parts, merged = connected_components(graph, directed=False)
-        part, pairs = merged[part].astype(np.int64), merged[pairs].astype(np.int64)
+            return _connect(count, np.concatenate(merges))[1]
+        merges.append(member[pairs[joined]])
+        parts, merged = _connect(len(active), pairs[joined])
+        pairs, members = merged[pairs], np.empty(parts, np.int64)
+        members[merged] = member
+        member = members
+
+
+def _connect(count: int, pairs: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
+    """Returns the number of connected components, and the (count,) component of each node."""
+    graph = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(count, count))
+    parts, part = connected_components(graph, directed=False)
+    return int(parts), part.astype(np.int64)

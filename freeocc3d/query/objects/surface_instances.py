@@ -37,7 +37,8 @@ def divide_surface(scan_map: SavedMap) -> NDArray[np.int64]:
     surfels = take_surfels(scan_map)
     floor = find_floor(surfels, occupancy.voxel_size)
     smooth = _parts(surfels, ~floor, _SMOOTH)
-    structure = floor | find_structure(surfels, smooth, occupancy, scan_map.T_gravity_map)
+    bounds = find_structure(surfels, smooth, occupancy, scan_map.T_gravity_map) & ~floor
+    structure = floor | (bounds & ~_differs(surfels, np.where(bounds, smooth, -1)))
     thing = _merge_alike(surfels, _parts(surfels, ~structure, _PART))
     centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
     return _vote(surfels.points, thing, transform(scan_map.T_gravity_map, centers))
@@ -52,18 +53,39 @@ def _parts(surfels: Surfels, chosen: NDArray[np.bool_], concavity: float) -> NDA
     return np.where(chosen, part, -1)
 
 
+def _differs(surfels: Surfels, wall: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Returns the (N,) surfels that differ in color from their wall: pictures, doors and windows that are flush with
+    it. wall: (N,) number of each surfel's wall, -1 for none. A wall has the median color of its surfels.
+    """
+    _, which = np.unique(wall, return_inverse=True)
+    order = np.argsort(which, kind="stable")
+    of_wall = np.split(order, np.cumsum(np.bincount(which))[:-1])
+    usual = np.stack([np.median(surfels.lab[rows], axis=0) for rows in of_wall])
+    return np.asarray((wall >= 0) & (_difference(surfels.lab, usual[which]) > _DIFFERENT))
+
+
+def _mean_colors(surfels: Surfels, part: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Returns the number of surfels of each part, and its (P, 3) mean color."""
+    size = np.bincount(part)
+    return size, np.stack([np.bincount(part, values) for values in surfels.lab.T], axis=1) / size[:, None]
+
+
+def _difference(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the (N,) differences of (N, 3) CIELAB colors, with less weight of the lightness."""
+    return np.asarray(np.linalg.norm((a - b) * (_LIGHTNESS, 1, 1), axis=1))
+
+
 def _merge_alike(surfels: Surfels, part: NDArray[np.int64]) -> NDArray[np.int64]:
     """Returns the (N,) thing of each surfel: parts whose colors are alike and that meet in blunt corners."""
     number, part = np.unique(part, return_inverse=True)
-    size = np.bincount(part)
-    lab = np.stack([np.bincount(part, values) for values in surfels.lab.T], axis=1) / size[:, None]
+    size, lab = _mean_colors(surfels, part)
     none = number[0] < 0
     pairs = surfels.pairs[~(none & (part[surfels.pairs] == 0)).any(axis=1)]
     a, b = part[pairs].T
     between = a != b
     pairs, a, b = pairs[between], a[between], b[between]
-    difference = np.linalg.norm((lab[a] - lab[b]) * (_LIGHTNESS, 1, 1), axis=1)
-    weights = 1 - np.maximum(surfels.concavities(pairs), 0) / _THING - difference / _DIFFERENT
+    corners = np.maximum(surfels.concavities(pairs), 0)
+    weights = 1 - corners / _THING - _difference(lab[a], lab[b]) / _DIFFERENT
     thing = agglomerate(len(size), np.stack((a, b), axis=1), weights)[part]
     return np.where(none & (part == 0), -1, thing)
 
