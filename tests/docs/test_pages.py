@@ -40,11 +40,14 @@ def test_links_of_the_top_lead_somewhere(page: Path) -> None:
     assert not [link for link in links if not (ROOT / link).exists()]
 
 
-@pytest.mark.parametrize("module", ["map_summary", "check", "query_answers", "region_details", "scores"])
+JSON = ["cli/map_summary", "cli/check", "cli/query_answers", "cli/region_details", "cli/scores", "cli/objects"]
+
+
+@pytest.mark.parametrize("module", [*JSON, "query/objects/description"])
 def test_every_key_of_json_is_explained(module: str) -> None:
     """Keys of the dictionaries in functions whose names end in document, or that details are made by."""
     page = (ROOT / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
-    tree = ast.parse((ROOT / "freeocc3d" / "cli" / f"{module}.py").read_text(encoding="utf-8"))
+    tree = ast.parse((ROOT / "freeocc3d" / f"{module}.py").read_text(encoding="utf-8"))
     keys = {
         key.value
         for function in tree.body
