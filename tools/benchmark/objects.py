@@ -18,12 +18,13 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .figures import Figures
+from .figures import Figures, tabulate
 
 LEAST = 60
 ENOUGH = 0.5
@@ -35,6 +36,12 @@ WAYS = {
     "colors, own poses": {"language": {"encoder": "color"}},
     "colors, given poses": {"language": {"encoder": "color"}, "tracking": {"backend": "known"}},
 }
+COUNTS: dict[str, tuple[tuple[str, ...], bool]] = {
+    "things": (STUFF, True),
+    "all_classes": ((), True),
+    "whole": (STUFF, False),
+}
+"""What counts: classes that are left out, and whether only voxels that truth and map hold occupied count."""
 
 
 def measure_objects(capture: str) -> Figures:
@@ -60,8 +67,8 @@ def score_objects(scan_map: Any, truth_path: Path) -> Figures:
     seconds = time.perf_counter() - start
     occupied, instance = _on_lattice(scan_map, truth, objects)
     figures: Figures = {"seconds": seconds, "objects": len(objects)}
-    for name, stuff, alone in (("things", STUFF, True), ("all_classes", (), True), ("whole", STUFF, False)):
-        figures[name] = _score(truth, occupied, instance, stuff, alone)
+    for name, (stuff, alone) in COUNTS.items():
+        figures[name] = count_found(truth, occupied, instance, stuff, alone)
     return figures
 
 
@@ -86,7 +93,8 @@ def _on_lattice(scan_map: Any, truth: Any, objects: Any) -> tuple[Any, Any]:
     return occupied, instance
 
 
-def _score(truth: Any, occupied: Any, instance: Any, stuff: tuple[str, ...], alone: bool) -> Figures:
+def count_found(truth: Any, occupied: Any, instance: Any, stuff: tuple[str, ...], alone: bool) -> Figures:
+    """Recall, precision and mistakes. occupied, instance: (X, Y, Z) of the map.  stuff, alone: see COUNTS."""
     known = truth.labels != 255
     thing, names = _things(truth, stuff)
     counted = known & occupied & (truth.labels > 0) if alone else known
@@ -137,3 +145,28 @@ def _things(truth: Any, stuff: tuple[str, ...]) -> tuple[Any, list[str]]:
             thing[component > 0] = component[component > 0] - 1 + len(names)
             names += [f"{name} of {n}" for n in np.bincount(component.ravel(), minlength=count + 1)[1:]]
     return thing, names
+
+
+def tabulate_objects(rows: Sequence[Figures]) -> list[str]:
+    """A table of all captures."""
+    return tabulate(
+        ("capture", "map", "things", "recall", "precision", "mean IoU", "with stuff", "with its occupancy", "seconds"),
+        [
+            (
+                row["capture"],
+                name,
+                str(found["things"]["things"]),
+                f"{found['things']['recall']:.2f}",
+                f"{found['things']['precision']:.2f}",
+                f"{found['things']['mean_iou']:.2f}",
+                *(
+                    f"{found[count]['recall']:.2f} / {found[count]['precision']:.2f}"
+                    for count in ("all_classes", "whole")
+                ),
+                f"{found['seconds']:.1f}",
+            )
+            for row in rows
+            for name, found in row.items()
+            if name in WAYS
+        ],
+    )

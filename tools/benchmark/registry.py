@@ -96,6 +96,12 @@ MEASUREMENTS = {
         "present_words:measure_present_words",
         table="present_words:tabulate_present_words",
     ),
+    "objects": Measurement(
+        "things found with class images and by shape and color, at own and at given poses: recall, precision, seconds",
+        "capture",
+        "objects:measure_objects",
+        table="objects:tabulate_objects",
+    ),
     "exports": Measurement(
         "every exporter at 4 cm: seconds, memory, bytes; the plan for robots against the truth's",
         "capture",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...core.transforms import transform
+from ...core.types import Occupancy
 from ...storage.saved_map import SavedMap
 from .agglomeration import agglomerate
 from .structure import find_floor, find_structure
@@ -35,16 +36,24 @@ def divide_surface(scan_map: SavedMap) -> NDArray[np.int64]:
     if not len(scan_map.gaussians):
         return np.full(len(occupancy.occupied_voxels()), -1)
     surfels = take_surfels(scan_map)
-    floor = find_floor(surfels, occupancy.voxel_size)
-    smooth = _parts(surfels, ~floor, _SMOOTH)
-    bounds = find_structure(surfels, smooth, occupancy, scan_map.T_gravity_map) & ~floor
-    structure = floor | (bounds & ~_differs(surfels, np.where(bounds, smooth, -1)))
-    thing = _merge_alike(surfels, _parts(surfels, ~structure, _PART))
+    thing = divide_surfels(surfels, occupancy, scan_map.T_gravity_map)
     centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
     return _vote(surfels.points, thing, transform(scan_map.T_gravity_map, centers))
 
 
-def _parts(surfels: Surfels, chosen: NDArray[np.bool_], concavity: float) -> NDArray[np.int64]:
+def divide_surfels(surfels: Surfels, occupancy: Occupancy, T_gravity_map: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Returns the (N,) thing of each surfel; -1 for those of floor, walls and ceiling.
+
+    T_gravity_map: (4, 4) from the frame of the occupancy to that of the surfels.
+    """
+    floor = find_floor(surfels, occupancy.voxel_size)
+    smooth = find_parts(surfels, ~floor, _SMOOTH)
+    bounds = find_structure(surfels, smooth, occupancy, T_gravity_map) & ~floor
+    structure = floor | (bounds & ~_differs(surfels, np.where(bounds, smooth, -1)))
+    return _merge_alike(surfels, find_parts(surfels, ~structure, _PART))
+
+
+def find_parts(surfels: Surfels, chosen: NDArray[np.bool_], concavity: float) -> NDArray[np.int64]:
     """Returns the (N,) part of each chosen surfel, -1 for others: surface without corners or steps."""
     pairs = surfels.pairs[chosen[surfels.pairs].all(axis=1)]
     steps = np.maximum(surfels.steps(pairs) - _STEP, 0)

@@ -69,11 +69,15 @@ def take_surfels(scan_map: SavedMap) -> Surfels:
     cameras = scan_map.trajectory.T_world_keyframe[gaussians.anchor_keyframe, :3, 3]
     toward = ((cameras - gaussians.means) * normals).sum(axis=1)
     normals = (normals * np.where(toward < 0, -1.0, 1.0)[:, None]) @ T_gravity_map[:3, :3].T
+    return join_neighbors(points, normals, rgb_to_lab(gaussians.colors.astype(np.float64)))
+
+
+def join_neighbors(points: NDArray[np.float64], normals: NDArray[np.float64], lab: NDArray[np.float64]) -> Surfels:
+    """Makes surfels of (N, 3) centers, unit normals and CIELAB colors: finds the neighbors and averages the normals."""
     tree = KDTree(points)
     count = min(_NEIGHBORS + 1, len(points))
     spacing = float(np.median(tree.query(points, k=[count])[0])) / np.sqrt(2.0) if count > 1 else 1.0
     pairs = tree.query_pairs(_REACH * spacing, output_type="ndarray").astype(np.int64)
-    lab = rgb_to_lab(gaussians.colors.astype(np.float64))
     return Surfels(points, _averaged(normals, pairs), lab, pairs, spacing)
 
 
