@@ -6,8 +6,8 @@ from __future__ import annotations
 import functools
 import re
 
-from .purposes import find_purpose
-from .synonyms import find_narrower, find_synonyms, find_wider, make_key, normalize_phrase
+from .purposes import find_purpose, find_uses
+from .synonyms import INCLUDES, find_narrower, find_synonyms, find_whole, find_wider, make_key, normalize_phrase
 from .typing_mistakes import correct_words
 
 _PREPOSITIONS = {
@@ -23,6 +23,15 @@ _AMOUNTS = re.compile(
     r"^(?:.*\s)?(?:pair|pile|stack|set|row|bunch|group|lot|number|couple|piece|kind|type|sort|heap|collection)s?\s+of\s+",
     re.I,
 )
+_COMPLEMENTS = {"of", "in", "for", "from"}
+"""Prepositions whose nouns say which thing is meant: "cupboards in the kitchen"."""
+_EMPTY = {"unit", "set", "system", "device", "machine", "item", "piece", "area"}
+"""Last words of phrases that say nothing of the thing: "sofa set", "air conditioning unit"."""
+_HOLDERS = {
+    "rack", "box", "stand", "cabinet", "cupboard", "closet", "unit", "holder", "shelf", "shelve", "case", "bench",
+    "table",
+}  # fmt: skip
+"""Furniture that is called by what it holds: a "spice rack" may be called a spice box, and is no shoe rack."""
 _LONGEST_PHRASE = 16
 _OTHER_THINGS = {
     "traffic light", "stop light", "water table", "multiplication table", "truck bed", "flower bed", "river bed",
@@ -57,8 +66,13 @@ def match_exactly(phrase: str, names: list[str]) -> tuple[list[int], str]:
     parts = split_phrase(phrase)
     if any(make_key(other) == make_key(part) for part in parts for other in _OTHER_THINGS):
         return known.named(frozenset((parts[0],))), parts[0]
+    head, complement = _head_and_complement(phrase)
     for part in parts:
-        if rows := known.find(part):
+        said = [*head[: len(head) - len(part.split())], *complement]
+        rows = known.find(part)
+        if said and part in _HOLDERS and part == head[-1]:
+            rows = known.find_holders(said) or known.without_holders_of_others(rows, said)
+        if rows := known.narrow(rows, said):
             return rows, part
     return [], ""
 
@@ -69,12 +83,39 @@ class _Names:
     def __init__(self, names: list[str]):
         self._keys = [make_key(name) for name in names]
         self._kinds = [_tail_keys(name) for name in names]
+        self._named = [normalize_phrase(name).split() for name in names]
+        self._words = [frozenset(map(make_key, words[:-1])) for words in self._named]
 
     def find(self, part: str) -> list[int]:
-        """Rows of the names that a word means: its own, those of its synonyms, or of a wider word."""
+        """Rows of the names that a word means: its own, those of its synonyms, of a wider word, or of a whole."""
         same = find_synonyms(part)
         wider = frozenset(wide for word in same for wide in find_wider(word))
-        return self.named(frozenset((part,))) or self.named(same) or self._exactly(wider)
+        whole = frozenset(thing for word in same for thing in find_whole(word))
+        return self.named(frozenset((part,))) or self.named(same) or self._exactly(wider) or self.named(whole)
+
+    def narrow(self, rows: list[int], said: list[str]) -> list[int]:
+        """Of several rows, those whose names hold what else a phrase says of the thing, or that are used for it; all
+        rows if there are none."""
+        if len(rows) < 2 or not said:
+            return rows
+        keys, used = _keys_of(said), self.named(frozenset(thing for word in said for thing in find_uses(word)))
+        return [row for row in rows if row in used or keys & self._words[row]] or rows
+
+    def find_holders(self, said: list[str]) -> list[int]:
+        """Rows of furniture that is named after what a phrase says, or that is used to store it."""
+        keys, same = _keys_of(said), {same for word in said for same in find_synonyms(word)}
+        rows = [row for row in range(len(self._keys)) if self._holds(row) and keys & self._words[row]]
+        stored = [thing for word in same for thing in find_uses(word) if thing in INCLUDES["storage"]]
+        return rows or self.named(frozenset(stored))
+
+    def without_holders_of_others(self, rows: list[int], said: list[str]) -> list[int]:
+        """Rows that are not named after another thing than a phrase says: no shoe rack for a "towel rack"."""
+        if not any(_is_thing(word) for word in said):
+            return rows
+        return [row for row in rows if not (self._holds(row) and any(map(_is_thing, self._named[row][:-1])))]
+
+    def _holds(self, row: int) -> bool:
+        return len(self._named[row]) > 1 and self._named[row][-1] in _HOLDERS
 
     def named(self, words: frozenset[str]) -> list[int]:
         """Rows of the names that are in ``words``, or a kind of one of them."""
@@ -89,16 +130,42 @@ class _Names:
 
 def split_phrase(phrase: str) -> list[str]:
     """Normal forms to look up, most specific first."""
-    tokens = re.findall(r"[^\W_]+", _AMOUNTS.sub("", phrase).lower())[:_LONGEST_PHRASE]
-    cut = next((at for at, token in enumerate(tokens) if at > 0 and _ends_head(token)), len(tokens))
-    head = normalize_phrase(" ".join(tokens[:cut])).split()
+    head, _ = _head_and_complement(phrase)
     ends = [" ".join(head[start:]) for start in range(len(head))]
-    return list(dict.fromkeys(part for part in (normalize_phrase(" ".join(tokens)), *ends) if part))
+    if head and head[-1] in _EMPTY:
+        ends += [" ".join(head[start:-1]) for start in range(len(head) - 1)]
+    whole = normalize_phrase(" ".join(_tokens(phrase)))
+    return list(dict.fromkeys(part for part in (whole, *ends) if part))
+
+
+def _tokens(phrase: str) -> list[str]:
+    return re.findall(r"[^\W_]+", _AMOUNTS.sub("", phrase).lower())[:_LONGEST_PHRASE]
+
+
+def _head_and_complement(phrase: str) -> tuple[list[str], list[str]]:
+    """The words before the first preposition, in their normal forms, and those between it and the next one if they say
+    which thing is meant."""
+    tokens = _tokens(phrase)
+    ends = [at for at, token in enumerate(tokens) if at > 0 and _ends_head(token)]
+    cut, after = (*ends, len(tokens), len(tokens))[:2]
+    told = tokens[cut + 1 : after] if tokens[cut : cut + 1] and tokens[cut] in _COMPLEMENTS else []
+    return normalize_phrase(" ".join(tokens[:cut])).split(), normalize_phrase(" ".join(told)).split()
 
 
 def _ends_head(token: str) -> bool:
     """Whether what follows only describes the thing: "in the hall", "standing there"."""
     return token in _PREPOSITIONS or token in _PARTICIPLES
+
+
+def _keys_of(words: list[str]) -> frozenset[str]:
+    """Keys of words and their synonyms."""
+    return frozenset(make_key(same) for word in words for same in find_synonyms(word))
+
+
+@functools.lru_cache(maxsize=4096)
+def _is_thing(word: str) -> bool:
+    """Whether a word is one for things in rooms, and not a color, material or size."""
+    return len(find_synonyms(word)) > 1 or bool(find_wider(word))
 
 
 @functools.lru_cache(maxsize=4096)

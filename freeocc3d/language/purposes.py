@@ -5,6 +5,7 @@ The table was written for this project. A phrase is read so only if it begins as
 
 from __future__ import annotations
 
+import functools
 import re
 
 from .synonyms import find_synonyms, make_singular
@@ -102,6 +103,12 @@ def find_purpose(phrase: str) -> tuple[str, ...]:
                     found = dict.fromkeys((*(found if fit == best else ()), *things))
                     best = fit
     return tuple(found)
+
+
+@functools.cache
+def find_uses(word: str) -> tuple[str, ...]:
+    """The words for the things that are used for one word alone: "dining table" for "dinner"."""
+    return tuple(thing for done, things in PURPOSES.items() if _stem(word) in done for thing in things)
 
 
 def _stem(word: str) -> str:

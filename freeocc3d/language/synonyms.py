@@ -72,7 +72,10 @@ SYNONYMS: tuple[tuple[str, ...], ...] = (
     ("person", "human", "man", "woman", "child", "boy", "girl", "somebody"),
     ("dumbbell", "barbell", "weights"),
     ("exercise bench", "weight bench"),
-    ("kitchen utensils", "utensils", "cutlery", "silverware", "flatware"),
+    (
+        "kitchen utensils", "utensils", "cutlery", "silverware", "flatware", "cooking utensils", "cooking tools",
+        "kitchen tools",
+    ),
     ("heater", "radiator", "space heater"),
     ("shoe rack", "shoe shelf", "shoe cabinet"),
     ("shoe", "trainer", "sneaker", "boot", "slipper", "sandal", "footwear", "high heel", "heel", "loafer"),
@@ -89,7 +92,7 @@ SYNONYMS: tuple[tuple[str, ...], ...] = (
     ("speaker", "loudspeaker", "soundbar", "stereo"),
     ("stairs", "staircase", "stairway", "steps"),
     ("door handle", "doorknob"),
-    ("door", "doorway"),
+    ("door", "doorway", "entrance", "entry"),
     ("whiteboard", "marker board", "dry erase board", "blackboard", "chalkboard"),
     ("toy", "teddy bear", "teddy", "doll", "stuffed animal", "plush toy", "plushie"),
     ("clock", "wall clock", "alarm clock"),
@@ -142,6 +145,20 @@ INCLUDES: dict[str, tuple[str, ...]] = {
 """A wider word -> narrower words that it includes, in addition to those that end with it ("dining table" is a
 table)."""
 
+PARTS: dict[str, tuple[str, ...]] = {
+    "bed": ("mattress", "headboard", "bed frame"),
+    "window": ("pane", "window frame", "window sill"),
+    "floor": ("floorboard", "tile", "floor tile", "laminate"),
+    "door": ("door frame",),
+    "door handle": ("knob", "handle", "latch"),
+    "lamp": ("lampshade", "light bulb", "bulb"),
+    "chair": ("stool", "highchair"),
+    "camera": ("webcam", "camcorder", "action camera"),
+    "tablet": ("ipad", "e reader", "ereader"),
+}  # fmt: skip
+"""A thing -> its parts, and special kinds of it, which mean the thing where the scan's classes have none of their own.
+The thing does not mean them: who asks for chairs does not ask for stools."""
+
 _IRREGULAR = {
     "shelves": "shelf", "bookshelves": "bookshelf", "knives": "knife", "people": "person", "men": "man",
     "women": "woman", "children": "child", "clothes": "clothes", "scissors": "scissors", "stairs": "stairs",
@@ -182,6 +199,13 @@ def find_wider(word: str) -> frozenset[str]:
     return frozenset(
         normalize_phrase(wide) for wide in INCLUDES if key in {make_key(inner) for inner in INCLUDES[wide]}
     )
+
+
+@functools.cache
+def find_whole(word: str) -> frozenset[str]:
+    """The normal forms of the things of which ``word`` is a part or a special kind."""
+    key = make_key(word)
+    return frozenset(normalize_phrase(whole) for whole in PARTS if key in {make_key(part) for part in PARTS[whole]})
 
 
 def make_key(name: str) -> str:

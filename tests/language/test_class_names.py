@@ -50,6 +50,35 @@ def test_phrases_find_the_classes_that_people_mean(phrase: str, names: set[str])
     assert found(phrase) == names
 
 
+@pytest.mark.parametrize(
+    ("phrase", "names"),
+    [
+        ("cupboards in the kitchen", {"kitchen cabinet"}),
+        ("sliding glass door", {"sliding door"}),
+        ("table for dinner", {"dining table"}),
+        ("lamp next to the dining table", {"lamp", "chandelier"}),
+        ("television unit", {"tv cabinet"}),
+        ("telly stand", {"tv cabinet"}),
+        ("spice rack", {"spice box"}),
+        ("wooden rack", {"shoe rack"}),
+        ("towel rack", set()),
+        ("clothes cupboard", {"wardrobe"}),
+        ("air conditioning unit", {"air conditioner"}),
+        ("sewing machine", set()),
+        ("mattress", {"bed"}),
+        ("stools", {"chair"}),
+    ],
+)
+def test_the_rest_of_a_phrase_decides_among_names(phrase: str, names: set[str]) -> None:
+    more = ["shoe rack", "spice box", "wardrobe", "air conditioner"]
+    assert found(phrase, [*HOUSE, *more]) == names
+
+
+def test_a_part_means_its_whole_and_not_the_reverse() -> None:
+    assert found("stool", ["chair", "stool"]) == {"stool"}
+    assert found("chair", ["chair", "stool"]) == {"chair"}
+
+
 @pytest.mark.parametrize("phrase", ["unicorn", "", "   ", "§$%", "handle bar", "wallpaper", "red", "on the"])
 def test_other_phrases_find_nothing(phrase: str) -> None:
     assert match_names(phrase, HOUSE) == ([], "")
