@@ -44,7 +44,7 @@ FAST = (
 SLOW = {
     *("storage.keyframes", "storage.work_folder", "storage.writer", "query.best_views", "query.standing_places"),
     *("query.objects.agglomeration", "query.objects.structure", "query.objects.surface_instances"),
-    "query.objects.surfels",
+    *("query.objects.surfels", "query.objects.view_features"),
 }
 """Modules of fast rooms that a query does not start with."""
 

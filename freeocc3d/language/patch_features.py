@@ -54,11 +54,7 @@ class Tiling:
     def image(self, rgb: NDArray[np.uint8], mean: tuple[float, ...], std: tuple[float, ...]) -> NDArray[np.float32]:
         """(3, rows patch, columns patch) the frame, resized and normalized for the network."""
         rows, columns = self.grid
-        size = columns * self.patch, rows * self.patch
-        shrinks = size[0] < rgb.shape[1]
-        resized = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
-        normal = (resized.astype(np.float32) / np.float32(255) - np.array(mean, np.float32)) / np.array(std, np.float32)
-        return np.ascontiguousarray(normal.transpose(2, 0, 1))
+        return resize_image(rgb, (columns * self.patch, rows * self.patch), mean, std)
 
     def windows(self, image: NDArray[np.float32]) -> Iterator[tuple[NDArray[np.float32], list[tuple[int, int]]]]:
         """Batches (B, 3, h patch, w patch) of windows of an image, with their first patch rows and columns."""
@@ -69,6 +65,16 @@ class Tiling:
             own = corners[start : start + at_once]
             crops = [image[:, t * patch : (t + h) * patch, left * patch : (left + w) * patch] for t, left in own]
             yield np.stack(crops), own
+
+
+def resize_image(
+    rgb: NDArray[np.uint8], size: tuple[int, int], mean: tuple[float, ...], std: tuple[float, ...]
+) -> NDArray[np.float32]:
+    """(3, height, width) a picture (H, W, 3), resized to (width, height) and normalized for a network."""
+    shrinks = size[0] < rgb.shape[1]
+    resized = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+    normal = (resized.astype(np.float32) / np.float32(255) - np.array(mean, np.float32)) / np.array(std, np.float32)
+    return np.ascontiguousarray(normal.transpose(2, 0, 1))
 
 
 class Splice:

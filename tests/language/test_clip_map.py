@@ -49,8 +49,19 @@ def test_a_map_is_made_asked_and_outlives_its_model(
     with pytest.raises(FreeOccError, match="A word is empty"):
         loaded.query(" ")
 
+    thing = loaded.objects(views=1)[0]
+    x0, y0, x1, y1 = thing.keyframes[0].box
+    rgb = loaded.keyframes[loaded.keyframes.frames.index(thing.keyframes[0].frame)].color
+    across, down = round(0.1 * (x1 - x0 + 1)), round(0.1 * (y1 - y0 + 1))
+    part = rgb[max(y0 - down, 0) : y1 + down + 1, max(x0 - across, 0) : x1 + across + 1]
+    assert thing.feature == pytest.approx(loaded.encoder.embed(part), abs=1e-6)
+
     shutil.rmtree(model)
     again = load_map(tmp_path / "map")
+    without = again.objects(views=1)[0]
+    assert np.array_equal(without.rows, thing.rows)
+    mean = features[thing.rows].sum(axis=0)
+    assert without.feature == pytest.approx(mean / np.linalg.norm(mean), abs=1e-4)
     assert again.query("椅子", threshold=-1.0).scores == pytest.approx(result.scores, abs=1e-5)
     with pytest.raises(ModelError, match="need the text part of the model 'tiny'"):
         again.query("a word of another day")

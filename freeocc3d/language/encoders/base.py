@@ -78,6 +78,11 @@ class Encoder(ABC):
         of a feature is its meaning. Its length is the encoder's confidence, and its weight when views are fused: 1 for
         an encoder that gives no confidence, 0 where the encoder has no result."""
 
+    def embed(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+        """(D,) unit embedding of a whole picture, (H, W, 3), in the space of words; None if the encoder has no such
+        embedding. Networks that were trained on whole pictures understand a thing that fills one best."""
+        return None
+
     @abstractmethod
     def text_state(self) -> dict[str, Any]:
         """The state that ``load_text`` needs to restore the text part: numbers, strings, lists and dicts only (the

@@ -85,6 +85,14 @@ class ClipEncoder(Encoder):
         mixed = clip_attention.mix_values("plain", q, k, v, grid)
         return np.asarray(self._head.run(["pooled"], {"mixed": mixed, "stream": stream})[0])
 
+    def embed(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The network's own embedding of a picture, which is resized to the size of the training images."""
+        from ..patch_features import normalize_patches, resize_image
+
+        size = self.package.input_size, self.package.input_size
+        image = resize_image(rgb, size, self.package.mean, self.package.std)
+        return normalize_patches(self.pooled(image[None]))[0]
+
     def _attention_of(self, images: NDArray[np.float32], patches: int) -> list[NDArray[np.float32]]:
         """Queries, keys and values (B, heads, N, d) of the last block, and its stream (B, N, heads d). Raises
         ModelError."""

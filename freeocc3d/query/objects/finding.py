@@ -23,6 +23,7 @@ def find_objects(scan_map: SavedMap, options: Options | None = None) -> list[Obj
     Raises MapError for a damaged map.
     """
     from ..best_views import best_views
+    from .view_features import embed_views
 
     options = options or Options()
     instance = divide_into_instances(scan_map)
@@ -37,14 +38,14 @@ def find_objects(scan_map: SavedMap, options: Options | None = None) -> list[Obj
         scan_map.occupancy, rows, instance, agreement, agreement, min_voxels=1, min_share=0.0, top_k=_MOST_REGIONS
     )
     which = [int(instance[np.searchsorted(rows, region.rows[0])]) for region in regions]
-    named = name_features(feature[which], scan_map.text_encoder, scan_map.vocabulary, options.names)
     views = best_views(scan_map.occupancy, scan_map.trajectory, scan_map.keyframes, regions, options.views)
+    embedded = embed_views(scan_map, views, feature.shape[1])
+    feature = np.where(mask_known(embedded)[:, None], embedded, feature[which])
+    named = name_features(feature, scan_map.text_encoder, scan_map.vocabulary, options.names)
     boxes = oriented_boxes(scan_map.occupancy, regions, scan_map.T_gravity_map)
     return [
-        Object(
-            np.sort(region.rows), feature[c], names, box, region.volume_m3, region.centroid, tuple(seen), region.score
-        )
-        for region, c, names, box, seen in zip(regions, which, named, boxes, views, strict=True)
+        Object(np.sort(region.rows), own, names, box, region.volume_m3, region.centroid, tuple(seen), region.score)
+        for region, own, names, box, seen in zip(regions, feature, named, boxes, views, strict=True)
     ]
 
 

@@ -32,7 +32,8 @@ class Object:
     """A thing of the scene, such as one of several chairs. Map frame, z up, meters.
 
     rows: (n,) rows of ``Occupancy.occupied_voxels()``, ascending; no voxel belongs to two objects.
-    feature: (D,) float32 unit feature of the map's encoder; zero where the map knows nothing of the object.
+    feature: (D,) float32 unit feature of the map's encoder: the mean embedding of its best views where the encoder is
+    installed and embeds pictures, else the mean of its voxels' features; zero where nothing is known.
     names: (name, probability) of the map's vocabulary, most probable first; the probabilities of all names of the
     vocabulary add to 1. Empty without a feature or a vocabulary.
     box: the upright box with the least level area.  volume_m3: of its voxels.  centroid: (3,) mean of their centers.
