@@ -1,4 +1,4 @@
-"""Chooses the keyframes to encode if not all may be: sharp ones that together show the most surface.
+"""Chooses the keyframes to encode if not all need to be: sharp ones that together show the most surface.
 
 A greedy choice: the next keyframe is the one that adds most to
 
@@ -41,9 +41,17 @@ def measure_detail(color: NDArray[np.uint8]) -> float:
 
 
 def choose_keyframes(
-    views: Sequence[VisibleGaussians], sharp: Sequence[float], n_gaussians: int, most: int
+    views: Sequence[VisibleGaussians],
+    sharp: Sequence[float],
+    n_gaussians: int,
+    most: int,
+    coverage: float | None = None,
 ) -> list[int]:
-    """Chooses up to ``most`` views, ascending; leaves out views that add nothing. sharp: the sharpness of each view."""
+    """Chooses up to ``most`` views, ascending; leaves out views that add nothing.
+
+    sharp: the sharpness of each view.  coverage: a share of the Gaussians that the views show together; no more views
+    are chosen once that share is shown. None = up to ``most`` anyway.
+    """
     best = np.zeros(n_gaussians, np.float32)
     for view in views:
         best[view.rows] = np.maximum(best[view.rows], view.weights)
@@ -58,7 +66,8 @@ def choose_keyframes(
     queue = [(-gain(row), row) for row in range(len(views))]
     heapq.heapify(queue)
     chosen: list[int] = []
-    while queue and len(chosen) < most:
+    enough = np.inf if coverage is None else coverage * np.count_nonzero(best)
+    while queue and len(chosen) < most and np.count_nonzero(so_far) < enough:
         _, row = heapq.heappop(queue)
         now = gain(row)
         if queue and -now > queue[0][0]:

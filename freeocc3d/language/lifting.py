@@ -40,7 +40,7 @@ def lift_features(
     """
     options, progress = options or Options(), progress or Progress()
     fusion = FeatureFusion(len(gaussians), encoder.dimension, options.disagreement)
-    chosen = choose_encoded_keyframes(gaussians, frames, T_world_cam, options)
+    chosen = choose_encoded_keyframes(gaussians, frames, T_world_cam, options, encoder.coverage)
     progress.stage("language", len(chosen))
     with contextlib.closing(call_ahead(lambda row: _encode(encoder, frames[row]), chosen, depth=1)) as encoded:
         for done, (row, (frame, features)) in enumerate(zip(chosen, encoded, strict=True), start=1):
@@ -69,15 +69,22 @@ def encode_finite(encoder: Encoder, frame: Frame) -> NDArray[np.float16]:
 
 
 def choose_encoded_keyframes(
-    gaussians: Gaussians, frames: Sequence[Frame], T_world_cam: NDArray[np.float64], options: Options
+    gaussians: Gaussians,
+    frames: Sequence[Frame],
+    T_world_cam: NDArray[np.float64],
+    options: Options,
+    coverage: float | None = None,
 ) -> list[int]:
-    """Rows of the keyframes to encode, ascending; ``options.keyframes`` gives their number."""
-    count = len(frames)
-    most = max(1, round(options.keyframes * count)) if options.keyframes <= 1 else int(options.keyframes)
-    if most >= count:
+    """Rows of the keyframes to encode, ascending: as many as ``options.keyframes`` states, or else as show the
+    encoder's ``coverage``."""
+    count = most = len(frames)
+    if options.keyframes is not None:
+        most = max(1, round(options.keyframes * count)) if options.keyframes <= 1 else int(options.keyframes)
+        coverage = None
+    if most >= count and coverage is None:
         return list(range(count))
     views, sharp = [], []
     for frame, T in zip(frames, T_world_cam, strict=True):
         views.append(find_visible(gaussians, frame, T, options))
         sharp.append(measure_detail(frame.color))
-    return choose_keyframes(views, sharp, len(gaussians), most)
+    return choose_keyframes(views, sharp, len(gaussians), most, coverage)

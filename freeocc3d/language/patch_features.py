@@ -41,15 +41,20 @@ class Tiling:
     patch: int
 
     @classmethod
-    def of(cls, height: int, width: int, package: Package, short_side: int, window: int) -> Tiling:
-        """The tiling of a frame resized to ``short_side`` pixels; windows have up to ``window`` pixels (0 = the whole
-        frame) and overlap by half."""
+    def of(
+        cls, height: int, width: int, package: Package, short_side: int, window: int, half_overlap: bool = False
+    ) -> Tiling:
+        """The tiling of a frame resized to ``short_side`` pixels. Windows have up to ``window`` pixels (0 = the whole
+        frame), and overlap by half, or else as little as covers the frame."""
         scale = short_side / min(height, width)
         rows, columns = (max(1, round(size * scale / package.patch)) for size in (height, width))
         most = max(1, window // package.patch) if window else max(rows, columns)
         h, w = min(most, rows), min(most, columns)
         _check_size(rows, columns, h, w, package)
-        return cls((rows, columns), (h, w), _starts(rows, h), _starts(columns, w), package.patch)
+        tops, lefts = (
+            _starts(length, own, own // 2 if half_overlap else own) for length, own in ((rows, h), (columns, w))
+        )
+        return cls((rows, columns), (h, w), tops, lefts, package.patch)
 
     def image(self, rgb: NDArray[np.uint8], mean: tuple[float, ...], std: tuple[float, ...]) -> NDArray[np.float32]:
         """(3, rows patch, columns patch) the frame, resized and normalized for the network."""
@@ -103,15 +108,15 @@ def encode_windows(
     short_side: int,
     window: int | None,
     encode: Callable[[NDArray[np.float32], Tiling], NDArray[np.float32]],
+    half_overlap: bool = False,
 ) -> NDArray[np.float32]:
     """(rows, columns, D) unit features of the patches of (H, W, 3) pixels, joined from windows.
 
     window: in pixels; None = the size of the model's training images.  encode: turns (B, 3, h patch, w patch) windows
     of a tiling into their (B, h, w, D) features.
     """
-    tiling = Tiling.of(
-        rgb.shape[0], rgb.shape[1], package, short_side, package.input_size if window is None else window
-    )
+    side = package.input_size if window is None else window
+    tiling = Tiling.of(rgb.shape[0], rgb.shape[1], package, short_side, side, half_overlap)
     splice = Splice(tiling, package.dimension)
     for images, corners in tiling.windows(tiling.image(rgb, package.mean, package.std)):
         splice.add(normalize_patches(encode(images, tiling)), corners)
@@ -146,7 +151,7 @@ def normalize_patches(features: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(features / np.where(norms > 0, norms, 1), np.float32)
 
 
-def _starts(length: int, window: int) -> tuple[int, ...]:
-    """The starts of windows that cover ``length``, half a window apart; the last window ends with it."""
-    step = max(1, window // 2)
-    return (*range(0, length - window, step), length - window)
+def _starts(length: int, window: int, step: int) -> tuple[int, ...]:
+    """The starts of windows that cover ``length``, evenly spread and at most ``step`` apart."""
+    steps = -(-(length - window) // max(1, step))
+    return tuple(round(n * (length - window) / max(1, steps)) for n in range(steps + 1))

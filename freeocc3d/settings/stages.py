@@ -163,10 +163,10 @@ class LanguageOptions(TypedOptions, frozen=True):
     encoder: str = "auto"
     """Turns images and words into features. "auto": the best model that is installed (freeocc3d models list), else
     "color", which needs no network and knows color names only."""
-    keyframes: Annotated[float, Meta(gt=0, le=1e6)] = 1.0
+    keyframes: Annotated[float, Meta(gt=0, le=1e6)] | None = None
     """Keyframes to encode: a value up to 1 is a share of all keyframes, a larger one a number. If not all are encoded,
-    sharp keyframes that together show the most surface are chosen. The time of layer 3 is proportional to this
-    number."""
+    sharp keyframes that together show the most surface are chosen. The time of layer 3 is proportional to this number.
+    null = all, or as many as show 98 % of the surface for networks that answer any words."""
     visible_within: Advanced[Meters] = 0.02
     """A Gaussian is visible if the depth map shows something within this many meters of it…"""
     visible_share: Advanced[Annotated[float, Meta(ge=0, le=10)]] = 0.01

@@ -42,6 +42,13 @@ def test_what_adds_nothing_is_left_out() -> None:
     assert choose_keyframes([], [], 9, 3) == []
 
 
+def test_no_more_are_chosen_than_show_the_share_that_is_asked() -> None:
+    views = [view(range(60)), view(range(50, 95)), view(range(95, 100)), view(range(20))]
+    assert choose_keyframes(views, [1] * 4, 120, 4, 0.95) == [0, 1]
+    assert choose_keyframes(views, [1] * 4, 120, 4, 0.96) == [0, 1, 2]
+    assert choose_keyframes(views, [1] * 4, 120, 1, 0.96) == [0]
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_greedy_choice_is_near_the_best(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -94,6 +94,17 @@ def test_the_budget_is_a_share_or_a_number(keyframes: float, count: int) -> None
         assert not any(index % 2 for index in encoder.asked)  # the sharp ones
 
 
+def test_an_encoder_with_a_network_gets_as_many_as_show_nearly_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Halves, "coverage", 0.98)
+    T = poses(6)
+    T[:4, 0, 3], T[4:, 0, 3] = -1.5, 1.5
+    encoder = Halves()
+    lift_features(WALL, frames(0, 1, 2, 3, 4, 5), T, encoder)
+    assert 1 < len(encoder.asked) < 4
+    assert any(index >= 4 for index in encoder.asked)
+    assert any(index < 4 for index in encoder.asked)
+
+
 @pytest.mark.parametrize(
     "bad",
     [{"visible_within": 0.0}, {"near": 0.0}, {"visible_share": -0.1}, {"keyframes": 0.0}, {"border": 0.6},

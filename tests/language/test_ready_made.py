@@ -19,6 +19,7 @@ from freeocc3d.language import clip_attention
 from freeocc3d.language.encoders import clip
 from freeocc3d.language.model_export import transformer_graphs as graphs
 from freeocc3d.language.patch_features import Tiling
+from freeocc3d.language.ready_made import onnx_graphs
 from freeocc3d.language.ready_made.export_packages import package_of_export
 from freeocc3d.language.text_networks import TextNetwork
 
@@ -58,8 +59,14 @@ def test_an_export_equals_its_network(
     assert (package.kind, package.precision, package.patch, package.licence) == ("clip", precision, 8, "mit")
     assert (package.prefix_tokens, lacks) == (int(kind == "clip"), "")
     assert package.mean == (0.5, 0.4, 0.3)
+    assert (package.logit_scale, package.logit_bias) == ((100.0, None) if kind == "clip" else (117.3308, -12.9324))
     images = np.random.default_rng(0).normal(size=(2, 3, 40, 24)).astype(np.float32)
     tiling = Tiling((5, 3), (5, 3), (0,), (0,), 8)
+    image = onnx.load(package.folder / "image.onnx").graph
+    weights = {own.name: own.data_type for own in image.initializer}
+    kinds = {weights[node.input[1]] for node in image.node if node.op_type == "MatMulInteger"}
+    fast = TensorProto.INT8 if onnx_graphs._int8_is_exact() else TensorProto.UINT8
+    assert kinds == ({fast} if precision == "int8" else set())
     for replaced, reference in zip(("naclip", "sclip"), in_torch(kind, images), strict=True):
         encoder = clip.load(clip.Options(model=str(package.folder), attention=replaced))
         found = encoder._window_features(images, tiling).reshape(2, 15, -1)

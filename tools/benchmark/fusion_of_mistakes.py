@@ -22,7 +22,7 @@ def measure_fusion(map_path: str) -> Figures:
 
     scan_map = load_map(map_path)
     capture = scan_map.capture
-    scene = _Scene(scan_map, Path(scan_map.manifest.capture.path) / "ground_truth.npz")
+    scene = Scene(scan_map, Path(scan_map.manifest.capture.path) / "ground_truth.npz")
 
     def encoder(kind: str | None, seed: int) -> LabelsEncoder:
         images = capture.labels if kind is None else Flipped(capture.labels, len(capture.classes), kind, seed)
@@ -80,7 +80,7 @@ def _components(image: Any) -> Any:
     return out
 
 
-class _Scene:
+class Scene:
     """A map's Gaussians on its truth's lattice, scored with other features than its own."""
 
     def __init__(self, scan_map: Any, truth_path: Path):

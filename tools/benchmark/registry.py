@@ -66,6 +66,19 @@ MEASUREMENTS = {
         "lifting_speed:measure_lifting",
         lines="lifting_speed:lifting_lines",
     ),
+    "encoding": Measurement(
+        "what encoding by a quantized ViT-B/16 takes of a run",
+        "capture",
+        "encoding_time:measure_encoding",
+        lines="encoding_time:encoding_lines",
+    ),
+    "patches": Measurement(
+        f"class images averaged over patches, fused in the map of {TRUE_CLASSES}: image sizes, numbers of keyframes",
+        "map",
+        "averaged_patches:measure_patches",
+        table="averaged_patches:tabulate_patches",
+        map_of=TRUE_CLASSES,
+    ),
     "stress": Measurement(
         "layer 1 on altered captures: what it reaches, what it loses, and whether it reports the loss",
         "capture",

@@ -12,7 +12,7 @@ from ...core.types import Frame
 from ...settings.option_types import Advanced, Cosine
 from .. import model_packages
 from ..text_networks import ModelWords
-from .base import Encoder
+from .base import WELL_COVERED, Encoder
 from .model_options import PatchOptions
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ class ClipEncoder(Encoder):
     """Patch features in the space of words, joined from windows and upsampled along the image's edges."""
 
     name: ClassVar[str] = "clip"
+    coverage = WELL_COVERED
 
     def __init__(self, package: model_packages.Package, options: Options):
         self.package = package
@@ -121,7 +122,8 @@ class WindowsEncoder(ClipEncoder):
         from ..patch_features import encode_windows
 
         side = self.package.input_size
-        return encode_windows(rgb, self.package, max(self.options.short_side, side), side, self._window_features)
+        short_side = max(self.options.short_side, side)
+        return encode_windows(rgb, self.package, short_side, side, self._window_features, half_overlap=True)
 
     def _window_features(self, images: NDArray[np.float32], tiling: Tiling) -> NDArray[np.float32]:
         shape = len(images), *tiling.window, self.dimension

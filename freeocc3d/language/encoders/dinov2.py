@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from ...core.types import Frame
 from .. import model_packages
 from ..text_networks import ModelWords
-from .base import Encoder
-from .model_options import ImageSide, PatchOptions, WindowSide
+from .base import WELL_COVERED, Encoder
+from .model_options import PatchOptions, WindowSide
 
 if TYPE_CHECKING:
     from ..patch_features import Tiling
@@ -24,7 +24,6 @@ class Options(PatchOptions, frozen=True):
 
     model: str = ""
     """Folder of a model package of kind "dense", or its name in the models folder (see freeocc3d models list)."""
-    short_side: ImageSide = 448
     window: WindowSide | None = 0
 
 
@@ -32,6 +31,7 @@ class Dinov2Encoder(Encoder):
     """Patch features that are already in the space of words, joined from windows and upsampled."""
 
     name: ClassVar[str] = "dinov2"
+    coverage = WELL_COVERED
 
     def __init__(self, package: model_packages.Package, options: Options):
         self.package = package

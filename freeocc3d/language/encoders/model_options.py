@@ -44,10 +44,10 @@ class WordOptions(TypedOptions, frozen=True):
 class PatchOptions(WordOptions, frozen=True):
     """How the patches of an image network become features of pixels."""
 
-    short_side: ImageSide = 336
+    short_side: ImageSide = 448
     """Frames are resized to this many pixels on the shorter side."""
     window: WindowSide | None = None
-    """Edge in pixels of the windows to encode one by one; they overlap by half. 0 = the whole frame at once; null = the
-    size of the model's training images."""
+    """Edge in pixels of the windows to encode one by one; they overlap as little as covers the frame. 0 = the whole
+    frame at once; null = the size of the model's training images."""
     stride: FeatureSpacing = 4
     """Pixels between features, which are upsampled from patches along the image's edges; 0 = one feature per patch."""

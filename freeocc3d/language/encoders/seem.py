@@ -17,7 +17,7 @@ from ...core.errors import ModelError
 from ...core.types import Frame
 from .. import model_packages
 from ..text_networks import ModelWords
-from .base import Encoder
+from .base import WELL_COVERED, Encoder
 from .model_options import ImageSide, WordOptions
 
 REQUIRES: tuple[str, ...] = ("onnxruntime", "tokenizers")
@@ -38,6 +38,7 @@ class SeemEncoder(Encoder):
     """The embedding of the mask that covers a pixel best."""
 
     name: ClassVar[str] = "seem"
+    coverage = WELL_COVERED
 
     def __init__(self, package: model_packages.Package, options: Options):
         self.package = package

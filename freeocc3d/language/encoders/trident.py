@@ -27,8 +27,8 @@ from ...core.types import Frame
 from ...settings.option_types import Advanced, Device
 from .. import model_packages
 from ..text_networks import ModelWords
-from .base import Encoder
-from .model_options import FeatureSpacing, PatchOptions, WindowSide
+from .base import WELL_COVERED, Encoder
+from .model_options import FeatureSpacing, ImageSide, PatchOptions, WindowSide
 
 if TYPE_CHECKING:
     from ..patch_features import Tiling
@@ -48,7 +48,10 @@ class Options(PatchOptions, frozen=True):
     """The same for kind "backbone": DINO ViT-B/16 in the paper."""
     sam: str = ""
     """The same for kind "sam"."""
+    short_side: ImageSide = 336
     window: WindowSide | None = 336
+    """Edge in pixels of the windows to encode one by one; they overlap by half. 0 = the whole frame at once; null = the
+    size of the model's training images."""
     beta: Advanced[Annotated[float, Meta(ge=-100, le=100)]] = 1.2
     """A pair of DINO patches counts if its correlation exceeds this times the mean correlation."""
     gamma: Advanced[Annotated[float, Meta(ge=-1000, le=1000)]] = 3.0
@@ -69,6 +72,7 @@ class TridentEncoder(Encoder):
     """CLIP, DINO and SAM together."""
 
     name: ClassVar[str] = "trident"
+    coverage = WELL_COVERED
 
     def __init__(
         self, clip: model_packages.Package, dino: model_packages.Package, sam: model_packages.Package, options: Options
@@ -103,7 +107,7 @@ class TridentEncoder(Encoder):
 
         options, clip, dino = self.options, self.clip, self.dino
         window = clip.input_size if options.window is None else options.window
-        tiling = Tiling.of(rgb.shape[0], rgb.shape[1], clip, options.short_side, window)
+        tiling = Tiling.of(rgb.shape[0], rgb.shape[1], clip, options.short_side, window, half_overlap=True)
         same = dataclasses.replace(tiling, patch=dino.patch)  # the same patches at DINO's size
         seen_by_dino = same.windows(same.image(rgb, dino.mean, dino.std))
         splice: Splice | None = None

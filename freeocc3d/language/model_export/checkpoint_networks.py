@@ -63,7 +63,10 @@ def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[
     return Checkpoint(
         "clip",
         {**_image_networks(model, graphs.SiglipHead(model)), "text": words},
-        _facts(vision.hidden_size, mean, std, vision, 0, math.exp(model.logit_scale.item())),
+        {
+            **_facts(vision.hidden_size, mean, std, vision, 0, math.exp(model.logit_scale.item())),
+            "logit_bias": round(model.logit_bias.item(), 4),
+        },
         siglip_tokenizer(tokenizer, text.max_position_embeddings, text.pad_token_id),
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ from .. import model_packages
 from ..model_export.tokenizer_files import clip_tokenizer, siglip_tokenizer
 from ..package_files import stated_licence, write_files
 from .export_layout import LARGEST_TOKENIZER, graph_names
-from .onnx_graphs import FLOAT, Additions, CutError, OnnxGraph, join, run_model
+from .onnx_graphs import FLOAT, Additions, CutError, OnnxGraph, join, run_model, sign_weights
 from .text_cut import cut_text
 from .vision_cut import cut_vision
 
@@ -33,9 +33,11 @@ _STATISTICS = {
 }
 _FIRST_VOCABULARY = 32_000
 """Tokens of SigLIP; SigLIP 2 has more."""
-_SCALES = {"clip": 100.0, "siglip": 117.3308, "siglip2": 112.6689}
-"""exp(logit_scale) of the published base models; the graphs of single towers do not hold it. CLIP's training bounds it
-by 100, which all published models reach."""
+_SIGMOIDS = {"siglip": (117.3308, -12.9324), "siglip2": (112.6689, -16.7717)}
+_SOFTMAX = 100.0, None
+"""exp(logit_scale) and logit_bias in the weights of the published models of B/16 at 224 pixels; others of a family
+differ by some percent. Graphs of single towers do not hold them, and config.json states what training began with.
+CLIP's training bounds the scale by 100, which all published models reach."""
 
 _Side = Annotated[int, Meta(ge=16, le=4096)]
 _Length = Annotated[int, Meta(ge=8, le=4096)]
@@ -110,10 +112,11 @@ def package_of_export(
         raise ModelError(f"{graph_names(precision)[1]} of {source} cannot be used: {error}.") from error
     usual = _STATISTICS[family]
     second = family == "siglip" and (config.text_config.vocab_size or _FIRST_VOCABULARY) > _FIRST_VOCABULARY
+    scale, bias = _SIGMOIDS["siglip2" if second else "siglip"] if family == "siglip" else _SOFTMAX
     manifest = {
         "name": target.name, "kind": kind, **facts, "input_size": side, "precision": precision,
         "mean": list(preprocessing.image_mean or usual[0]), "std": list(preprocessing.image_std or usual[1]),
-        "logit_scale": _SCALES["siglip2" if second else family], "licence": stated_licence(folder), "source": source,
+        "logit_scale": scale, "logit_bias": bias, "licence": stated_licence(folder), "source": source,
     }  # fmt: skip
     tokenizer = _tokenizer(folder, family, longest, fixed, second, config.text_config.pad_token_id)
     networks = {part: functools.partial(_save, network) for part, network in {**vision, "text": text}.items()}
@@ -145,7 +148,9 @@ def _load(folder: Path, name: str, source: str) -> onnx.ModelProto:
                 raise ModelError(
                     f"{name} of {source} keeps weights in '{outside[:80]}', which is no file beside it: it is refused."
                 )
-        return onnx.load(path)
+        model = onnx.load(path)
+        sign_weights(model)
+        return model
     except OSError as error:
         raise ModelError(f"Cannot read {path}: {error.strerror}.") from error
     except ModelError:

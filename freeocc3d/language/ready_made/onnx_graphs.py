@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import collections
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -90,6 +92,38 @@ class OnnxGraph:
         probed.graph.output.extend(onnx.ValueInfoProto(name=name) for name in wanted)
         values = dict(zip(wanted, run_model(probed, wanted, feeds), strict=True)) if wanted else {}
         return values | {name: numpy_helper.to_array(own) for name, own in self.initializers.items() if name in names}
+
+
+def sign_weights(model: onnx.ModelProto) -> None:
+    """Makes int8 of the uint8 weights of quantized matrix products, and of their zero points: both less 128, which
+    changes no result. onnxruntime multiplies int8 weights two to three times faster on processors with VNNI or AMX; on
+    older ones its sums of them overflow, so that weights stay uint8 there."""
+    if not _int8_is_exact():
+        return
+    bytes_of = {own.name: own for own in model.graph.initializer if own.data_type == onnx.TensorProto.UINT8}
+    users = collections.Counter(name for node in model.graph.node for name in taken_by(node))
+    for node in model.graph.node:
+        names = node.input[1:4:2]  # the weights, and their zero points
+        if node.op_type == "MatMulInteger" and len(names) == 2 and all(n in bytes_of and users[n] == 1 for n in names):
+            for name in names:
+                centered = numpy_helper.to_array(bytes_of[name]).astype(np.int16) - 128
+                bytes_of[name].CopyFrom(numpy_helper.from_array(centered.astype(np.int8), name))
+
+
+@functools.cache
+def _int8_is_exact() -> bool:
+    """Whether this processor multiplies the largest int8 weights without overflow: without VNNI, the sum of two
+    products has 16 bits."""
+    inputs = [helper.make_tensor_value_info("a", onnx.TensorProto.UINT8, [1, 64])]
+    weights = numpy_helper.from_array(np.full((64, 16), 127, np.int8), "weights")
+    product = helper.make_node("MatMulInteger", ["a", "weights"], ["sums"])
+    outputs = [helper.make_tensor_value_info("sums", onnx.TensorProto.INT32, [1, 16])]
+    model = helper.make_model(
+        helper.make_graph([product], "product", inputs, outputs, [weights]),
+        opset_imports=[helper.make_opsetid("", 13)], ir_version=7,
+    )  # fmt: skip
+    (sums,) = run_model(model, ["sums"], {"a": np.full((1, 64), 255, np.uint8)})
+    return bool((sums == 64 * 255 * 127).all())
 
 
 def taken_by(node: onnx.NodeProto) -> list[str]:
