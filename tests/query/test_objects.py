@@ -1,13 +1,16 @@
 """Objects of a map: which voxels, names, places and keyframes they have."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import worded_voxels as cells
 
 import freeocc3d
+from freeocc3d.query.objects import surface_instances
 from freeocc3d.query.objects.finding import average_features, name_features
+from freeocc3d.query.objects.instances import divide_into_instances
 from freeocc3d.query.scan_map import load_map
 
 
@@ -48,3 +51,20 @@ def test_an_object_has_the_mean_feature_of_its_voxels_and_its_nearest_name() -> 
     names = name_features(features, cells.WORDS, cells.CLASSES[1:], 2)
     assert [own[0][0] for own in names[:2]] == ["cup", "coffee table"]
     assert names[2] == ()
+
+
+def test_classes_divide_a_map_only_where_its_views_agree_about_them(monkeypatch) -> None:
+    monkeypatch.setattr(surface_instances, "divide_surface", lambda scan_map: np.array([7, 5, -1]))
+    coffee, wall = cells.feature(COFFEE=1), cells.feature(WALL=1)
+    table, behind = cells.box((0, 0, 0), (4, 4, 1), coffee), cells.box((0, 5, 0), (4, 6, 4), wall)
+    for cup in (cells.feature(CUP=1), cells.feature(CUP=1, COFFEE=1)):
+        occupancy = cells.occupancy(table | cells.box((0, 0, 1), (2, 2, 5), cup) | behind)
+        scan_map = SimpleNamespace(occupancy=occupancy, text_encoder=cells.WORDS, up=np.array((0.0, 0.0, 1.0)))
+        instance = divide_into_instances(scan_map)
+        if cup.max() < 1:  # a third of the voxels may be either
+            assert instance.tolist() == [1, 0, -1]
+        else:
+            _, y, z = occupancy.occupied_voxels().T
+            assert set(instance[y == 5]) == {-1}
+            assert {*instance[(y < 5) & (z == 0)]} | {*instance[(y < 5) & (z > 0)]} == {0, 1}
+            assert len(set(instance[(y < 5) & (z > 0)])) == 1
