@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -117,31 +117,70 @@ def models_export(
 
 
 @app.command("list")
-def models_list(as_json: Json = False) -> None:
+def models_list(
+    available: Annotated[
+        bool, typer.Option("--available", help="Models with a short name too, and seconds to encode a keyframe here.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
     """List the models in the models folder."""
     from ..language import model_packages
 
-    found = model_packages.list_installed()
+    rows = _available_models() if available else _installed_models()
     if as_json:
-        facts = {
-            name: {"error": str(p)}
-            if isinstance(p, FreeOccError)
-            else {"kind": p.kind, "dimension": p.dimension, "precision": p.precision, "bytes": p.bytes,
-                  "licence": p.licence, "source": p.source}
-            for name, p in found.items()
-        }  # fmt: skip
-        print(json.dumps({"folder": str(model_packages.find_models_folder()), "models": facts}))
+        print(json.dumps({"folder": str(model_packages.find_models_folder()), "models": rows}))
         return
-    for name, package in found.items():
-        if isinstance(package, FreeOccError):
-            print(f"{name:<24} unusable: {package}")
-        else:
-            print(
-                f"{name:<24} {package.kind:<9} {package.dimension:>5} dimensions  {package.precision}  "
-                f"{package.bytes / 1e6:8.1f} MB  license {package.licence}, from {package.source}"
-            )
-    if not found:
+    for name, facts in rows.items():
+        print(f"{name:<24} unusable: {facts['error']}" if "error" in facts else f"{name:<24} {_described(facts)}")
+    if not rows:
         print(f"There are no models in {model_packages.find_models_folder()}.")
+
+
+def _installed_models() -> dict[str, dict[str, Any]]:
+    """Name -> facts of the models in the models folder."""
+    from ..language import model_packages
+
+    return {
+        name: {"error": str(package)}
+        if isinstance(package, FreeOccError)
+        else {"kind": package.kind, "dimension": package.dimension, "precision": package.precision,
+              "bytes": package.bytes, "licence": package.licence, "source": package.source}
+        for name, package in model_packages.list_installed().items()
+    }  # fmt: skip
+
+
+def _available_models() -> dict[str, dict[str, Any]]:
+    """Name -> facts of installed models and of those with a short name, with seconds to encode a keyframe."""
+    from ..language import encoding_speed, known_models, model_packages
+
+    rows = _installed_models()
+    for name, facts in rows.items():
+        if "error" not in facts:
+            package = model_packages.read_package(model_packages.find_models_folder() / name)
+            facts |= {"installed": True, "seconds": encoding_speed.measure_frame(package), "estimated": False}
+    speed = encoding_speed.measure_products()
+    for name, known in known_models.KNOWN.items():
+        rows.setdefault(name, {
+            "kind": "export" if known.export else "checkpoint", "dimension": known.dimension,
+            "precision": "int8" if known.export else "fp32", "bytes": known.megabytes * 1_000_000,
+            "licence": known.licence, "source": known.repository, "installed": False,
+            "seconds": 1e9 * known.gigaflop / speed, "estimated": True,
+        })  # fmt: skip
+    return rows
+
+
+def _described(facts: dict[str, Any]) -> str:
+    """A model in a line."""
+    line = (
+        f"{facts['kind']:<10} {facts['dimension']:>5} dimensions  {facts['precision']}  "
+        f"{facts['bytes'] / 1e6:8.1f} MB  license {facts['licence']}, from {facts['source']}"
+    )
+    if facts.get("seconds") is not None:
+        how = "estimated" if facts["estimated"] else "measured"
+        line += f"; {facts['seconds']:.1f} s a keyframe ({how})"
+    if facts.get("kind") == "checkpoint":
+        line += "; needs 'freeocc3d models export', with torch"
+    return line
 
 
 @app.command("verify")

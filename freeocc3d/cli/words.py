@@ -22,13 +22,13 @@ Words = Annotated[str | None, typer.Option("--words", metavar="NAME", help=Words
 def obtain_words(name: str, progress: Progress) -> Package:
     """The package with that name; fetches it if it is not installed. On a terminal the user is asked before. Raises
     ModelError."""
-    from ..language import model_hub, model_packages, word_models
+    from ..language import known_models, model_hub, model_packages, word_models
 
     found = word_models.find_words(name)
     if found is not None:
         return found
     if sys.stdin.isatty() and sys.stderr.isatty() and not model_hub.is_offline():
-        repository = model_hub.NAMES.get(model_hub.local_name(name), name)
+        repository = known_models.NAMES.get(model_hub.local_name(name), name)
         if not typer.confirm(f"The model '{name}' is not installed. Fetch {repository}?", default=True, err=True):
             raise ModelError(f"The model '{name}' is not installed: fetch it with 'freeocc3d models pull {name}'.")
     folder = model_hub.pull_package(name, progress=progress)

@@ -26,32 +26,10 @@ from ..core.errors import ModelError
 from ..core.progress import Progress
 from ..core.regular_files import check_regular
 from . import model_packages
+from .known_models import NAMES, RECOMMENDED, WORDS
 from .ready_made import export_layout
 from .timed_requests import Answer, NoAnswer, fetch
 from .vision_server import shorten_to_line
-
-WORDS, RECOMMENDED = "words", "clip-b16"
-"""A name for the recommended model, and that model: with it the papers of training-free dense features report."""
-
-EXPORTS = {
-    "clip-b16": "Xenova/clip-vit-base-patch16",
-    "clip-b32": "Xenova/clip-vit-base-patch32",
-    "siglip-b16": "Xenova/siglip-base-patch16-224",
-    "siglip2-b16": "onnx-community/siglip2-base-patch16-224-ONNX",
-}
-"""Short names of repositories with ready-made ONNX exports, of which packages are made without torch."""
-
-CHECKPOINT_NAMES = {
-    "clip-b16-openai": "timm/vit_base_patch16_clip_224.openai",
-    "clip-b16-laion": "laion/CLIP-ViT-B-16-laion2B-s34B-b88K",
-    "siglip-b16-google": "google/siglip-base-patch16-224",
-    "dino-b16": "facebook/dino-vitb16",
-    "dinov2-b14": "facebook/dinov2-base",
-    "sam-b": "facebook/sam-vit-base",
-}
-"""Short names of repositories whose checkpoints ``freeocc3d models export`` accepts."""
-
-NAMES = EXPORTS | CHECKPOINT_NAMES
 
 OFFLINE = "FREEOCC3D_OFFLINE"
 """Environment variable that forbids to fetch anything."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..core.errors import ModelError
 from ..settings.config import Settings
-from . import model_hub, model_packages
+from . import known_models, model_hub, model_packages
 from .model_packages import Package
 
 AUTO = "auto"
@@ -50,7 +50,7 @@ def find_best() -> Package | None:
     usable = [own for own in model_packages.list_installed().values() if isinstance(own, Package) and own.kind in kinds]
 
     def rank(own: Package) -> tuple[object, ...]:
-        recommended = own.folder.name == model_hub.RECOMMENDED
+        recommended = own.folder.name == known_models.RECOMMENDED
         return not recommended, kinds.index(own.kind), own.patch, -own.dimension, own.folder.name
 
     return min(usable, key=rank, default=None)

@@ -11,12 +11,12 @@ import pytest
 import ready_made
 from command_line import refused, run
 from hubs import Hub, serve
-from model_folders import dense_package
+from model_folders import dense_package, succeed
 
 from freeocc3d import load_map
 from freeocc3d.editing import relabeling
 from freeocc3d.gaussians import anchors
-from freeocc3d.language import model_hub, word_models
+from freeocc3d.language import encoding_speed, known_models, word_models
 from freeocc3d.language.ready_made.export_packages import package_of_export
 from freeocc3d.occupancy import build
 from freeocc3d.query.scan_map import Map
@@ -36,7 +36,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def hub(tmp_path: Path, home: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch):
     folder = ready_made.copy_export(tmp_path_factory, tmp_path / "remote", "clip", "int8", "sdpa")
-    with serve(folder, model_hub.NAMES["clip-b16"]) as running:
+    with serve(folder, known_models.NAMES["clip-b16"]) as running:
         monkeypatch.setenv("HF_ENDPOINT", running.url)
         yield running
 
@@ -67,6 +67,33 @@ def test_the_best_installed_model_is_used(home: Path, tmp_path: Path, tmp_path_f
     assert word_models.choose_encoder(named)[0].given("language", "clip")["model"] == "mine"
     color = config.resolve({"language": {"encoder": "color"}})
     assert word_models.choose_encoder(color) == (color, "")
+
+
+def test_the_models_that_there_are_are_listed_with_their_speed(
+    home: Path,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    export = ready_made.copy_export(tmp_path_factory, tmp_path / "export", "clip", "int8", "sdpa")
+    package_of_export(export, home / "tiny", "someone/tiny", "int8")
+    (home / "broken").mkdir()
+    succeed(["models", "list", "--available", "--json"])
+    rows = json.loads(capsys.readouterr().out)["models"]
+    assert rows["tiny"]["installed"]
+    assert not rows["tiny"]["estimated"]
+    assert "is not a model package" in rows["broken"]["error"]
+    for name, known in known_models.KNOWN.items():
+        assert (rows[name]["source"], rows[name]["installed"]) == (known.repository, False)
+        assert rows[name]["estimated"]
+    assert rows["clip-b16"]["seconds"] == pytest.approx(211 / 52 * rows["clip-b32"]["seconds"])
+    monkeypatch.setattr(encoding_speed, "FRAME", None)  # measured once: nothing is encoded again
+    succeed(["models", "list", "--available"])
+    lines = capsys.readouterr().out.splitlines()
+    measured = next(line for line in lines if line.startswith("tiny "))
+    assert f"{rows['tiny']['seconds']:.1f} s a keyframe (measured)" in measured
+    assert "(estimated); needs 'freeocc3d models export', with torch" in next(x for x in lines if x.startswith("sam-b"))
 
 
 def test_from_nothing_to_an_answer_in_two_commands(hub: Hub, home: Path, tmp_path: Path) -> None:

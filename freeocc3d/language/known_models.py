@@ -1,0 +1,42 @@
+"""Models on the Hugging Face hub that have a short name, and what is known of them before they are fetched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+WORDS, RECOMMENDED = "words", "clip-b16"
+"""A name for the recommended model, and that model: with it the papers of training-free dense features report."""
+
+
+@dataclass(frozen=True)
+class KnownModel:
+    """A repository of the hub.
+
+    export: whether it is a ready-made ONNX export, of which a package is made without torch; else it is a checkpoint
+    that ``freeocc3d models export`` accepts.  megabytes: to fetch, in int8 if it is an export.  dimension: of features.
+    gigaflop: multiplications and additions for a frame of 640 x 480 pixels at the encoder's default options.
+    """
+
+    repository: str
+    export: bool
+    megabytes: int
+    licence: str
+    dimension: int
+    gigaflop: int
+
+
+KNOWN = {
+    "clip-b16": KnownModel("Xenova/clip-vit-base-patch16", True, 152, "mit", 512, 211),
+    "clip-b32": KnownModel("Xenova/clip-vit-base-patch32", True, 154, "mit", 512, 52),
+    "siglip-b16": KnownModel("Xenova/siglip-base-patch16-224", True, 206, "apache-2.0", 768, 210),
+    "siglip2-b16": KnownModel("onnx-community/siglip2-base-patch16-224-ONNX", True, 411, "apache-2.0", 768, 210),
+    "clip-b16-openai": KnownModel("timm/vit_base_patch16_clip_224.openai", False, 599, "apache-2.0", 512, 211),
+    "clip-b16-laion": KnownModel("laion/CLIP-ViT-B-16-laion2B-s34B-b88K", False, 599, "mit", 512, 211),
+    "siglip-b16-google": KnownModel("google/siglip-base-patch16-224", False, 813, "apache-2.0", 768, 210),
+    "dino-b16": KnownModel("facebook/dino-vitb16", False, 343, "apache-2.0", 768, 211),
+    "dinov2-b14": KnownModel("facebook/dinov2-base", False, 346, "apache-2.0", 768, 306),
+    "sam-b": KnownModel("facebook/sam-vit-base", False, 375, "apache-2.0", 256, 742),
+}
+"""Short name -> model. Sizes follow from the numbers of weights."""
+
+NAMES = {name: known.repository for name, known in KNOWN.items()}
