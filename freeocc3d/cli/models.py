@@ -162,7 +162,7 @@ def _available_models() -> dict[str, dict[str, Any]]:
     for name, known in known_models.KNOWN.items():
         rows.setdefault(name, {
             "kind": "export" if known.export else "checkpoint", "dimension": known.dimension,
-            "precision": "int8" if known.export else "fp32", "bytes": known.megabytes * 1_000_000,
+            "precision": known.precision, "bytes": known.megabytes * 1_000_000,
             "licence": known.licence, "source": known.repository, "installed": False,
             "seconds": 1e9 * known.gigaflop / speed, "estimated": True,
         })  # fmt: skip

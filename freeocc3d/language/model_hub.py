@@ -26,7 +26,7 @@ from ..core.errors import ModelError
 from ..core.progress import Progress
 from ..core.regular_files import check_regular
 from . import model_packages
-from .known_models import NAMES, RECOMMENDED, WORDS
+from .known_models import KNOWN, NAMES, RECOMMENDED, WORDS
 from .ready_made import export_layout
 from .timed_requests import Answer, NoAnswer, fetch
 from .vision_server import shorten_to_line
@@ -80,7 +80,8 @@ def pull_package(
 ) -> Path:
     """Fetches the repository OWNER/NAME, or one of NAMES ("words" is the recommended one), and returns its folder: for
     a package, the one with its name in the models folder; for a checkpoint, one in the subfolder CHECKPOINTS. Complete
-    files are not fetched again. precision: of a ready-made export; None = int8, or else fp32.
+    files are not fetched again. precision: of a ready-made export; None = the one that suits a known model, and else
+    int8, or the first that exists.
 
     Raises ModelError if the network fails, the repository does not exist or has no usable files, or a hash differs;
     DependencyError if a package is missing that reads an export.
@@ -91,6 +92,8 @@ def pull_package(
     if not is_repository(name):
         raise unknown_name(name)
     local = local_name(name) + (f"-{precision}" if precision else "")
+    if precision is None and (known := KNOWN.get(name)) and known.export and known.precision != "int8":
+        precision = known.precision
     if is_offline():
         raise ModelError(
             f"{repository} is not fetched, because {OFFLINE} is set: unset it, or copy the model's folder."

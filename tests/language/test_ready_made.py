@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ import ready_made
 import tiny_models
 import torch
 from onnx import TensorProto, helper
+from torch import nn
 
 from freeocc3d.core.errors import ModelError
 from freeocc3d.language import clip_attention
-from freeocc3d.language.encoders import clip
+from freeocc3d.language.encoders import clip, dinov2
 from freeocc3d.language.model_export import transformer_graphs as graphs
 from freeocc3d.language.patch_features import Tiling
 from freeocc3d.language.ready_made import onnx_graphs
@@ -116,6 +118,53 @@ def test_a_graph_that_cannot_be_cut_encodes_windows(clip_export: Path, tmp_path:
     with torch.no_grad():
         expected = unit(ready_made.Vision(ready_made.model_of("clip"))(left).numpy())[0]
     assert np.linalg.norm(found[0, 0] - expected) < 2e-3
+
+
+class ConvolutionalVision(nn.Module):
+    """As MobileCLIP's: convolutions, one weighted by averages, then a projected average; fixed: attends to its cells as
+    if there were always 16."""
+
+    def __init__(self, fixed: bool) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.fixed = fixed
+        self.stem, self.mix = nn.Conv2d(3, 12, 8, 8), nn.Conv2d(12, 12, 3, padding=1)
+        self.gate, self.project = nn.Conv2d(12, 12, 1), nn.Linear(12, 24, bias=False)
+
+    def cells(self, pixel_values: torch.Tensor) -> torch.Tensor:
+        x = torch.relu(self.stem(pixel_values))
+        x = self.mix(x) * torch.sigmoid(self.gate(x.mean(dim=(2, 3), keepdim=True)))
+        if self.fixed:
+            y = x.reshape(-1, 12, 16)
+            x = (y @ torch.softmax(y.transpose(1, 2) @ y, dim=-1)).reshape(-1, 12, 4, 4)
+        return x
+
+    def forward(self, pixel_values: torch.Tensor) -> torch.Tensor:
+        return self.project(self.cells(pixel_values).mean(dim=(2, 3)))
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_a_convolutional_network_gives_a_feature_to_each_cell(clip_export: Path, tmp_path: Path, fixed: bool) -> None:
+    own = ConvolutionalVision(fixed).eval()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            own, (torch.zeros(2, 3, 32, 32),), str(clip_export / "onnx" / "vision_model.onnx"), dynamo=False,
+            input_names=["pixel_values"], output_names=["image_embeds"], opset_version=14,
+            dynamic_axes={"pixel_values": {0: "batch"}, "image_embeds": {0: "batch"}},
+        )  # fmt: skip
+    package, lacks = package_of_export(clip_export, tmp_path / "tiny", "someone/tiny", "fp32")
+    assert (package.kind, package.dimension, package.patch, lacks) == ("dense", 24, 8, "")
+    height = 32 if fixed else 48
+    images = np.random.default_rng(0).normal(size=(2, 3, height, 32)).astype(np.float32)
+    (found,) = package.session("image").run(["features"], {"image": images})
+    with torch.no_grad():
+        expected = own.project(own.cells(torch.from_numpy(images)).permute(0, 2, 3, 1)).numpy()
+        embedded = own(torch.from_numpy(images)).numpy()
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(found.mean(axis=(1, 2)), embedded, atol=1e-5)
+    encoder = dinov2.load(dinov2.Options(model=str(package.folder), stride=0, short_side=40))
+    assert encoder.encode(tiny_models.frame(40, 56)).shape == (5, 7, 24)
 
 
 def test_a_text_graph_may_list_an_image_and_a_mask(clip_export: Path, tmp_path: Path) -> None:

@@ -87,6 +87,7 @@ def test_the_models_that_there_are_are_listed_with_their_speed(
     for name, known in known_models.KNOWN.items():
         assert (rows[name]["source"], rows[name]["installed"]) == (known.repository, False)
         assert rows[name]["estimated"]
+    assert (rows["mobileclip-s2"]["precision"], rows["sam-b"]["precision"]) == ("fp16", "fp32")
     assert rows["clip-b16"]["seconds"] == pytest.approx(211 / 52 * rows["clip-b32"]["seconds"])
     monkeypatch.setattr(encoding_speed, "FRAME", None)  # measured once: nothing is encoded again
     succeed(["models", "list", "--available"])

@@ -1,4 +1,4 @@
-"""DINOv2 with a text-aligned head (dino.txt, Talk2DINO) as a model package: patches in the space of words."""
+"""Patches in the space of words as a model package: DINOv2 with a text-aligned head, and convolutional CLIPs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ class Dinov2Encoder(Encoder):
         from ..patch_features import encode_windows, finish_patches
 
         options, rgb = self.options, frame.color
-        patches = encode_windows(rgb, self.package, options.short_side, options.window, self._window_features)
+        short_side, window = options.short_side, options.window
+        if isinstance(self._image.inputs["image"][-1], int):  # it takes images of one size alone
+            short_side, window = max(short_side, self.package.input_size), None
+        patches = encode_windows(rgb, self.package, short_side, window, self._window_features)
         return finish_patches(patches, rgb, options.stride)
 
     def _window_features(self, images: NDArray[np.float32], tiling: Tiling) -> NDArray[np.float32]:

@@ -20,6 +20,7 @@ from ..model_export.tokenizer_files import clip_tokenizer, siglip_tokenizer
 from ..package_files import stated_licence, write_files
 from .export_layout import LARGEST_TOKENIZER, graph_names
 from .onnx_graphs import FLOAT, Additions, CutError, OnnxGraph, join, run_model, sign_weights
+from .pooling_cut import cut_pooling
 from .text_cut import cut_text
 from .vision_cut import cut_vision
 
@@ -101,11 +102,7 @@ def package_of_export(
         kind, vision = "clip", {"image": cut.image, "head": cut.head}
         facts = {"dimension": cut.dimension, "patch": cut.patch, "prefix_tokens": cut.prefix_tokens}
     except CutError as error:
-        kind, vision, facts = "windows", *_whole_windows(graphs[0], _OUTPUTS[family][0], side, source)
-        lacks = (
-            f"{graph_names(precision)[0]} cannot be cut, because {error}. So it gives one feature to a window of "
-            f"{side} pixels instead of one to each patch: small things are lost, and edges are coarse."
-        )
+        kind, vision, facts, lacks = _without_attention(graphs[0], precision, _OUTPUTS[family][0], side, source, error)
     try:
         text, fixed = cut_text(graphs[1], _OUTPUTS[family][1], facts["dimension"], longest, side)
     except CutError as error:
@@ -161,6 +158,28 @@ def _load(folder: Path, name: str, source: str) -> onnx.ModelProto:
 
 def _save(model: onnx.ModelProto, path: Path) -> None:
     onnx.save(model, path)
+
+
+def _without_attention(
+    model: onnx.ModelProto, precision: model_packages.Precision, output: str, side: int, source: str, error: CutError
+) -> tuple[str, dict[str, onnx.ModelProto], dict[str, int], str]:
+    """Kind, networks and facts of a graph whose last attention cannot be replaced, and what it lacks. Raises
+    ModelError."""
+    name = graph_names(precision)[0]
+    try:
+        cut = cut_pooling(model, output, side)
+    except CutError:
+        lacks = (
+            f"{name} cannot be cut, because {error}. So it gives one feature to a window of {side} pixels instead of "
+            "one to each patch: small things are lost, and edges are coarse."
+        )
+        return "windows", *_whole_windows(model, output, side, source), lacks
+    lacks = (
+        f"{name} is convolutional, and such networks often recognize next to nothing in int8: if words find nothing, "
+        "pull it with --precision fp16."
+    )
+    facts = {"dimension": cut.dimension, "patch": cut.patch, "prefix_tokens": 0}
+    return "dense", {"image": cut.image}, facts, lacks if precision == "int8" else ""
 
 
 def _whole_windows(

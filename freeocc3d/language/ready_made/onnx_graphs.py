@@ -69,6 +69,11 @@ class OnnxGraph:
         users = self.users.get(name, [])
         return users[0] if len(users) == 1 and name not in self.outputs else None
 
+    def sole_user_of_data(self, name: str) -> onnx.NodeProto | None:
+        """The node that alone takes a tensor for more than its shape, if there is one."""
+        users = [node for node in self.users.get(name, []) if node.op_type not in _SHAPES]
+        return users[0] if len(users) == 1 and name not in self.outputs else None
+
     def is_single(self, name: str) -> bool:
         """Whether a tensor that does not depend on data is one number: a constant of size one, or made of shapes."""
         value = self.constant(name)

@@ -99,7 +99,7 @@ def cut_vision(model: onnx.ModelProto, output: str, side: int, precision: str) -
     embedding = _find_embedding(graph, feeds, blocks[0].tokens)
     block = _find_last_block(graph, feeds, blocks[-1].mixed)
     image = _image_network(graph, embedding, blocks, block.stream)
-    head = _head_network(graph, block, _Tail.of(graph, feeds, block.after, output, blocks[0].tokens))
+    head = _head_network(graph, block, Tail.of(graph, feeds, block.after, output, blocks[0].tokens))
     expected = graph.run([output], feeds)[output]
     cut = VisionCut(image, head, int(expected.shape[-1]), side // embedding.grid, len(embedding.first))
     _check(cut, images.astype(np.float32), expected, TOLERANCE[precision])
@@ -276,7 +276,7 @@ def _attend(own: _Attention, prefix: str) -> tuple[Additions, str]:
 
 
 @dataclass(frozen=True)
-class _Tail:
+class Tail:
     """What turns the tokens (B, N, C) after the blocks into an embedding (B, D), for any numbers of tokens."""
 
     start: str
@@ -286,8 +286,10 @@ class _Tail:
     """Shape of a reshaping -> what its axes of as many tokens as in training become, and 1 for all others."""
 
     @classmethod
-    def of(cls, graph: OnnxGraph, feeds: dict[str, NDArray[Any]], start: str, output: str, tokens: int) -> _Tail:
-        """Raises CutError."""
+    def of(
+        cls, graph: OnnxGraph, feeds: dict[str, NDArray[Any]], start: str, output: str, tokens: int | None = None
+    ) -> Tail:
+        """tokens: their number in training, which shapes may state. Raises CutError."""
         inside, needed = graph.descendants([start]), graph.ancestors([output])
         nodes = [
             node for node in graph.nodes if inside.intersection(taken_by(node)) and needed.intersection(node.output)
@@ -297,7 +299,9 @@ class _Tail:
         shaping = [node.input[:2] for node in nodes if node.op_type == "Reshape"]
         seen = graph.run([name for names in shaping for name in names], feeds)
         freed = {
-            name: _free(seen[name], seen[before].shape, tokens) for before, name in shaping if tokens in seen[name]
+            name: _free(seen[name], seen[before].shape, tokens)
+            for before, name in shaping
+            if tokens is not None and tokens in seen[name]
         }
         return cls(start, output, tuple(nodes), freed)
 
@@ -330,7 +334,7 @@ def _free(shape: NDArray[Any], before: tuple[int, ...], tokens: int) -> NDArray[
     return freed
 
 
-def _head_network(graph: OnnxGraph, block: _LastBlock, tail: _Tail) -> onnx.ModelProto:
+def _head_network(graph: OnnxGraph, block: _LastBlock, tail: Tail) -> onnx.ModelProto:
     """The network ``head``. The feature of a token is the embedding of an image with that token alone."""
     ends, float32 = Additions("ends"), np.dtype(np.float32)
     mixed, stream = (ends.cast(*own) for own in zip(("mixed", "stream"), block.dtypes, strict=True))
