@@ -84,6 +84,7 @@ class Ranking:
     top: Annotated[int | None, typer.Option("--top", min=1, metavar="K", help="At most K regions for each word.")] = (
         None
     )
+    objects: Annotated[bool, flag("--objects", "Answer with whole objects first, then with what else matches.")] = False
     threshold: Annotated[
         float | None, typer.Option("--threshold", min=-1, max=1, metavar="T", help="Lowest score of a match, -1 to 1.")
     ] = None
@@ -212,6 +213,7 @@ def _question(asked: Asked, place: Place, ranking: Ranking) -> Question:
         image_box=asked.image_box,
         negative=tuple(asked.negative or ()),
         where=where,
+        objects=ranking.objects,
         options={name: value for name, value in options.items() if value is not None},
     )
 

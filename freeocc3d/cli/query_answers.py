@@ -56,6 +56,8 @@ def answers_document(
 def _region(region: Region) -> dict[str, Any]:
     return {
         "label": region.label,
+        "object": region.number,
+        "name": region.name,
         "score": round(region.score, 4),
         "confidence": round(region.confidence, 4),
         "centroid": region.centroid.round(4).tolist(),
@@ -74,11 +76,13 @@ def answers_text(results: Sequence[QueryResult], metric: bool = True, frame: Ans
     lines = []
     for result in results:
         count = len(result.regions)
-        title = f"{result.word}: {count} region{'s' if count != 1 else ''}" if count else f"{result.word}: no match"
+        things = sum(region.number is not None for region in result.regions)
+        counted = [_count(things, "object")] * bool(things) + [_count(count - things, "region")] * (count > things)
+        title = f"{result.word}: {', '.join(counted) or 'no match'}"
         lines.append(f"{title}. {result.note}".rstrip(". ") + ("." if result.note else ""))
         if count:
             columns = f"{f'centroid ({length})':23}  {f'size ({length})':19}  {f'volume ({volume})':>10}"
-            lines.append(f"   #  score  conf.  {columns}  voxels")
+            lines.append(f"   #  score  conf.  {columns}  voxels" + "  object" * bool(things))
         for number, region in enumerate(map(move, result.regions), start=1):
             x, y, z = region.centroid
             dx, dy, dz = region.box_max - region.box_min
@@ -86,5 +90,10 @@ def answers_text(results: Sequence[QueryResult], metric: bool = True, frame: Ans
                 f"  {number:2d}   {region.score:.2f}   {region.confidence:.2f}  "
                 f"{x:7.2f} {y:7.2f} {z:7.2f}  {dx:5.2f} x {dy:4.2f} x {dz:4.2f}  "
                 f"{per_unit3 * region.volume_m3:{len(f'volume ({volume})')}.{digits}f}  {region.voxels:6d}"
+                + (f"  {region.number} {region.name}" if region.number is not None else "")
             )
     return "\n".join(lines)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -20,7 +20,8 @@ class Question:
 
     words: words or phrases.  negative: words for what these do not mean.  classes: names of the map's vocabulary.
     image: a picture.  image_box: x0, y0, x1, y1, the pixels of the picture that count, with the last included.
-    where: conditions on the places of regions.  options: fields of ``word_query.Options``.
+    where: conditions on the places of regions.  objects: whether the answers are whole objects.
+    options: fields of ``word_query.Options``.
     """
 
     words: Sequence[str] = ()
@@ -30,12 +31,13 @@ class Question:
     image_box: tuple[int, int, int, int] | None = None
     where: Where | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+    objects: bool = False
 
 
 def ask(scan_map: Map, question: Question) -> list[QueryResult]:
     """Returns one answer for each word, then for each class, then for the picture. Raises FreeOccError as the map's
     ``query`` methods do."""
-    about: dict[str, Any] = {"where": question.where, **question.options}
+    about: dict[str, Any] = {"where": question.where, "objects": question.objects, **question.options}
     results: list[QueryResult] = []
     if question.words:
         results += scan_map.query_words(list(question.words), negative=question.negative, **about)

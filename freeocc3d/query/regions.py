@@ -33,6 +33,7 @@ class Region:
     centroid: (3,) mean of the voxels' centers, map frame, meters.
     box_min, box_max: (3,) corners of the axis-aligned box around the voxels, faces included, meters.  rows: (n,) rows
     of ``Occupancy.occupied_voxels()``.  label: the word that found it.
+    number, name: of the object that it is, if whole objects were asked for; see ``query.objects.ranking``.
     """
 
     score: float
@@ -43,6 +44,8 @@ class Region:
     volume_m3: float
     rows: NDArray[np.int64]
     label: str = ""
+    number: int | None = None
+    name: str = ""
 
     @property
     def voxels(self) -> int:

@@ -42,38 +42,44 @@ class Map(SavedMap):
         contrast: Sequence[str] = (),
         negative: Sequence[str] = (),
         where: Where | None = None,
+        objects: bool = False,
         **options: Any,
     ) -> list[QueryResult]:
         """``query`` for several words. contrast: words for other things in the scan, added to the encoder's own.
         negative: words for what is not meant.  where: conditions on the places of regions; see
-        ``query.conditions.Where``."""
-        return self._placed(lambda asked: self._words(words, asked, contrast, negative), where, options)
+        ``query.conditions.Where``.  objects: whether regions are whole objects where most of an object matches; see
+        ``query.objects.ranking``."""
+        return self._placed(lambda asked: self._words(words, asked, contrast, negative), where, objects, options)
 
-    def query_classes(self, names: list[str], where: Where | None = None, **options: Any) -> list[QueryResult]:
+    def query_classes(
+        self, names: list[str], where: Where | None = None, objects: bool = False, **options: Any
+    ) -> list[QueryResult]:
         """Finds the voxels whose nearest name in ``vocabulary`` is each of these; see ``query.class_query``. Of the
-        options, only ``top_k`` and ``narrow`` apply."""
+        options, only ``top_k`` and ``narrow`` apply. where, objects: as in ``query_words``."""
         from .class_query import query_classes
 
         ask = functools.partial(query_classes, self.occupancy, self.text_encoder, self.vocabulary, names, up=self.up)
-        return self._placed(ask, where, options)
+        return self._placed(ask, where, objects, options)
 
     def query_image(
         self,
         image: str | Path | NDArray[np.uint8],
         box: tuple[int, int, int, int] | None = None,
         where: Where | None = None,
+        objects: bool = False,
         **options: Any,
     ) -> QueryResult:
         """Finds where the map looks like a picture, a file or (H, W, 3) RGB, or like a box x0 y0 x1 y1 of its pixels;
-        see ``query.image_query``."""
+        see ``query.image_query``. where, objects: as in ``query_words``."""
         from . import image_query
 
         feature = image_query.patch_feature(image_query.picture_encoder(self), image, box)
         name = "the picture" if isinstance(image, np.ndarray) else Path(image).name
-        found = self._placed(
-            lambda asked: [image_query.query_feature(self.occupancy, feature, name, asked, self.up)], where, options
-        )
-        return found[0]
+
+        def ask(asked: Options) -> list[QueryResult]:
+            return [image_query.query_feature(self.occupancy, feature, name, asked, self.up)]
+
+        return self._placed(ask, where, objects, options)[0]
 
     def objects(self, **options: Any) -> list[Object]:
         """Returns the things of the room, best described first; see ``query.objects.finding``. ``options``: fields of
@@ -81,7 +87,9 @@ class Map(SavedMap):
         from .objects import finding
         from .objects.object import Options as ObjectOptions
 
-        return finding.find_objects(self, typed_options.build(ObjectOptions, options))
+        if options:
+            return finding.find_objects(self, typed_options.build(ObjectOptions, options))
+        return list(self._objects)
 
     def labels(self) -> NDArray[np.uint8]:
         """Returns the (V,) class of each occupied voxel: 0 = nothing known, k = ``vocabulary[k - 1]``."""
@@ -131,6 +139,12 @@ class Map(SavedMap):
         return standing_places(self.occupancy, self.T_gravity_map, regions)
 
     @functools.cached_property
+    def _objects(self) -> list[Object]:
+        from .objects import finding
+
+        return finding.find_objects(self)
+
+    @functools.cached_property
     def _class_labels(self) -> NDArray[np.uint8]:
         text = self.text_encoder.encode_words(self.vocabulary[:253])
         return (word_query.nearest_word(self.occupancy.features, text) + 1).astype(np.uint8)
@@ -143,17 +157,30 @@ class Map(SavedMap):
         return word_query.query(self.occupancy, self.text_encoder, words, options, others, negative, self.up)
 
     def _placed(
-        self, ask: Callable[[Options], list[QueryResult]], where: Where | None, options: dict[str, Any]
+        self,
+        ask: Callable[[Options], list[QueryResult]],
+        where: Where | None,
+        objects: bool,
+        options: dict[str, Any],
     ) -> list[QueryResult]:
-        """Returns the results with only the regions that meet the conditions."""
+        """Returns the results with whole objects, if asked for, and only the regions that meet the conditions."""
         checked = typed_options.build(word_query.Options, options)
-        if where is None:
+        if where is None and not objects:
             return ask(checked)
         from . import conditions
 
         every = checked.changed(top_k=max(len(self.occupancy.colors), 1))
-        references = self._words(where.words, every) if where.words else []
-        return conditions.only_where(self.occupancy, self.up, ask(every), references, where, checked.top_k)
+        results, references = ask(every), self._words(where.words, every) if where is not None and where.words else []
+        if objects:
+            from .objects.ranking import rank_objects
+
+            results, references = (
+                [rank_objects(self.occupancy, result, self._objects) for result in some]
+                for some in (results, references)
+            )
+        return conditions.only_where(
+            self.occupancy, self.up, results, references, where or conditions.Where(), checked.top_k
+        )
 
 
 def load_map(path: str | Path) -> Map:

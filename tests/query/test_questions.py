@@ -19,9 +19,9 @@ def test_words_come_first_then_classes_then_the_picture() -> None:
         query_words=answer, query_classes=answer, query_image=lambda *a, **o: answer(*a, **o)[0]
     )
     where = Where(pick="best")
-    question = Question(["cup"], ["red"], ["sofa"], Path("a.png"), (0, 0, 1, 1), where, {"top_k": 3})
+    question = Question(["cup"], ["red"], ["sofa"], Path("a.png"), (0, 0, 1, 1), where, {"top_k": 3}, True)
     assert ask(scan_map, question) == ["answer 1", "answer 2", "answer 3"]
-    about = {"where": where, "top_k": 3}
+    about = {"where": where, "objects": True, "top_k": 3}
     assert asked == [
         (["cup"], {"negative": ["red"], **about}),
         (["sofa"], about),
