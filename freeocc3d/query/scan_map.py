@@ -19,6 +19,7 @@ from ..storage.saved_map import SavedMap
 from . import word_query
 
 if TYPE_CHECKING:
+    from ..core.types import Occupancy
     from .best_views import RegionView
     from .conditions import Where
     from .objects.object import Object
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from .oriented_boxes import OrientedBox
     from .regions import Region
     from .word_query import Options, QueryResult
+
+    _Ask = Callable[[Occupancy, Options], list[QueryResult]]
 
 
 class Map(SavedMap):
@@ -49,7 +52,11 @@ class Map(SavedMap):
         negative: words for what is not meant.  where: conditions on the places of regions; see
         ``query.conditions.Where``.  objects: whether regions are whole objects where most of an object matches; see
         ``query.objects.ranking``."""
-        return self._placed(lambda asked: self._words(words, asked, contrast, negative), where, objects, options)
+
+        def ask(occupancy: Occupancy, asked: Options) -> list[QueryResult]:
+            return self._words(words, occupancy, asked, contrast, negative)
+
+        return self._placed(ask, where, objects, options)
 
     def query_classes(
         self, names: list[str], where: Where | None = None, objects: bool = False, **options: Any
@@ -58,7 +65,9 @@ class Map(SavedMap):
         options, only ``top_k`` and ``narrow`` apply. where, objects: as in ``query_words``."""
         from .class_query import query_classes
 
-        ask = functools.partial(query_classes, self.occupancy, self.text_encoder, self.vocabulary, names, up=self.up)
+        def ask(occupancy: Occupancy, asked: Options) -> list[QueryResult]:
+            return query_classes(occupancy, self.text_encoder, self.vocabulary, names, asked, self.up)
+
         return self._placed(ask, where, objects, options)
 
     def query_image(
@@ -76,8 +85,8 @@ class Map(SavedMap):
         feature = image_query.patch_feature(image_query.picture_encoder(self), image, box)
         name = "the picture" if isinstance(image, np.ndarray) else Path(image).name
 
-        def ask(asked: Options) -> list[QueryResult]:
-            return [image_query.query_feature(self.occupancy, feature, name, asked, self.up)]
+        def ask(occupancy: Occupancy, asked: Options) -> list[QueryResult]:
+            return [image_query.query_feature(occupancy, feature, name, asked, self.up)]
 
         return self._placed(ask, where, objects, options)[0]
 
@@ -150,15 +159,20 @@ class Map(SavedMap):
         return (word_query.nearest_word(self.occupancy.features, text) + 1).astype(np.uint8)
 
     def _words(
-        self, words: list[str], options: Options, contrast: Sequence[str] = (), negative: Sequence[str] = ()
+        self,
+        words: list[str],
+        occupancy: Occupancy,
+        options: Options,
+        contrast: Sequence[str] = (),
+        negative: Sequence[str] = (),
     ) -> list[QueryResult]:
         named = self.scene_words if self.text_encoder.open_vocabulary else []
         others = [*named, *contrast]
-        return word_query.query(self.occupancy, self.text_encoder, words, options, others, negative, self.up)
+        return word_query.query(occupancy, self.text_encoder, words, options, others, negative, self.up)
 
     def _placed(
         self,
-        ask: Callable[[Options], list[QueryResult]],
+        ask: _Ask,
         where: Where | None,
         objects: bool,
         options: dict[str, Any],
@@ -166,21 +180,21 @@ class Map(SavedMap):
         """Returns the results with whole objects, if asked for, and only the regions that meet the conditions."""
         checked = typed_options.build(word_query.Options, options)
         if where is None and not objects:
-            return ask(checked)
+            return ask(self.occupancy, checked)
         from . import conditions
 
         every = checked.changed(top_k=max(len(self.occupancy.colors), 1))
-        results, references = ask(every), self._words(where.words, every) if where is not None and where.words else []
-        if objects:
-            from .objects.ranking import rank_objects
+        where = where or conditions.Where()
+        answer = self._with_objects if objects else lambda ask, asked: ask(self.occupancy, asked)
+        references = answer(functools.partial(self._words, where.words), every) if where.words else []
+        return conditions.only_where(self.occupancy, self.up, answer(ask, every), references, where, checked.top_k)
 
-            results, references = (
-                [rank_objects(self.occupancy, result, self._objects) for result in some]
-                for some in (results, references)
-            )
-        return conditions.only_where(
-            self.occupancy, self.up, results, references, where or conditions.Where(), checked.top_k
-        )
+    def _with_objects(self, ask: _Ask, asked: Options) -> list[QueryResult]:
+        """Returns the answers with whole objects first."""
+        from .objects.ranking import pool_features, rank_objects
+
+        plain, pooled = ask(self.occupancy, asked), ask(pool_features(self.occupancy, self._objects), asked)
+        return [rank_objects(self.occupancy, *both, self._objects) for both in zip(plain, pooled, strict=True)]
 
 
 def load_map(path: str | Path) -> Map:

@@ -44,15 +44,16 @@ def test_the_document_and_the_table_tell_of_the_same_objects(room: Path, tmp_pat
 
 def test_a_query_answers_with_whole_objects_first(room: Path) -> None:
     objects = load_map(room).objects()
-    regions = json.loads(run("query", room, "yellow", "--objects", "--json").stdout)["results"][0]["regions"]
+    word = objects[0].name
+    regions = json.loads(run("query", room, word, "--objects", "--json").stdout)["results"][0]["regions"]
     numbers = [region["object"] for region in regions]
     things = [number for number in numbers if number is not None]
     assert things
     assert numbers == [*things, *[None] * (len(numbers) - len(things))]
     for region, number in zip(regions, things, strict=False):
         assert (region["name"], region["voxels"]) == (objects[number - 1].name, len(objects[number - 1].rows))
-    count = f"yellow: {len(things)} object{'s' if len(things) > 1 else ''}"
-    assert run("query", room, "yellow", "--objects").stdout.startswith(count)
+    count = f"{word}: {len(things)} object{'s' if len(things) > 1 else ''}"
+    assert run("query", room, word, "--objects").stdout.startswith(count)
 
 
 def test_unusable_targets_are_told_before_any_work(room: Path, tmp_path: Path) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worded_voxels import SIZE, WORDS, box, feature, occupancy
 
 from freeocc3d.core.types import Occupancy
+from freeocc3d.language.feature_codec import Codec, CodedFeatures
 from freeocc3d.query.objects.object import Object
-from freeocc3d.query.objects.ranking import rank_objects
+from freeocc3d.query.objects.ranking import pool_features, rank_objects
 from freeocc3d.query.oriented_boxes import oriented_boxes
 from freeocc3d.query.regions import Region, best_regions
 from freeocc3d.query.word_query import Options, QueryResult, query
@@ -30,6 +33,11 @@ def ask(made: Occupancy, word: str = "cup") -> QueryResult:
     return query(made, WORDS, [word], Options(top_k=10**6, narrow=0.0))[0]
 
 
+def ranked(made: Occupancy, objects: list[Object], word: str = "cup") -> QueryResult:
+    """The answer with whole objects; those without features only gather the votes of their voxels."""
+    return rank_objects(made, ask(made, word), ask(pool_features(made, objects), word), objects)
+
+
 def told(region: Region) -> tuple[int | None, str, int]:
     return region.number, region.name, region.voxels
 
@@ -41,9 +49,9 @@ def test_an_object_in_pieces_is_one_answer_with_all_its_voxels() -> None:
     made = occupancy(striped | box((20, 0, 0), (24, 4, 4), CUP))
     plain = ask(made)
     assert len(plain.regions) == 4
-    ranked = rank_objects(made, plain, [thing(made, (0, 0, 0), (9, 3, 3)), thing(made, (20, 0, 0), (24, 4, 4))])
-    assert [told(region) for region in ranked.regions] == [(2, "cup", 64), (1, "cup", 81)]
-    whole = ranked.regions[1]
+    found = ranked(made, [thing(made, (0, 0, 0), (9, 3, 3)), thing(made, (20, 0, 0), (24, 4, 4))]).regions
+    assert [told(region) for region in found] == [(2, "cup", 64), (1, "cup", 81)]
+    whole = found[1]
     np.testing.assert_allclose((whole.box_min, whole.box_max), ((0, 0, 0), (9 * SIZE, 3 * SIZE, 3 * SIZE)))
     volume = 81 * SIZE**3
     assert whole.score == pytest.approx(np.mean(plain.scores[whole.rows]) * volume / (volume + 1e-3), rel=1e-3)
@@ -55,28 +63,49 @@ def test_a_region_over_two_objects_and_the_floor_becomes_three_answers() -> None
     made = occupancy(floor | box((2, 2, 1), (6, 6, 4), CUP) | box((10, 2, 1), (13, 5, 4), CUP))
     assert len(ask(made).regions) == 1
     objects = [thing(made, (2, 2, 1), (6, 6, 4), "bowl"), thing(made, (10, 2, 1), (13, 5, 4))]
-    ranked = rank_objects(made, ask(made), objects)
-    assert [told(region) for region in ranked.regions] == [(1, "bowl", 48), (2, "cup", 27), (None, "", 400)]
+    assert [told(region) for region in ranked(made, objects).regions] == [
+        (1, "bowl", 48),
+        (2, "cup", 27),
+        (None, "", 400),
+    ]
 
 
 @pytest.mark.parametrize(("layers", "whole"), [(2, True), (1, False)])
 def test_half_of_an_object_must_match(layers: int, whole: bool) -> None:
     made = occupancy(box((0, 0, 0), (4, 4, layers), CUP) | box((0, 0, layers), (4, 4, 4), SOFA))
-    ranked = rank_objects(made, ask(made), [thing(made, (0, 0, 0), (4, 4, 4))])
-    assert [told(region) for region in ranked.regions] == [(1, "cup", 64) if whole else (None, "", 16 * layers)]
+    found = ranked(made, [thing(made, (0, 0, 0), (4, 4, 4))]).regions
+    assert [told(region) for region in found] == [(1, "cup", 64) if whole else (None, "", 16 * layers)]
 
 
 def test_fringes_and_specks_beside_objects_are_left_out() -> None:
     cup, fringe = box((0, 0, 0), (4, 4, 4), CUP), box((4, 0, 0), (5, 4, 4), CUP)
     speck, region = box((20, 0, 0), (21, 3, 2), CUP), box((30, 0, 0), (32, 2, 2), CUP)
     made = occupancy(cup | fringe | speck | region)
-    ranked = rank_objects(made, ask(made), [thing(made, (0, 0, 0), (4, 4, 4))])
-    assert [told(region) for region in ranked.regions] == [(1, "cup", 64), (None, "", 8)]
+    found = ranked(made, [thing(made, (0, 0, 0), (4, 4, 4))]).regions
+    assert [told(region) for region in found] == [(1, "cup", 64), (None, "", 8)]
 
 
 def test_without_matching_objects_an_answer_stays() -> None:
     made = occupancy(box((0, 0, 0), (2, 2, 2), CUP) | box((9, 0, 0), (11, 2, 2), SOFA))
     plain = ask(made)
-    assert rank_objects(made, plain, [thing(made, (9, 0, 0), (11, 2, 2), "sofa")]).regions == plain.regions
-    assert rank_objects(made, plain, []).regions == plain.regions
-    assert rank_objects(made, ask(made, "unicorn"), []).regions == []
+    for objects in ([thing(made, (9, 0, 0), (11, 2, 2), "sofa")], []):
+        assert list(map(told, ranked(made, objects).regions)) == list(map(told, plain.regions)) == [(None, "", 8)]
+    assert ranked(made, [], "unicorn").regions == []
+
+
+@pytest.mark.parametrize("coded", [False, True])
+def test_an_objects_feature_answers_where_its_voxels_are_too_uncertain(coded: bool) -> None:
+    rng = np.random.default_rng(0)
+    made = occupancy(box((0, 0, 0), (6, 6, 6), CUP) | box((20, 0, 0), (26, 6, 6), SOFA))
+    true = np.asarray(made.features, np.float32)
+    noisy = true + rng.normal(0, 0.7, true.shape)
+    noisy = (noisy / np.linalg.norm(noisy, axis=1, keepdims=True)).astype(np.float16)
+    codec = Codec.fit(noisy)
+    made = made.replace(features=CodedFeatures(codec, codec.encode(noisy)) if coded else noisy)
+    objects = [thing(made, (0, 0, 0), (6, 6, 6)), thing(made, (20, 0, 0), (26, 6, 6), "sofa")]
+    means = [noisy[own.rows].astype(np.float32).mean(axis=0) for own in objects]
+    objects = [replace(own, feature=mean / np.linalg.norm(mean)) for own, mean in zip(objects, means, strict=True)]
+    plain = ask(made).regions
+    assert len(plain) > 1  # a part of the cup, and specks of the sofa
+    assert plain[0].voxels < 0.9 * 216
+    assert [told(region) for region in ranked(made, objects).regions] == [(1, "cup", 216)]

@@ -1,9 +1,11 @@
-"""Answers with whole objects: a word that matches most of a chair finds the chair once, not as several specks of it,
-and not together with the floor of the same color.
+"""Answers with whole objects: a word finds a chair once, not as several specks of it, and not together with the floor
+of the same color.
 
-A voxel's match is uncertain, and an object's is the vote of its voxels. So an object of which at least half matches is
-an answer, with all its voxels. What matches besides, on surfaces that are no objects or on parts of objects, follows.
-Source of the idea: instances that gather votes of their points, A. Takmaz et al., OpenMask3D, NeurIPS 2023.
+A voxel's feature is uncertain; an object's, a mean over many voxels or views, is much less so. So a question is asked
+twice: of the voxels, and of a copy of the map in which the voxels of an object have the object's feature. An object is
+an answer if its feature matches, or if at least half of it matches by its voxels' own. Then follows what else matches,
+such as the floor. Sources of the ideas: Q. Gu et al., ConceptGraphs, ICRA 2024 (features of objects); A. Takmaz et al.,
+OpenMask3D, NeurIPS 2023 (instances that gather what their points say).
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.types import Occupancy
+from ...language.feature_codec import CodedFeatures
 from ..regions import Region, best_regions
 from ..word_query import QueryResult
 from .object import Object
@@ -26,41 +29,74 @@ _LEFT = 0.5
 _PATCH = 8  # voxels: a patch of surface of two by two voxels, two deep; less beside objects is a speck
 
 
-def rank_objects(occupancy: Occupancy, result: QueryResult, objects: Sequence[Object]) -> QueryResult:
+def pool_features(occupancy: Occupancy, objects: Sequence[Object]) -> Occupancy:
+    """Returns the voxels with the feature of their object in place of their own, if the object has one."""
+    known = [thing for thing in objects if thing.feature.any()]
+    if not known:
+        return occupancy
+    rows = np.concatenate([thing.rows for thing in known])
+    own = np.repeat(np.arange(len(known)), [len(thing.rows) for thing in known])
+    features, pooled = occupancy.features, np.stack([thing.feature for thing in known])
+    if isinstance(features, CodedFeatures):
+        codes = features.codes.copy()
+        codes[rows] = features.codec.encode(pooled)[own]
+        return occupancy.replace(features=CodedFeatures(features.codec, codes))
+    dense = np.array(features)
+    dense[rows] = pooled.astype(dense.dtype)[own]
+    return occupancy.replace(features=dense)
+
+
+def rank_objects(
+    occupancy: Occupancy, plain: QueryResult, pooled: QueryResult, objects: Sequence[Object]
+) -> QueryResult:
     """Returns an answer with the objects that match as its first regions, best score first, and then the regions that
     are left.
 
-    result: the answer with all its regions.  A region that is an object has the object's number, from 1, and name. Its
-    score is that of a region of all its voxels; its confidence is the mean of the regions that it comes of, by volume.
+    plain, pooled: the answers of the map and of that of ``pool_features``, with all their regions.  A region that is an
+    object has the object's number, from 1, and name. Its score and confidence are those of its voxels in the answer
+    that it comes of. If no object matches, the plain answer stays.
     """
-    count = len(result.scores)
-    confidence, region_of = np.zeros(count, np.float32), np.full(count, -1)
-    for number, region in enumerate(result.regions):
-        confidence[region.rows], region_of[region.rows] = region.confidence, number
-    instance = np.full(count, -1)
+    instance = np.full(len(plain.scores), -1)
     for number, thing in enumerate(objects):
         instance[thing.rows] = number
     volume = np.asarray((occupancy.occupied_edges() * occupancy.finest) ** 3, np.float64)
-    held, matched = instance >= 0, (instance >= 0) & (region_of >= 0)
-    whole = np.bincount(instance[held], volume[held], len(objects))
-    part = np.bincount(instance[matched], volume[matched], len(objects))
-    answers = part >= np.maximum(_MATCHING * whole, 1e-12)
-    if not answers.any():
-        return result
-    sure = np.bincount(instance[matched], (volume * confidence)[matched], len(objects)) / np.maximum(part, 1e-12)
-    rows = np.flatnonzero(held & answers[instance])
-    found = _regions(occupancy, rows, instance[rows], result)
-    of = [int(instance[region.rows[0]]) for region in found]
-    things = [
-        replace(region, confidence=float(sure[k]), number=k + 1, name=objects[k].name)
-        for region, k in zip(found, of, strict=True)
-    ]
-    taken = np.zeros(count, bool)
-    taken[rows] = True
+    things: list[Region] = []
+    for result in (pooled, plain):
+        known = np.array([thing.number for thing in things if thing.number is not None], np.int64) - 1
+        share, confidence = _count_matches(result, instance, volume, len(objects))
+        share[known] = 0
+        held = np.flatnonzero(instance >= 0)
+        rows = held[share[instance[held]] >= _MATCHING]
+        things += [
+            replace(region, confidence=float(confidence[k]), number=k + 1, name=objects[k].name)
+            for region in _regions(occupancy, rows, instance[rows], result)
+            for k in [int(instance[region.rows[0]])]
+        ]
+    if not things:
+        return plain
+    things.sort(key=lambda region: -region.score)
+    taken = np.zeros(len(instance), bool)
+    taken[np.concatenate([region.rows for region in things])] = True
     rest = [
-        _remaining(occupancy, region, region.rows[~taken[region.rows]], volume, result) for region in result.regions
+        _remaining(occupancy, region, region.rows[~taken[region.rows]], volume, pooled) for region in pooled.regions
     ]
-    return replace(result, regions=[*things, *(region for region in rest if region is not None)])
+    answer = pooled if pooled.matched else plain
+    return replace(answer, regions=[*things, *(region for region in rest if region is not None)])
+
+
+def _count_matches(
+    result: QueryResult, instance: NDArray[np.integer], volume: NDArray[np.float64], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the (N,) share of each object's volume that matches, and the (N,) mean confidence there."""
+    confidence, matched = np.zeros(len(instance)), np.zeros(len(instance), bool)
+    for region in result.regions:
+        confidence[region.rows], matched[region.rows] = region.confidence, True
+    held = instance >= 0
+    matched &= held
+    whole = np.bincount(instance[held], volume[held], count)
+    part = np.bincount(instance[matched], volume[matched], count)
+    sure = np.bincount(instance[matched], (volume * confidence)[matched], count)
+    return part / np.maximum(whole, 1e-12), sure / np.maximum(part, 1e-12)
 
 
 def _regions(
