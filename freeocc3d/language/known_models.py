@@ -37,6 +37,7 @@ KNOWN = {
     "clip-b16-openai": KnownModel("timm/vit_base_patch16_clip_224.openai", False, 599, "apache-2.0", 512, 211, "fp32"),
     "clip-b16-laion": KnownModel("laion/CLIP-ViT-B-16-laion2B-s34B-b88K", False, 599, "mit", 512, 211, "fp32"),
     "siglip-b16-google": KnownModel("google/siglip-base-patch16-224", False, 813, "apache-2.0", 768, 210, "fp32"),
+    "siglip2-b16-naflex": KnownModel("google/siglip2-base-patch16-naflex", False, 1500, "apache-2.0", 768, 278, "fp32"),
     "dino-b16": KnownModel("facebook/dino-vitb16", False, 343, "apache-2.0", 768, 211, "fp32"),
     "dinov2-b14": KnownModel("facebook/dinov2-base", False, 346, "apache-2.0", 768, 306, "fp32"),
     "sam-b": KnownModel("facebook/sam-vit-base", False, 375, "apache-2.0", 256, 742, "fp32"),

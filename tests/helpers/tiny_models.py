@@ -114,6 +114,20 @@ def siglip(seed: int = 1) -> Any:
         return lively(model)
 
 
+def naflex(seed: int = 3) -> Any:
+    """SigLIP 2 for images of any shape, as flattened patches."""
+    from transformers import Siglip2Config, Siglip2Model
+
+    sizes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+    words = {"vocab_size": len(vocabulary()[0]), "max_position_embeddings": 16, "projection_size": 32,
+             "bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1}  # fmt: skip
+    with seeded(seed):
+        config = Siglip2Config(
+            vision_config={**sizes, "patch_size": 8, "num_patches": 16}, text_config={**sizes, **words}
+        )
+        return lively(Siglip2Model(config))
+
+
 def dinov2(seed: int = 2, registers: int = 0) -> Any:
     import transformers
 

@@ -62,6 +62,23 @@ def test_siglip_equals_transformers_forward_pass(siglip_folder: Path, height: in
     assert np.abs(encoder(siglip_folder).pooled(given) - expected).max() < 1e-4 * np.abs(expected).max()
 
 
+def test_naflex_equals_transformers_forward_pass(tmp_path: Path) -> None:
+    model = tiny_models.naflex()
+    checkpoint = build_siglip(model, tiny_models.tokenizer(), [0.5] * 3, [0.5] * 3)
+    write_package(checkpoint, tmp_path / "naflex", "naflex", "random weights", "none")
+    for height, width in ((32, 32), (24, 80)):
+        given = torch.from_numpy(images(height, width))
+        patches = given.reshape(2, 3, height // 8, 8, width // 8, 8).permute(0, 2, 4, 3, 5, 1).flatten(3).flatten(1, 2)
+        shapes = torch.tensor([[height // 8, width // 8]] * 2)
+        with torch.no_grad():
+            mask = torch.ones(patches.shape[:2], dtype=torch.int64)
+            expected = model.get_image_features(patches, pixel_attention_mask=mask, spatial_shapes=shapes)
+        expected = getattr(expected, "pooler_output", expected).numpy()
+        found = encoder(tmp_path / "naflex").pooled(given.numpy())
+        assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
+    assert encoder(tmp_path / "naflex").package.input_size == 32
+
+
 def plain_dense(model: Any, pixels: torch.Tensor, attention: str, grid: tuple[int, int]) -> torch.Tensor:
     """(B, h w, D) dense features of transformers' CLIP, the last block written as each paper has it."""
     vision = model.vision_model

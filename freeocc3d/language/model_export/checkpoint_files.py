@@ -45,7 +45,7 @@ def read_checkpoint(source: str, tokenizer: Path | None, text: str | None, text_
         return build_text_aligned(model, _clip_of(other), read_tokenizer(tokenizer or other), _safetensors(text_head))
     if kind == "clip":
         return build_clip(model, read_tokenizer(tokenizer or folder), mean, std)
-    if kind == "siglip":
+    if kind in ("siglip", "siglip2"):
         return build_siglip(model, read_tokenizer(tokenizer or folder), mean, std)
     return build_sam(model, mean, std) if kind == "sam" else build_backbone(model, mean, std)
 
@@ -69,8 +69,8 @@ def _from_transformers(folder: Path) -> nn.Module:
     try:
         config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
         name = {
-            "clip": "CLIPModel", "siglip": "SiglipModel", "vit": "ViTModel", "dinov2": "Dinov2Model",
-            "dinov2_with_registers": "Dinov2WithRegistersModel", "sam": "SamModel",
+            "clip": "CLIPModel", "siglip": "SiglipModel", "siglip2": "Siglip2Model", "vit": "ViTModel",
+            "dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel", "sam": "SamModel",
         }[config["model_type"]]  # fmt: skip
         loaded = getattr(transformers, name).from_pretrained(
             folder, use_safetensors=True, local_files_only=True, attn_implementation="eager"
@@ -122,5 +122,7 @@ def _normalization(folder: Path, kind: str) -> tuple[list[float], list[float]]:
     """Mean and standard deviation from a checkpoint's preprocessor_config.json, or the usual ones for its kind."""
     path = folder / "preprocessor_config.json"
     stated = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    usual = {"clip": (CLIP_MEAN, CLIP_STD), "siglip": ([0.5] * 3, [0.5] * 3)}.get(kind, (DINO_MEAN, DINO_STD))
+    usual = {"clip": (CLIP_MEAN, CLIP_STD), "siglip": ([0.5] * 3, [0.5] * 3), "siglip2": ([0.5] * 3, [0.5] * 3)}.get(
+        kind, (DINO_MEAN, DINO_STD)
+    )
     return list(stated.get("image_mean", usual[0])), list(stated.get("image_std", usual[1]))

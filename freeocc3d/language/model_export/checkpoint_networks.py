@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from tokenizers import Tokenizer
 from torch import Tensor, nn
 
 from . import transformer_graphs as graphs
@@ -17,6 +18,9 @@ CLIP_MEAN, CLIP_STD = [0.48145466, 0.4578275, 0.40821073], [0.26862954, 0.261302
 
 DINO_MEAN, DINO_STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
 """ImageNet's."""
+
+SIGLIP_VOCABULARY = 32_000
+"""Tokens of SigLIP; SigLIP 2 has more."""
 
 _TALK2DINO_TEMPERATURE = 0.07
 """Softmax temperature in the training of Talk2DINO."""
@@ -56,10 +60,13 @@ def build_clip(model: nn.Module, tokenizer: str, mean: list[float], std: list[fl
 
 
 def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[float]) -> Checkpoint:
-    """From transformers' SiglipModel."""
+    """From transformers' SiglipModel (SigLIP, SigLIP 2 of a fixed size) or Siglip2Model (NaFlex)."""
     text, vision = model.config.text_config, model.config.vision_config
     tokens = torch.zeros((2, text.max_position_embeddings), dtype=torch.int64)
     words = _text_network(graphs.SiglipText(model), tokens, (0,))
+    second = text.vocab_size > SIGLIP_VOCABULARY
+    stated = Tokenizer.from_str(tokenizer).token_to_id("<pad>") if second else None  # config.json states SigLIP's
+    pad = text.pad_token_id if stated is None else stated
     return Checkpoint(
         "clip",
         {**_image_networks(model, graphs.SiglipHead(model)), "text": words},
@@ -67,7 +74,7 @@ def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[
             **_facts(vision.hidden_size, mean, std, vision, 0, math.exp(model.logit_scale.item())),
             "logit_bias": round(model.logit_bias.item(), 4),
         },
-        siglip_tokenizer(tokenizer, text.max_position_embeddings, text.pad_token_id),
+        siglip_tokenizer(tokenizer, text.max_position_embeddings, pad, without_punctuation=not second),
     )  # fmt: skip
 
 
@@ -143,5 +150,12 @@ def _facts(
 ) -> dict[str, Any]:
     return {
         "dimension": int(dimension), "mean": mean, "std": std, "patch": int(vision.patch_size),
-        "input_size": int(vision.image_size), "prefix_tokens": prefix, "logit_scale": round(logit_scale, 4),
+        "input_size": _image_size(vision), "prefix_tokens": prefix, "logit_scale": round(logit_scale, 4),
     }  # fmt: skip
+
+
+def _image_size(vision: Any) -> int:
+    """Edge of the training images in pixels; that of a square one for NaFlex, which states a number of patches."""
+    if hasattr(vision, "image_size"):
+        return int(vision.image_size)
+    return int(vision.num_patches**0.5) * int(vision.patch_size)

@@ -25,15 +25,26 @@ def clip_block(layer: nn.Module, x: Tensor, mask: Tensor | None = None) -> Tenso
     return x + layer.mlp(layer.layer_norm2(x))
 
 
-def positions(table: Tensor, grid: int, height: int, width: int, antialias: bool = False) -> Tensor:
+def positions(
+    table: Tensor, grid: int, height: int, width: int, antialias: bool = False, mode: str = "bicubic"
+) -> Tensor:
     """(1, height width, C) interpolated from (grid², C) position embeddings."""
     square = table.reshape(1, grid, grid, -1).permute(0, 3, 1, 2)
-    fitted = F.interpolate(square, size=(height, width), mode="bicubic", align_corners=False, antialias=antialias)
+    fitted = F.interpolate(square, size=(height, width), mode=mode, align_corners=False, antialias=antialias)
     return fitted.flatten(2).transpose(1, 2)
 
 
+def as_convolution(linear: nn.Linear, patch: int) -> nn.Conv2d:
+    """The convolution of images that equals a layer on flattened (patch, patch, RGB) pixels of patches."""
+    made = nn.Conv2d(3, linear.out_features, patch, patch)
+    weight = linear.weight.detach().reshape(-1, patch, patch, 3).permute(0, 3, 1, 2)
+    made.load_state_dict({"weight": weight, "bias": linear.bias.detach()})
+    return made
+
+
 class ImageTrunk(nn.Module):
-    """CLIP's or SigLIP's vision tower up to the last block's queries, keys and values."""
+    """The vision tower of CLIP, SigLIP or SigLIP 2 NaFlex up to the last block's queries, keys and values. NaFlex takes
+    flattened patches, and interpolates its positions linearly, with antialiasing."""
 
     def __init__(self, vision: nn.Module):
         super().__init__()
@@ -41,7 +52,10 @@ class ImageTrunk(nn.Module):
         self.patches, self.layers = own.patch_embedding, vision.encoder.layers
         self.before = getattr(vision, "pre_layrnorm", nn.Identity())
         table = own.position_embedding.weight.detach()
-        self.grid = own.image_size // own.patch_size
+        self.mode = "bicubic"
+        if isinstance(self.patches, nn.Linear):
+            self.patches, self.mode = as_convolution(self.patches, own.patch_size), "bilinear"
+        self.grid = int(len(table) ** 0.5)
         self.prefix = len(table) - self.grid**2
         self.register_buffer("table", table[self.prefix :])
         first = own.class_embedding.detach() + table[0] if self.prefix else torch.zeros(0, table.shape[1])
@@ -50,7 +64,9 @@ class ImageTrunk(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         x = self.patches(image)
         height, width = x.shape[-2:]
-        x = x.flatten(2).transpose(1, 2) + positions(self.table, self.grid, height, width)
+        x = x.flatten(2).transpose(1, 2) + positions(
+            self.table, self.grid, height, width, self.mode == "bilinear", self.mode
+        )
         if self.prefix:
             x = torch.cat((self.first.expand(x.shape[0], -1, -1), x), dim=1)
         x = self.before(x)
