@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,9 @@ from hubs import Hub, serve
 from model_folders import dense_package, succeed
 
 from freeocc3d import load_map
+from freeocc3d.cli import words
+from freeocc3d.core.errors import ModelError
+from freeocc3d.core.progress import Progress
 from freeocc3d.editing import relabeling
 from freeocc3d.gaussians import anchors
 from freeocc3d.language import encoding_speed, known_models, word_models
@@ -127,6 +132,24 @@ def test_voxels_get_the_features_that_a_run_gives_them(room: Map) -> None:
     assert known.mean() > 0.5
     assert (found.any(axis=1) == known).mean() > 0.999
     assert np.quantile(cosine[known], 0.001) > 0.99
+
+
+def test_on_a_terminal_it_asks_before_it_fetches(
+    hub: Hub, home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    asked = Terminal()
+    monkeypatch.setattr(sys, "stdin", Terminal("n\n"))
+    monkeypatch.setattr(sys, "stderr", asked)
+    with pytest.raises(ModelError, match="is not installed: fetch it with 'freeocc3d models pull words'"):
+        words.obtain_words("words", Progress())
+    assert f"Fetch {known_models.NAMES['clip-b16']}? [Y/n]" in asked.getvalue()
+    assert not hub.requested
+    monkeypatch.setattr(sys, "stdin", Terminal("\n"))
+    assert words.obtain_words("words", Progress()).folder == home / "clip-b16"
 
 
 def test_without_a_network_and_a_model_it_is_one_sentence(
