@@ -115,6 +115,13 @@ MEASUREMENTS = {
         "objects:measure_objects",
         table="objects:tabulate_objects",
     ),
+    "object_answers": Measurement(
+        f"words asked of voxels and of whole objects, with simulated features of CLIP in the map of {TRUE_CLASSES}",
+        "map",
+        "object_answers:measure_object_answers",
+        table="object_answers:tabulate_object_answers",
+        map_of=TRUE_CLASSES,
+    ),
     "exports": Measurement(
         "every exporter at 4 cm: seconds, memory, bytes; the plan for robots against the truth's",
         "capture",
