@@ -109,8 +109,7 @@ def test_a_second_run_is_refused_while_the_first_works(tmp_path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
 
 
-@pytest.mark.parametrize("exchanging", [True, False])
-@pytest.mark.parametrize("existing", [True, False])
+@pytest.mark.parametrize(("existing", "exchanging"), [(True, True), (True, False), (False, True)])
 def test_at_every_moment_of_finishing_there_is_a_whole_map_or_work_to_resume(
     tmp_path, complete, whole, monkeypatch, existing, exchanging
 ) -> None:

@@ -15,7 +15,7 @@ from small_captures import data_folder
 
 def test_every_part_of_a_few_frames(tmp_path: Path) -> None:
     bedroom = data_folder() / "house" / "bedroom"
-    names = ("rgbd", "rgbd_trident", "dense_slam_tsdf", "ours_octomap", "query")
+    names = ("rgbd", "rgbd_trident", "dense_slam_tsdf", "query")
     printed = run_benchmark(
         "--captures", bedroom, "--variants", *names, "--frames", 8, "-o", tmp_path / "out", "--json"
     )
