@@ -167,6 +167,38 @@ def test_a_convolutional_network_gives_a_feature_to_each_cell(clip_export: Path,
     assert encoder.encode(tiny_models.frame(40, 56)).shape == (5, 7, 24)
 
 
+class BagOfTokens(nn.Module):
+    """A text tower that sees what follows a text, as MobileCLIP's does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.tokens = nn.Embedding(len(tiny_models.vocabulary()[0]), 24)
+
+    def forward(self, input_ids: torch.Tensor) -> torch.Tensor:
+        return self.tokens(input_ids).mean(dim=1)
+
+
+def test_texts_are_as_long_as_in_training_where_padding_counts(clip_export: Path, tmp_path: Path) -> None:
+    own = BagOfTokens()
+    path = clip_export / "onnx" / "text_model.onnx"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            own, (torch.ones((2, 77), dtype=torch.int64),), str(path), dynamo=False, input_names=["input_ids"],
+            output_names=["text_embeds"], dynamic_axes={"input_ids": {0: "batch", 1: "length"}}, opset_version=14,
+        )  # fmt: skip
+    settings = clip_export / "preprocessor_config.json"
+    settings.write_text(json.dumps({**json.loads(settings.read_text()), "do_normalize": False}))
+    (clip_export / "config.json").write_text(json.dumps({"model_type": "clip_vision_model"}))
+    package, _ = package_of_export(clip_export, tmp_path / "tiny", "someone/tiny", "fp32")
+    assert (package.mean, package.std) == ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    text = TextNetwork(package)
+    tokens = text.tokens(TEXTS)
+    assert tokens.shape == (2, 77)
+    assert (tokens[:, -1] == 0).all()  # as OpenCLIP pads
+
+
 def test_a_text_graph_may_list_an_image_and_a_mask(clip_export: Path, tmp_path: Path) -> None:
     plain, _ = package_of_export(clip_export, tmp_path / "plain", "someone/tiny", "fp32")
 

@@ -21,8 +21,8 @@ def end_token(stated: int, tokenizer: str) -> int:
 
 
 def clip_tokenizer(tokenizer: str, length: int, fixed: bool = False) -> str:
-    """tokenizer.json that cuts texts like CLIP, with the end token last, and pads them to the longest; all to
-    ``length`` if that is fixed."""
+    """tokenizer.json that cuts texts like CLIP, with the end token last, and pads them with end tokens to the longest;
+    all to ``length`` with token 0, as in training, if that is fixed."""
     from tokenizers import Tokenizer
 
     made = Tokenizer.from_str(tokenizer)
@@ -30,7 +30,8 @@ def clip_tokenizer(tokenizer: str, length: int, fixed: bool = False) -> str:
     if end is None:
         raise ModelError("The tokenizer has no <|endoftext|>: it is not a CLIP tokenizer.")
     made.enable_truncation(length)
-    made.enable_padding(pad_id=end, pad_token="<|endoftext|>", length=length if fixed else None)
+    pad = 0 if fixed else end
+    made.enable_padding(pad_id=pad, pad_token=made.id_to_token(pad) or "", length=length if fixed else None)
     return str(made.to_str())
 
 

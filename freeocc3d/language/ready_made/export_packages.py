@@ -70,6 +70,7 @@ class _Config(msgspec.Struct):
 class _Preprocessing(msgspec.Struct):
     """What matters of preprocessor_config.json."""
 
+    do_normalize: bool = True
     image_mean: tuple[float, float, float] | None = None
     image_std: tuple[float, float, float] | None = None
     crop_size: _Size | _Side | None = None
@@ -85,7 +86,7 @@ def package_of_export(
     """
     config = _read(folder / "config.json", _Config)
     preprocessing = _read(folder / "preprocessor_config.json", _Preprocessing)
-    family = "siglip" if config.model_type.startswith("siglip") else config.model_type
+    family = "siglip" if config.model_type.startswith("siglip") else config.model_type.split("_")[0]
     if family not in _OUTPUTS:
         raise ModelError(f"{source} is a model of type '{config.model_type[:40]}': clip and siglip can be used.")
     side = _side(preprocessing.crop_size) or _side(preprocessing.size) or config.vision_config.image_size or _SIDE
@@ -107,12 +108,16 @@ def package_of_export(
         text, fixed = cut_text(graphs[1], _OUTPUTS[family][1], facts["dimension"], longest, side)
     except CutError as error:
         raise ModelError(f"{graph_names(precision)[1]} of {source} cannot be used: {error}.") from error
-    usual = _STATISTICS[family]
+    mean, std = _STATISTICS[family]
+    if preprocessing.do_normalize:
+        mean, std = list(preprocessing.image_mean or mean), list(preprocessing.image_std or std)
+    else:
+        mean, std = [0.0] * 3, [1.0] * 3
     second = family == "siglip" and (config.text_config.vocab_size or _FIRST_VOCABULARY) > _FIRST_VOCABULARY
     scale, bias = _SIGMOIDS["siglip2" if second else "siglip"] if family == "siglip" else _SOFTMAX
     manifest = {
         "name": target.name, "kind": kind, **facts, "input_size": side, "precision": precision,
-        "mean": list(preprocessing.image_mean or usual[0]), "std": list(preprocessing.image_std or usual[1]),
+        "mean": mean, "std": std,
         "logit_scale": scale, "logit_bias": bias, "licence": stated_licence(folder), "source": source,
     }  # fmt: skip
     tokenizer = _tokenizer(folder, family, longest, fixed, second, config.text_config.pad_token_id)

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 import onnx
+from numpy.typing import NDArray
 
 from .onnx_graphs import Additions, CutError, OnnxGraph, join, run_model
+from .vision_cut import TOLERANCE
 
 _WHOLE_NUMBERS = {onnx.TensorProto.INT64: np.int64, onnx.TensorProto.INT32: np.int32}
 _TOKENS, _MASK = "input_ids", "attention_mask"
@@ -19,7 +21,7 @@ def cut_text(
     model: onnx.ModelProto, output: str, dimension: int, longest: int, side: int
 ) -> tuple[onnx.ModelProto, bool]:
     """The network that turns ``tokens`` (T, L) into ``features`` (T, D), the graph's ``output``; and whether all texts
-    must have the ``longest`` L.
+    must have the ``longest`` L: a graph may be made for it alone, or attend to what follows a text, as MobileCLIP does.
 
     Other inputs of the graph are left out where the output does not need them. Otherwise the mask is all ones, as in
     both models' training, and the image (1, 3, side, side) is empty. Raises CutError.
@@ -40,19 +42,24 @@ def cut_text(
     end.cast(output, np.dtype(np.float32), "features")
     tokens = {"tokens": (onnx.TensorProto.INT64, ["texts", "tokens"])}
     made = join(graph, tokens, {"features": ["texts", "size"]}, [given, end], instead)
-    fixed = not _gives(made, _SHORT, dimension)
-    if fixed and not _gives(made, longest, dimension):
+    texts = np.ones((2, _SHORT), np.int64)
+    short, whole = (_features(made, own) for own in (texts, np.pad(texts, ((0, 0), (0, longest - _SHORT)))))
+    fits = [own is not None and own.shape == (2, dimension) for own in (short, whole)]
+    if not any(fits):
         raise CutError(f"it does not turn two texts of {longest} tokens into {dimension} numbers each")
-    return made, fixed
+    if short is None or whole is None or not all(fits):
+        return made, fits[1]
+    units = [own / np.linalg.norm(own, axis=1, keepdims=True) for own in (short, whole)]
+    return made, bool(np.linalg.norm(units[0] - units[1], axis=1).max() > TOLERANCE["int8"])
 
 
 def _one(value: int, kind: int) -> Any:
     return onnx.helper.make_tensor("value", kind, [1], [value])
 
 
-def _gives(model: onnx.ModelProto, length: int, dimension: int) -> bool:
+def _features(model: onnx.ModelProto, tokens: NDArray[np.int64]) -> NDArray[np.float32] | None:
+    """The features of texts; None if the network fails on them."""
     try:
-        (features,) = run_model(model, ["features"], {"tokens": np.ones((2, length), np.int64)})
+        return run_model(model, ["features"], {"tokens": tokens})[0]
     except CutError:
-        return False
-    return features.shape == (2, dimension)
+        return None
