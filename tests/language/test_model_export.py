@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import tiny_models
 import torch
+from command_line import refused, run
 from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -139,26 +136,18 @@ def test_open_clip_checkpoints_equal_their_own_forward_pass(tmp_path: Path, quic
     assert np.abs(words.embed(texts) - text).max() < 1e-4
 
 
-def run(*arguments: Any, code: int = 0, **environment: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "freeocc3d.cli", "models", "export", *map(str, arguments)],
-        capture_output=True, text=True, timeout=600, check=False, env={**os.environ, **environment},
-    )  # fmt: skip
-    assert done.returncode == code, done.stderr
-    return done.stdout if code == 0 else done.stderr.strip().splitlines()[-1]
-
-
-def test_the_command_exports_a_clip_of_transformers(tmp_path: Path) -> None:
+def test_the_command_exports_a_clip_of_transformers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FREEOCC3D_MODELS", str(tmp_path / "models"))
     source = tmp_path / "source"
     tiny_models.clip().save_pretrained(source)
     write_tokenizer(source)
     (source / "README.md").write_text("---\nlicense: mit\n---\n# A model\n")
-    said = run(source, "-o", "tiny", "--precision", "int8", FREEOCC3D_MODELS=str(tmp_path / "models"))
+    said = run("models", "export", source, "-o", "tiny", "--precision", "int8").stdout
     assert "clip, 24 dimensions, int8" in said
     package = model_packages.read_package(tmp_path / "models" / "tiny")
     model_packages.verify_files(package)
     assert (package.licence, package.source, package.input_size) == ("mit", str(source), 32)
-    assert "exists: choose another" in run(source, "-o", tmp_path / "models" / "tiny", code=1)
+    assert "exists: choose another" in refused("models", "export", source, "-o", tmp_path / "models" / "tiny")
 
 
 def test_dino_and_dinov2_checkpoints_are_backbones(tmp_path: Path) -> None:
@@ -200,7 +189,9 @@ def test_sam_equals_transformers_forward_pass(tmp_path: Path) -> None:
 
 def test_what_is_no_checkpoint_is_reported(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text('{"model_type": "bert"}')
-    assert "does not contain a checkpoint of CLIP, SigLIP, DINO" in run(tmp_path, "-o", tmp_path / "x", code=1)
+    assert "does not contain a checkpoint of CLIP, SigLIP, DINO" in refused(
+        "models", "export", tmp_path, "-o", tmp_path / "x"
+    )
     assert not (tmp_path / "x").exists()
 
 
