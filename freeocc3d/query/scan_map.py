@@ -108,7 +108,7 @@ class Map(SavedMap):
         """Returns how each of some objects stands to the others and to the walls; see ``query.objects.relations``."""
         from .objects.relations import find_relations
 
-        return find_relations(self.occupancy, objects, self.T_gravity_map)
+        return find_relations(self.occupancy, objects, self.T_gravity_map, self.metric)
 
     def box_of(self, region: Region) -> OrientedBox:
         """Returns the oriented bounding box of a region: upright, with the least level area."""

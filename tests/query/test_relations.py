@@ -19,7 +19,9 @@ def solid(low: tuple[int, int, int], high: tuple[int, int, int]) -> Cells:
     return box(low, high, NOTHING)
 
 
-def related(things: dict[str, Cells], walls: Cells | None = None, tilt: float = 0.0) -> dict[str, list[str]]:
+def related(
+    things: dict[str, Cells], walls: Cells | None = None, tilt: float = 0.0, metric: bool = True
+) -> dict[str, list[str]]:
     """What each thing is: "on table", "against wall". tilt: radians by which the lattice leans."""
     made = occupancy({**(walls or {}), **{voxel: NOTHING for own in things.values() for voxel in own}})
     row_of = {tuple(voxel): row for row, voxel in enumerate(made.occupied_voxels().tolist())}
@@ -31,7 +33,7 @@ def related(things: dict[str, Cells], walls: Cells | None = None, tilt: float = 
     def said(relation: Relation) -> str:
         return f"{relation.kind} {'wall' if relation.other is None else names[relation.other]}"
 
-    found = find_relations(made, objects, T)
+    found = find_relations(made, objects, T, metric)
     return {name: [said(relation) for relation in own] for name, own in zip(names, found, strict=True)}
 
 
@@ -75,6 +77,19 @@ def test_next_to_is_relative_to_size() -> None:
     cup = solid((0, 12, 0), (1, 13, 2))  # as far from the sofa as the lamp, but farther than it is high
     assert related({"sofa": sofa, "lamp": lamp, "cup": cup})["sofa"] == ["next to lamp"]
     assert related({"sofa": sofa, "picture": solid((0, 0, 10), (10, 1, 14))})["sofa"] == []  # above, not beside
+
+
+def test_only_sizes_limit_gaps_where_lengths_are_not_meters() -> None:
+    things = {"sofa": solid((0, 0, 0), (20, 8, 8)), "lamp": solid((28, 0, 0), (30, 2, 15))}
+    assert related(things)["sofa"] == []
+    assert related(things, metric=False)["sofa"] == ["next to lamp"]
+
+
+def test_of_two_things_that_interlock_the_higher_is_on_the_lower() -> None:
+    low = solid((0, 0, 1), (6, 4, 2)) | solid((6, 0, 0), (18, 4, 1))
+    high = solid((0, 0, 0), (6, 4, 1)) | solid((12, 0, 1), (18, 4, 2))
+    assert related({"low": low, "high": high}) == {"low": [], "high": ["on low"]}
+    assert related({"high": high, "low": low}) == {"low": [], "high": ["on low"]}
 
 
 def test_against_a_wall_that_the_thing_itself_hides() -> None:

@@ -53,33 +53,42 @@ class Relation:
 
 
 def find_relations(
-    occupancy: Occupancy, objects: Sequence[Object], T_gravity_map: NDArray[np.float64]
+    occupancy: Occupancy, objects: Sequence[Object], T_gravity_map: NDArray[np.float64], metric: bool = True
 ) -> list[list[Relation]]:
     """Returns the relations of each object: "in" and "on", "against", then "next to", nearest first.
 
-    T_gravity_map: (4, 4) rigid, to a frame with z up and the floor at z = 0.
+    T_gravity_map: (4, 4) rigid, to a frame with z up and the floor at z = 0.  metric: whether lengths are meters; if
+    not, only the sizes of things and voxels limit gaps. Of two things that interlock, the higher is on the lower.
     """
     there = SolidVoxels(occupancy, T_gravity_map[2, :3])
     count = len(objects)
-    inner, outer = _candidates(there, objects)
+    longest = np.array([thing.box.extent.max() for thing in objects])
+    reach = np.minimum(np.minimum(longest[:, None], longest), _NEXT_M if metric else np.inf).reshape(count, count)
+    inner, outer = _candidates(there, objects, reach)
     held: list[list[Relation]] = [[] for _ in objects]
     resting = np.zeros((count, count), bool)
     for i, j in zip(inner, outer, strict=True):
         own, others = objects[i].rows, objects[j].rows
         if _share_enclosed(there, own, others) >= _INSIDE:
             kind: Literal["in", "on"] = "in"
-        elif (stands := there.supported(own, others)).mean() >= _CARRIED and stands.any():
+        elif there.supported(own, others).mean() >= _CARRIED:
             kind = "on"
         else:
             continue
+        if resting[j, i]:
+            if objects[i].centroid @ T_gravity_map[2, :3] <= objects[j].centroid @ T_gravity_map[2, :3]:
+                continue
+            held[j] = [relation for relation in held[j] if relation.other != i]
         resting[i, j] = True
         held[i].append(Relation(kind, int(j)))
     walls = _wall_cells(there, objects, T_gravity_map)
-    gaps = _gaps(there, objects, inner, outer, resting | resting.T)
+    reach[resting | resting.T] = -1
+    gaps = _gaps(there, objects, inner, outer, reach)
+    most = max(_AGAINST_M * metric, _AGAINST_VOXELS * occupancy.voxel_size)
     related = []
     for i, thing in enumerate(objects):
         own = sorted(held[i], key=lambda relation: relation.kind)  # "in" before "on"
-        gap = _gap_to_wall(thing, walls, occupancy.voxel_size, T_gravity_map)
+        gap = _gap_to_wall(thing, walls, occupancy.voxel_size, T_gravity_map, most)
         if gap is not None:
             own.append(Relation("against", None, gap))
         near = np.flatnonzero(np.isfinite(gaps[i]))
@@ -88,13 +97,15 @@ def find_relations(
     return related
 
 
-def _candidates(there: SolidVoxels, objects: Sequence[Object]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _candidates(
+    there: SolidVoxels, objects: Sequence[Object], reach: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Returns the ordered pairs of objects with boxes, in a level frame, that are as near as some relation allows."""
     spans = [there.level(thing.rows) for thing in objects]
     low = np.array([(at - edges[:, None] / 2).min(axis=0) for at, edges in spans]).reshape(-1, 3)
     high = np.array([(at + edges[:, None] / 2).max(axis=0) for at, edges in spans]).reshape(-1, 3)
     apart = np.maximum(np.maximum(low[:, None] - high[None], low[None] - high[:, None]), 0)
-    near = np.linalg.norm(apart, axis=2) <= max(_NEXT_M, 2 * there.occupancy.voxel_size)
+    near = np.linalg.norm(apart, axis=2) <= np.maximum(reach, 2 * there.occupancy.voxel_size)
     np.fill_diagonal(near, False)
     first, second = np.nonzero(near)
     return first, second
@@ -127,9 +138,10 @@ def _gaps(
     objects: Sequence[Object],
     first: NDArray[np.int64],
     second: NDArray[np.int64],
-    resting: NDArray[np.bool_],
+    reach: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Returns the (N, N) gaps between things next to each other, meters; infinite for all other pairs."""
+    """Returns the (N, N) gaps between things next to each other, meters; infinite for all other pairs. reach: (N, N)
+    greatest gaps, less than 0 for pairs that are not next to each other."""
     from scipy.spatial import KDTree
 
     size = there.occupancy.finest
@@ -137,18 +149,17 @@ def _gaps(
     trees: dict[int, KDTree] = {}
     heights = [there.level(thing.rows) for thing in objects]
     spans = np.array([((at[:, 2] - e / 2).min(), (at[:, 2] + e / 2).max()) for at, e in heights]).reshape(-1, 2)
-    longest = np.array([thing.box.extent.max() for thing in objects])
     gaps = np.full((len(objects), len(objects)), np.inf)
     for i, j in zip(first, second, strict=True):
         shared = min(spans[i, 1], spans[j, 1]) - max(spans[i, 0], spans[j, 0])
-        if resting[i, j] or len(points[i]) > len(points[j]) or (len(points[i]) == len(points[j]) and i > j):
+        if reach[i, j] < 0 or len(points[i]) > len(points[j]) or (len(points[i]) == len(points[j]) and i > j):
             continue  # each pair once, from the one of fewer points
         if shared < 0.5 * there.occupancy.voxel_size:
             continue
-        reach = min(_NEXT_M, longest[i], longest[j]) / size * (1 + 1e-9)
         if j not in trees:
             trees[j] = KDTree(points[j])
-        gap = trees[j].query(points[i], distance_upper_bound=reach)[0].min() * size
+        most = reach[i, j] / size * (1 + 1e-9)
+        gap = trees[j].query(points[i], distance_upper_bound=most)[0].min() * size
         gaps[i, j] = gaps[j, i] = gap
     return gaps
 
@@ -174,15 +185,14 @@ def _wall_cells(
 
 
 def _gap_to_wall(
-    thing: Object, walls: NDArray[np.float64], size: float, T_gravity_map: NDArray[np.float64]
+    thing: Object, walls: NDArray[np.float64], size: float, T_gravity_map: NDArray[np.float64], most: float
 ) -> float | None:
-    """Returns the gap between a side of a thing's box and the wall that runs along it, meters, or None."""
+    """Returns the gap, up to ``most``, between a side of a thing's box and the wall that runs along it, or None."""
     if not len(walls):
         return None
     T_gravity_box = T_gravity_map @ thing.box.T_map_box
     own = (walls - T_gravity_box[:2, 3]) @ T_gravity_box[:2, :2]  # in the box's frame
     half = thing.box.extent[:2] / 2
-    most = max(_AGAINST_M, _AGAINST_VOXELS * size)
     gaps = []
     for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1)):
         out = sign * own[:, axis] - size / 2 - half[axis]
