@@ -16,7 +16,8 @@ class KnownModel:
 
     export: whether it is a ready-made ONNX export, of which a package is made without torch; else it is a checkpoint
     that ``freeocc3d models export`` accepts.  megabytes: to fetch, in its precision.  dimension: of features.
-    gigaflop: multiplications and additions for a frame of 640 x 480 pixels at the encoder's default options.
+    gigaflop: multiplications and additions for a frame of 640 x 480 pixels at the encoder's default options.  variant:
+    folder of the graphs and their configuration below ``onnx/``, in a repository of several models.
     """
 
     repository: str
@@ -26,6 +27,7 @@ class KnownModel:
     dimension: int
     gigaflop: int
     precision: Precision = "int8"
+    variant: str = ""
 
 
 KNOWN = {
@@ -34,6 +36,7 @@ KNOWN = {
     "siglip-b16": KnownModel("Xenova/siglip-base-patch16-224", True, 206, "apache-2.0", 768, 210),
     "siglip2-b16": KnownModel("onnx-community/siglip2-base-patch16-224-ONNX", True, 411, "apache-2.0", 768, 210),
     "mobileclip-s2": KnownModel("Xenova/mobileclip_s2", True, 199, "apple-ascl", 512, 80, "fp16"),
+    "mobileclip2-s2": KnownModel("plhery/mobileclip2-onnx", True, 397, "apple-amlr", 512, 80, "fp32", "s2"),
     "clip-b16-openai": KnownModel("timm/vit_base_patch16_clip_224.openai", False, 599, "apache-2.0", 512, 211, "fp32"),
     "clip-b16-laion": KnownModel("laion/CLIP-ViT-B-16-laion2B-s34B-b88K", False, 599, "mit", 512, 211, "fp32"),
     "siglip-b16-google": KnownModel("google/siglip-base-patch16-224", False, 813, "apache-2.0", 768, 210, "fp32"),

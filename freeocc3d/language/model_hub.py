@@ -52,8 +52,10 @@ _PARTIAL, _FORBIDDEN = 206, 403
 
 @dataclass(frozen=True)
 class _Remote:
-    """A file on the hub: its size in bytes, and its sha256, or otherwise the sha1 of its git blob."""
+    """A file on the hub: its path there, the name that it gets here, its size in bytes, and its sha256, or otherwise
+    the sha1 of its git blob."""
 
+    path: str
     name: str
     size: int
     sha256: str | None
@@ -98,7 +100,7 @@ def pull_package(
         raise ModelError(
             f"{repository} is not fetched, because {OFFLINE} is set: unset it, or copy the model's folder."
         )
-    remote = _listed(repository, revision)
+    remote = _listed(repository, revision, KNOWN[name].variant if name in KNOWN else "")
     manifest = next((remote[n] for n in model_packages.MANIFESTS if n in remote), None)
     sizes = {file: own.size for file, own in remote.items()}
     exported = None if manifest else export_layout.choose_files(repository, sizes, precision)
@@ -212,8 +214,9 @@ class _Listing(msgspec.Struct):
     siblings: list[_Sibling] = []
 
 
-def _listed(repository: str, revision: str) -> dict[str, _Remote]:
-    """The repository's files by name, without those in subfolders but ``export_layout.FOLDER``. Raises ModelError."""
+def _listed(repository: str, revision: str, variant: str) -> dict[str, _Remote]:
+    """The repository's files by name, without those in subfolders but ``export_layout.FOLDER``. Those of a variant are
+    named as if the repository held nothing else. Raises ModelError."""
     url = f"{_endpoint()}/api/models/{repository}/revision/{quote(revision, safe='')}?blobs=true"
     received = bytearray()
 
@@ -230,15 +233,22 @@ def _listed(repository: str, revision: str) -> dict[str, _Remote]:
     except (TimeoutError, NoAnswer, msgspec.MsgspecError, RecursionError) as error:
         raise _told(error, repository) from error
     remotes = [
-        _Remote(file.rfilename, file.size or 0, _digest((file.lfs or {}).get("sha256")), _digest(file.blobId))
-        for file in listing.siblings
+        _Remote(path, own, file.size or 0, _digest((file.lfs or {}).get("sha256")), _digest(file.blobId))
+        for file in sorted(listing.siblings, key=lambda file: file.rfilename.count("/"))
+        if (own := _name_here(path := file.rfilename, variant)) is not None
     ]
-    return {
-        remote.name: remote
-        for remote in remotes
-        if model_packages.is_plain_name(remote.name.removeprefix(export_layout.FOLDER))
-        and (remote.sha256 or remote.blob)
-    }
+    return {remote.name: remote for remote in remotes if remote.sha256 or remote.blob}
+
+
+def _name_here(path: str, variant: str) -> str | None:
+    """The name that a file of a repository gets; None for one that is not needed."""
+    folder, slash, file = path.rpartition("/")
+    graphs = f"{export_layout.FOLDER}{variant}/" if variant else export_layout.FOLDER
+    if not model_packages.is_plain_name(file) or folder + slash not in ("", graphs):
+        return None
+    if folder and (".onnx" in file or not variant):
+        return export_layout.FOLDER + file
+    return file
 
 
 def _digest(stated: object) -> str | None:
@@ -274,7 +284,7 @@ def _fetch(repository: str, revision: str, remote: _Remote, folder: Path, progre
 def _continue(repository: str, revision: str, remote: _Remote, stream: IO[bytes]) -> None:
     """Fetches the rest of a file, as far as the connection lasts. Raises ModelError."""
     start = stream.tell()
-    request = _request(f"{_endpoint()}/{repository}/resolve/{quote(revision, safe='')}/{quote(remote.name)}")
+    request = _request(f"{_endpoint()}/{repository}/resolve/{quote(revision, safe='')}/{quote(remote.path)}")
     if start:
         request.add_header("Range", f"bytes={start}-")
 

@@ -14,7 +14,7 @@ from model_folders import dense_package, graph, succeed, write_manifest
 
 from freeocc3d.cli.main import main
 from freeocc3d.core.errors import ModelError
-from freeocc3d.language import model_hub, model_packages
+from freeocc3d.language import known_models, model_hub, model_packages
 
 
 @pytest.fixture
@@ -135,6 +135,24 @@ def test_words_are_pulled_as_a_ready_made_export(words: Hub, home: Path, capsys:
     assert "onnx/model_q4.onnx" not in fetched
     model_hub.pull_package("words")
     assert [name for name, _ in words.requested] == fetched
+
+
+def test_one_of_several_models_of_a_repository_is_pulled(
+    words: Hub, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = known_models.KnownModel(REPOSITORY, True, 1, "mit", 24, 1, "int8", "s2")
+    monkeypatch.setitem(known_models.KNOWN, "several", known)
+    monkeypatch.setitem(known_models.NAMES, "several", REPOSITORY)
+    for folder in ("s1", "s2"):
+        (words.folder / "onnx" / folder).mkdir()
+        (words.folder / "onnx" / folder / "config.json").write_text('{"model_type": "bert"}')
+    for path in (words.folder / "config.json", *(words.folder / "onnx").glob("*_quantized.onnx")):
+        path.rename(words.folder / "onnx" / "s2" / path.name)
+    model_hub.pull_package("several")
+    assert model_packages.read_package(home / "several").kind == "clip"
+    assert {name for name, _ in words.requested if "onnx/" in name} == {
+        "onnx/s2/config.json", "onnx/s2/text_model_quantized.onnx", "onnx/s2/vision_model_quantized.onnx"
+    }  # fmt: skip
 
 
 def test_an_interrupted_export_goes_on_where_it_stopped(words: Hub, home: Path) -> None:
