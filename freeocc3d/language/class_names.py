@@ -71,9 +71,12 @@ def match_exactly(phrase: str, names: list[str]) -> tuple[list[int], str]:
         said = [*head[: len(head) - len(part.split())], *complement]
         rows = known.find(part)
         if said and part in _HOLDERS and part == head[-1]:
-            rows = known.find_holders(said) or known.without_holders_of_others(rows, said)
-        if rows := known.narrow(rows, said):
-            return rows, part
+            if held := known.find_holders(said):
+                return held, normalize_phrase(phrase)
+            rows = known.without_holders_of_others(rows, said)
+        if rows:
+            narrowed = known.narrow(rows, said)
+            return narrowed, part if narrowed == rows else normalize_phrase(phrase)
     return [], ""
 
 
