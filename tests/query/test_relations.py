@@ -54,6 +54,19 @@ def test_a_cup_stands_on_the_table_and_the_table_on_the_carpet(tilt: float) -> N
     assert found == {"cup": ["on table"], "table": ["on carpet"], "carpet": []}
 
 
+@pytest.mark.parametrize(("rise", "on"), [(-1, True), (0, True), (1, True), (3, False)])
+def test_what_a_pillow_hides_of_its_bed_is_told_by_what_is_around_it(rise: int, on: bool) -> None:
+    bed = solid((0, 0, 0), (20, 12, 6))
+    seen = {cell: value for cell, value in bed.items() if not (4 <= cell[0] < 10 and 2 <= cell[1] < 7)}
+    found = related({"pillow": solid((4, 2, 6 + rise), (10, 7, 8 + rise)), "bed": seen})
+    assert ("on bed" in found["pillow"]) == on
+
+
+def test_a_thing_beside_a_carpet_is_not_on_it() -> None:
+    carpet = solid((0, 0, 0), (20, 20, 1))
+    assert related({"chair": solid((20, 5, 0), (25, 10, 9)), "carpet": carpet})["chair"] == ["next to carpet"]
+
+
 @pytest.mark.parametrize(("over", "carried"), [(2, True), (1, False)])
 def test_a_quarter_of_the_underside_carries(over: int, carried: bool) -> None:
     plank = solid((12 - over, 0, 7), (18 - over, 4, 8))  # of six columns, so many stand over the table

@@ -23,6 +23,8 @@ from .object import Object
 
 _CARRIED = 0.25
 """Least share of an underside that stands over the thing that carries it. Less is an edge that reaches over it."""
+_AROUND = 0.5
+"""Least share of the rim around an underside that is the carrier's top: what a thing stands on is hidden below it."""
 _INSIDE = 0.5  # least share of the voxels that the other thing encloses
 _SIDES = 3  # of the four level directions: a niche is open in front
 _NEXT_M = 0.5
@@ -40,7 +42,8 @@ _ALONG = 0.5  # least length of the wall there, as a share of the side's
 class Relation:
     """How an object stands to another or to a wall.
 
-    kind: "on": at least a quarter of its underside stands over voxels of the other, at most 1.5 voxels above them.
+    kind: "on": at least a quarter of its underside stands over voxels of the other, at most 1.5 voxels above them; or
+    at least half of the cells around its underside, as seen from above, are the other's top at that height.
     "in": at least half of its voxels have voxels of the other below them and on three of four sides.  "next to": the
     gap is no more than 0.5 m and no more than the smaller thing's longest edge, the two share a range of heights, and
     neither is on or in the other.  "against": a wall runs along one side of its box, at most 0.1 m or 1.5 voxels away.
@@ -71,7 +74,7 @@ def find_relations(
         own, others = objects[i].rows, objects[j].rows
         if _share_enclosed(there, own, others) >= _INSIDE:
             kind: Literal["in", "on"] = "in"
-        elif there.supported(own, others).mean() >= _CARRIED:
+        elif there.supported(own, others).mean() >= _CARRIED or _share_of_rim(there, own, others) >= _AROUND:
             kind = "on"
         else:
             continue
@@ -131,6 +134,28 @@ def _share_enclosed(there: SolidVoxels, rows: NDArray[np.int64], others: NDArray
 
     sides = sum(hidden(axis, step).astype(int) for axis in (0, 1) for step in (1, -1))
     return float(np.count_nonzero((sides >= _SIDES) & hidden(2, 1)) / len(rows))
+
+
+def _share_of_rim(there: SolidVoxels, rows: NDArray[np.int64], others: NDArray[np.int64]) -> float:
+    """Returns the share of the cells around the underside of voxels, as seen from above, that are tops of the others at
+    its height, up to a voxel higher or lower."""
+    from scipy import ndimage
+
+    size = there.occupancy.voxel_size
+    mine, theirs = there.level(rows)[0], there.level(others)[0]
+    low = theirs.min(axis=0) - size / 2
+    own, cells = (np.floor((at - low) / size).astype(np.int64) for at in (mine, theirs))
+    bottom = own[:, 2].min()
+    if not 0 <= bottom <= cells[:, 2].max() + 2:
+        return 0.0
+    under = own[own[:, 2] <= bottom + 1, :2]
+    shift = np.minimum(under.min(axis=0), 0) - 1
+    shape = tuple(np.maximum(under.max(axis=0), cells[:, :2].max(axis=0)) - shift + 2)
+    footprint, top = np.zeros(shape, bool), np.full(shape, -9)
+    footprint[tuple((under - shift).T)] = True
+    np.maximum.at(top, tuple((cells[:, :2] - shift).T), cells[:, 2])
+    rim = ndimage.binary_dilation(footprint) & ~footprint
+    return float((np.abs(top[rim] + 1 - bottom) <= 1).mean())
 
 
 def _gaps(
