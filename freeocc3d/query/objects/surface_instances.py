@@ -19,9 +19,9 @@ from .agglomeration import agglomerate
 from .structure import find_floor, find_structure
 from .surfels import Surfels, take_surfels
 
-_SMOOTH, _PART, _THING = 0.17, 0.3, 1.0
-"""Concavity that ends a smooth surface, a part of a thing, and a thing: corners that turn by 10 degrees (as in LCCP),
-17 and 60 degrees. Normals that are averaged over neighbors halve the concavity of a sharp corner."""
+_SMOOTH, _PART, _THING = 0.17, 0.3, 2.0**0.5
+"""Concavity that ends a smooth surface, a part of a thing, and a thing whose parts have one color: corners that turn by
+10 degrees (as in LCCP), by 17 degrees, and by a right angle."""
 _STEP = 0.35
 """Spacings by which one surface may lie above another without a step: three standard deviations of the Gaussians."""
 _DIFFERENT = 10.0
