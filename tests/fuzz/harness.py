@@ -161,7 +161,8 @@ class _Worker:
     log: Path = field(init=False)
 
     def __post_init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(["freeocc3d.pipeline.run", "freeocc3d.storage.writer"])
         self.pipe, other = context.Pipe()
         self.log = Path(tempfile.mkstemp(prefix="log-", dir=self.originals.parent)[1])
         arguments = (other, self.part, self.seed, self.originals, self.log, self.limits.most_bytes)
