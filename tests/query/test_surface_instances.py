@@ -98,3 +98,11 @@ def test_concavity_is_positive_in_corners_negative_around_edges_and_zero_on_plan
         assert surfels.concavities(surfels.pairs)[0] == pytest.approx(sign * np.sqrt(2))
     level = Surfels(points[2:], np.array((up, up)), points[2:], np.array(((0, 1),)), 1.0)
     assert level.concavities(level.pairs)[0] == level.steps(level.pairs)[0] == 0
+
+
+@pytest.mark.parametrize("count", [1, 2, 12])
+def test_a_few_or_coinciding_surfels_are_no_walls(count, room) -> None:
+    random = np.random.default_rng(count)
+    for points in (random.uniform(0, 0.1, (count, 3)) + (2, 2, 1), np.ones((count, 3))):
+        surfels = join_neighbors(points, np.tile((1.0, 0.0, 0.0), (count, 1)), points)
+        assert (surface_instances.divide_surfels(surfels, free_air(room), np.eye(4)) >= 0).all()

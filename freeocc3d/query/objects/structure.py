@@ -35,6 +35,7 @@ _SEEN = 0.1
 _STOREY_M, _BELOW_TOP_M = 2.2, 0.25
 """A plane that ends at most 0.25 m below the top of a scan that is as high as a storey (2.2 m is the least of building
 codes) is a wall or built in, such as the lintel over an opening."""
+_FEWEST = 3  # points of a plane
 _TRIALS, _SAMPLE, _FITS = 32, 4000, 4
 
 
@@ -91,7 +92,7 @@ def _find_planes(surfels: Surfels, parts: NDArray[np.int64]) -> list[tuple[NDArr
 
     Source: M. Fischler, R. Bolles, Random Sample Consensus, CACM 1981; a surfel with its normal is a sample.
     """
-    least = int(np.ceil(_LEAST_M2 / surfels.spacing**2))
+    least = max(int(np.ceil(_LEAST_M2 / surfels.spacing**2)), _FEWEST)
     order = np.argsort(parts, kind="stable")
     starts = np.flatnonzero(np.diff(parts[order], prepend=-1))
     random = np.random.default_rng(0)

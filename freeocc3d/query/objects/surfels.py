@@ -76,7 +76,7 @@ def join_neighbors(points: NDArray[np.float64], normals: NDArray[np.float64], la
     """Makes surfels of (N, 3) centers, unit normals and CIELAB colors: finds the neighbors and averages the normals."""
     tree = KDTree(points)
     count = min(_NEIGHBORS + 1, len(points))
-    spacing = float(np.median(tree.query(points, k=[count])[0])) / np.sqrt(2.0) if count > 1 else 1.0
+    spacing = float(np.median(tree.query(points, k=[count])[0])) / np.sqrt(2.0) or 1.0
     pairs = tree.query_pairs(_REACH * spacing, output_type="ndarray").astype(np.int64)
     return Surfels(points, _averaged(normals, pairs), lab, pairs, spacing)
 
