@@ -1,9 +1,8 @@
 """Divides the surface of a map into things by its shape and colors, where no classes are known.
 
 Without floor, walls and ceiling, things meet each other and themselves in corners. A part of the surface without
-corners belongs to one thing. Two such parts are one thing if their colors are alike and the corner between them is
-blunt, such as between a sofa's seat and back; a chair at a table and a cup on it differ in color or meet it in a sharp
-corner.
+corners belongs to one thing. Two such parts are one thing if their colors are alike, and the more so, the blunter the
+corner between them: a sofa's seat and its back, but not a table and the chair at it, which differ in color.
 """
 
 from __future__ import annotations
