@@ -7,6 +7,7 @@ Python expression of Numba's types.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import multiprocessing
 import os
@@ -35,19 +36,27 @@ def compile_ahead() -> None:
         raise SystemExit(f"Kernels cannot be kept in {FOLDER}: {error.strerror}.") from None
     with tempfile.TemporaryDirectory() as folder:
         os.environ |= {"NUMBA_CPU_NAME": CPU_NAME, "NUMBA_CPU_FEATURES": CPU_FEATURES, "NUMBA_CACHE_DIR": folder}
-        with ProcessPoolExecutor(count_threads(), multiprocessing.get_context("spawn")) as pool:
-            failed = list(filter(None, pool.map(_compile, LIST.read_text(encoding="utf-8").splitlines())))
+        lines = LIST.read_text(encoding="utf-8").splitlines()
+        with ProcessPoolExecutor(count_threads(), multiprocessing.get_context("spawn"), _keep, (lines,)) as pool:
+            failed = list(filter(None, pool.map(_compile, lines)))
     if failed:
         raise SystemExit("\n".join([*failed, f"Write {LIST} anew (tools/list_kernels.py)."]))
 
 
-def _compile(line: str) -> str | None:
-    """Compile a kernel; what is wrong with its line."""
+def _keep(lines: list[str]) -> None:
+    """Keep every listed kernel in the package: compiling one compiles those that it calls."""
     from . import compiling
 
+    for line in lines:
+        with contextlib.suppress(ImportError, AttributeError, NameError, TypeError):  # which _compile reports
+            kernel, _ = _read(line)
+            kernel._cache = compiling.open_portable(kernel.py_func)
+
+
+def _compile(line: str) -> str | None:
+    """Compile a kernel; what is wrong with its line."""
     try:
         kernel, signature = _read(line)
-        kernel._cache = compiling.open_portable(kernel.py_func)
         kernel.compile(signature)
     except (ImportError, AttributeError, NameError, TypeError, NumbaError) as error:
         return f"{' '.join(line.split()[:2])} cannot be compiled as listed: {str(error).splitlines()[0]}"
