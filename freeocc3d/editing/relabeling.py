@@ -16,8 +16,8 @@ from ..language.feature_codec import Codec
 from ..language.model_packages import Package
 from ..language.word_models import use_package
 from ..occupancy import build
+from ..query.chance import record_encoder
 from ..query.scan_map import Map, load_map
-from ..storage.manifest import EncoderRecord
 from ..storage.work_folder import WorkFolder
 from ..storage.writer import MapParts, write_changed_map
 from .box_refinement import read_settings
@@ -50,12 +50,12 @@ def relabel_map(
         scale = anchors.compute_least_scale(settings.gaussians, cell, occupancy.voxel_size)
         voxels = build.compute_features(occupancy, gaussians, features, splatting, scale)
         progress.stage("saving")
-        record = EncoderRecord(name=encoder.name, dimension=encoder.dimension, state=encoder.text_state())
+        relabeled = dataclasses.replace(occupancy, features=voxels)
         parts = MapParts(
-            msgspec.structs.replace(scan_map.manifest, encoder=record),
+            msgspec.structs.replace(scan_map.manifest, encoder=record_encoder(encoder, relabeled)),
             settings,
             lambda: scan_map.report,
-            dataclasses.replace(occupancy, features=voxels),
+            relabeled,
             Codec.fit(features),
             features,
         )

@@ -50,7 +50,7 @@ class Wording:
 
     templates: tuple[str, ...] = TEMPLATES
     contrast: tuple[str, ...] = CONTRAST
-    threshold: float = 0.0
+    threshold: float | None = None
 
     def check(self) -> None:
         """Raises ConfigError for templates without a place for the word."""
@@ -77,7 +77,7 @@ class Wording:
 class _State(msgspec.Struct):
     """What a map keeps of an encoder whose words a text network embeds."""
 
-    threshold: Annotated[float, msgspec.Meta(ge=-1, le=1)]
+    threshold: Annotated[float, msgspec.Meta(ge=-1, le=1)] | None
     temperature: Annotated[float, msgspec.Meta(gt=0, le=1000)]
     dimension: Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
     templates: Annotated[list[str], msgspec.Meta(min_length=1, max_length=10_000)]

@@ -16,10 +16,10 @@ from ..core.types import Gaussians, Occupancy, Trajectory
 from ..gaussians import rendered_views
 from ..language.encoders.base import Encoder
 from ..language.feature_codec import Codec
+from ..query.chance import record_encoder
 from ..storage import map_files
 from ..storage.manifest import (
     CaptureRecord,
-    EncoderRecord,
     MapFacts,
     MapScale,
     SceneWords,
@@ -81,7 +81,7 @@ def save(
             }
 
         with work.timed("saving"):
-            facts = _facts(mapper, trajectory, encoder, vocabulary)
+            facts = _facts(mapper, trajectory, encoder, occupancy, vocabulary)
             count = len(trajectory.keyframes)
             measured = mapper.views(trajectory, evenly(count, _MEASURED_VIEWS))
             fidelity = rendered_views.measure_fidelity(gaussians, measured, mapper.rasterizer)
@@ -93,7 +93,13 @@ def save(
         write_map(work, parts)
 
 
-def _facts(mapper: Mapper, trajectory: Trajectory, encoder: Encoder, vocabulary: dict[str, Any] | None) -> MapFacts:
+def _facts(
+    mapper: Mapper,
+    trajectory: Trajectory,
+    encoder: Encoder,
+    occupancy: Occupancy,
+    vocabulary: dict[str, Any] | None,
+) -> MapFacts:
     capture = mapper.capture
     assert mapper.upright is not None  # refined
     upright = Upright(**mapper.upright.evidence())
@@ -107,7 +113,7 @@ def _facts(mapper: Mapper, trajectory: Trajectory, encoder: Encoder, vocabulary:
         T_world_map=matrix(invert(mapper.T_map_world)),
         T_first_camera=matrix(invert(trajectory.T_world_cam[np.flatnonzero(trajectory.has_pose)[0]])),
         T_gravity_map=matrix(np.eye(4)),
-        encoder=EncoderRecord(name=encoder.name, dimension=encoder.dimension, state=encoder.text_state()),
+        encoder=record_encoder(encoder, occupancy),
         vocabulary=msgspec.convert(vocabulary, SceneWords) if vocabulary else None,
     )
 

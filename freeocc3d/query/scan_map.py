@@ -20,6 +20,7 @@ from . import word_query
 
 if TYPE_CHECKING:
     from ..core.types import Occupancy
+    from ..storage.manifest import ChanceRecord
     from .best_views import RegionView
     from .conditions import Where
     from .objects.object import Object
@@ -154,6 +155,13 @@ class Map(SavedMap):
         return finding.find_objects(self)
 
     @functools.cached_property
+    def _chance(self) -> ChanceRecord:
+        """What random words reach in the map: an older map does not state it."""
+        from .chance import Chance
+
+        return self.manifest.encoder.chance or Chance(self.occupancy, self.text_encoder).record
+
+    @functools.cached_property
     def _class_labels(self) -> NDArray[np.uint8]:
         text = self.text_encoder.encode_words(self.vocabulary[:253])
         return (word_query.nearest_word(self.occupancy.features, text) + 1).astype(np.uint8)
@@ -168,7 +176,9 @@ class Map(SavedMap):
     ) -> list[QueryResult]:
         named = self.scene_words if self.text_encoder.open_vocabulary else []
         others = [*named, *contrast]
-        return word_query.query(occupancy, self.text_encoder, words, options, others, negative, self.up)
+        return word_query.query(
+            occupancy, self.text_encoder, words, options, others, negative, self.up, lambda: self._chance
+        )
 
     def _placed(
         self,

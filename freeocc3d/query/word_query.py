@@ -11,7 +11,7 @@ these and fit nearly as well also match. Matching voxels that touch form a regio
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -28,12 +28,14 @@ from ..language.synonyms import make_key
 from ..occupancy.connected_components import label_components
 from ..settings.option_types import Cosine, PositiveInt, PositiveShare, Share
 from ..settings.typed_options import TypedOptions, nearest
+from .chance import Chance, WordRegions
 from .colored_things import choose_colored, read_colors, read_only_colors
 from .region_splitting import cut_necks
 from .regions import Region, best_regions
 
 if TYPE_CHECKING:
     from ..language.encoders.base import TextEncoder, TextFeatures
+    from ..storage.manifest import ChanceRecord
 
 _LONGEST_WORD = 200
 _MISSPELT = 0.75  # least ratio of difflib: "soffa" is a misspelling, "canoe" for "camera" is not
@@ -50,7 +52,8 @@ class Options(TypedOptions, frozen=True):
     contrast words) or "relevancy" (the least probability against each of some phrases that fit anything, as in LERF).
     """
     threshold: Cosine | None = None
-    """Least score of a matching voxel, -1…1; null = the encoder's own value for cosines, 0.5 for probabilities."""
+    """Least score of a matching voxel, -1…1; null = 0.5 for probabilities, and for cosines the encoder's own value; for
+    an encoder of any words, what random words reach in the map decides."""
     grow: PositiveShare = 0.8
     """A region grows over connected voxels that reach this share of the threshold; 1 = no growth."""
     top_k: PositiveInt = 20
@@ -94,12 +97,14 @@ def query(
     contrast: Sequence[str] = (),
     negative: Sequence[str] = (),
     up: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 1.0),
+    chance: Callable[[], ChanceRecord] | None = None,
 ) -> list[QueryResult]:
     """Asks for several words. A word that nothing matches has no regions.
 
     contrast: words for other things in the scan, added to the encoder's own.  negative: words for what is not meant. A
     voxel whose plain cosine with one of them is higher than with the word does not match, even if the word includes
-    it, as "table" includes a coffee table.  up: (3,) unit vector, map frame.
+    it, as "table" includes a coffee table.  up: (3,) unit vector, map frame.  chance: what random words reach in the
+    map, if it is known.
     Raises FreeOccError for an empty, too long or excluded word, one that says what is not meant ("not red"), or a
     negative word that is not understood; MapError if the map's features are not those of the encoder.
     """
@@ -132,6 +137,13 @@ def query(
     plain = options.scores == "cosine"
     default = text_encoder.threshold if plain else _EVEN
     threshold = default if options.threshold is None else options.threshold
+    if threshold is None:
+        measured = Chance(occupancy, text_encoder, chance() if chance else None)
+        found = measured.find_regions(text.features, others.features)
+        return [
+            _answer_by_chance(occupancy, word, found[w], measured, options, up, _beaten(features, text, excluded, w))
+            for w, word in enumerate(words)
+        ]
     every_score = cosine
     if not plain:
         every_score = np.stack(
@@ -164,6 +176,48 @@ def query(
         result = QueryResult(word, part, note, regions, np.ascontiguousarray(scores))
         results.append(_in_color(occupancy, result, colors, taken, options, up) if colors and regions else result)
     return results
+
+
+def _answer_by_chance(
+    occupancy: Occupancy,
+    word: str,
+    found: WordRegions,
+    chance: Chance,
+    options: Options,
+    up: Sequence[float] | NDArray[np.float64],
+    excluded: NDArray[np.bool_],
+) -> QueryResult:
+    """Answers a word by those of its regions that random words hardly reach. The score of a voxel is that of its
+    region, 0 outside. excluded: (V,) voxels of what is not meant."""
+    allowed = ~excluded[found.rows]
+    rows, component, confidence = found.rows[allowed], found.component[allowed], found.confidence[allowed]
+    score = chance.score(found.evidence).astype(np.float32)
+    scores = np.zeros(len(excluded), np.float32)
+    scores[rows] = score[component]
+    kept = scores[rows] >= _EVEN
+    rows, component, confidence = rows[kept], component[kept], confidence[kept]
+    component = cut_necks(occupancy, rows, component, scores[rows], np.asarray(up), options.narrow)
+    least = options.min_voxels, options.min_share
+    regions = best_regions(occupancy, rows, component, scores[rows], confidence, *least, options.top_k, word)
+    note = "" if regions else _nothing_like(word, scores, _EVEN)
+    return QueryResult(word, word, note, regions, scores)
+
+
+def _nothing_like(word: str, scores: NDArray[np.float32], threshold: float) -> str:
+    """Returns the sentence about a word that nothing matches."""
+    if len(scores) == 0:
+        return "The map has no occupied voxels."
+    highest = float(scores.max())
+    why = f"the best score is {highest:.2f}" + (f", below {threshold:.2f}" if highest < threshold else "")
+    return f"Nothing in this map looks like '{word}': {why}."
+
+
+def _beaten(features: Features, text: TextFeatures, excluded: TextFeatures, w: int) -> NDArray[np.bool_]:
+    """Returns (V,) whether a voxel is nearer to an excluded word than to word ``w``."""
+    if not len(excluded.understood):
+        return np.zeros(len(features), bool)
+    meant = compute_cosines(features, text.features[w : w + 1])
+    return np.asarray((compute_cosines(features, excluded.features) > meant).any(axis=1))
 
 
 def _in_color(
@@ -323,12 +377,8 @@ def _note(
 ) -> str:
     if not understood:
         return f"'{word}' is not understood{_only_known(word, text_encoder)}"
-    if len(scores) == 0:
-        return "The map has no occupied voxels."
     if not matched:
-        highest = float(scores.max())
-        why = f"the best score is {highest:.2f}" + (f", below {threshold:.2f}" if highest < threshold else "")
-        return f"Nothing in this map looks like '{understood}': {why}."
+        return _nothing_like(understood, scores, threshold)
     asked = [token for token in re.findall(r"\w+", phrase.lower()) if token not in ("a", "an", "the")]
     partly = len(asked) > len(re.findall(r"\w+", understood))
     named = make_key(understood if partly else phrase) in map(make_key, meant)

@@ -73,12 +73,22 @@ class CaptureRecord(msgspec.Struct, frozen=True, kw_only=True):
     frames: Count = 0
 
 
+class ChanceRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """What random words reach in a map; see ``query.chance``. evidence: that one in 40 reaches.  spread: standard
+    deviation of the evidence of their best regions."""
+
+    evidence: Annotated[float, msgspec.Meta(gt=0, le=1e6)]
+    spread: Annotated[float, msgspec.Meta(gt=0, le=1e6)]
+
+
 class EncoderRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """The encoder of the features. state: restores the text encoder.  dimension: of the features."""
+    """The encoder of the features. state: restores the text encoder.  dimension: of the features.  chance: what random
+    words reach, for an encoder of any words."""
 
     name: str
     dimension: Count = 0
     state: Any
+    chance: ChanceRecord | None = None
 
 
 class MapScale(msgspec.Struct, frozen=True, kw_only=True):

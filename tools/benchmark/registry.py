@@ -122,6 +122,12 @@ MEASUREMENTS = {
         table="object_answers:tabulate_object_answers",
         map_of=TRUE_CLASSES,
     ),
+    "words_by_chance": Measurement(
+        "names that are there and names that are not, asked of maps with simulated CLIP features",
+        "capture",
+        "words_by_chance:measure_words_by_chance",
+        table="words_by_chance:tabulate_words_by_chance",
+    ),
     "exports": Measurement(
         "every exporter at 4 cm: seconds, memory, bytes; the plan for robots against the truth's",
         "capture",

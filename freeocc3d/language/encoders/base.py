@@ -45,9 +45,9 @@ class TextFeatures:
 class TextEncoder(ABC):
     """The text part of an encoder, restored from the state that the map saved."""
 
-    threshold: float
-    """A voxel matches a word that beats the contrast words if its score (cosine / attainable cosine) is at least
-    this."""
+    threshold: float | None
+    """A voxel matches a word that beats the contrast words if its score (cosine / attainable cosine) is at least this.
+    None = what random words reach in the map decides (``query.chance``), for an encoder of any words."""
     temperature: float
     """Softmax temperature that turns scores into a confidence relative to the contrast words."""
     bias: float | None = None

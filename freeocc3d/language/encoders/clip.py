@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import ModelError
 from ...core.types import Frame
-from ...settings.option_types import Advanced, Cosine
+from ...settings.option_types import Advanced
 from .. import model_packages
 from ..text_networks import ModelWords
 from .base import WELL_COVERED, Encoder
@@ -31,9 +31,6 @@ class Options(PatchOptions, frozen=True):
     list)."""
     attention: Advanced[Attention] = "naclip"
     """Attention of the last block; "naclip" has the best results in the papers."""
-    threshold: Cosine = 0.15
-    """Smallest cosine of a match. Cosines of images and words are usually 0.1 to 0.35 with CLIP, 0 to 0.2 with
-    SigLIP."""
 
 
 class ClipEncoder(Encoder):

@@ -26,8 +26,8 @@ class WordOptions(TypedOptions, frozen=True):
     contrast: tuple[str, ...] = ()
     """What else a voxel could be: a word matches only where none of these words fits better; none = things in most
     rooms."""
-    threshold: Cosine = 0.15
-    """Smallest cosine of a match."""
+    threshold: Cosine | None = None
+    """Smallest cosine of a match; null = what random words reach in the map decides."""
     device: Device = "cpu"
     """Device that runs the image network: "cpu", or "cuda:0" with onnxruntime-gpu."""
 

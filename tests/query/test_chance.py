@@ -1,0 +1,130 @@
+"""What random words reach decides whether a word is in a map, whatever a model's cosines are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import worded_voxels
+from numpy.typing import NDArray
+
+from freeocc3d.core.types import Occupancy
+from freeocc3d.language.encoders.base import TextEncoder, TextFeatures
+from freeocc3d.language.feature_codec import Codec, CodedFeatures
+from freeocc3d.language.random_words import RANDOM_WORDS
+from freeocc3d.query.chance import Chance
+from freeocc3d.query.word_query import Options, query
+
+SIZE = 256
+CONTRAST = ["wall", "floor", "table"]
+PRESENT = ["wall", "floor", "sofa", "table"]
+ABSENT = ["zebra", "anchor", "violin", "cactus", "rocket", "tent", "saddle", "harp", "anvil", "cannon"]
+
+
+class Model(TextEncoder):
+    """Words around a mean of length 0.86, as CLIP's; "couch" is near "sofa"."""
+
+    threshold = None
+    temperature = 0.01
+    open_vocabulary = True
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(1)
+        names = dict.fromkeys([*RANDOM_WORDS, *PRESENT, *ABSENT])
+        mean = np.zeros(SIZE)
+        mean[0] = 0.86
+        self.words = {name: mean + 0.51 * _unit(rng.standard_normal(SIZE) * (np.arange(SIZE) > 0)) for name in names}
+        self.words["couch"] = self.words["sofa"] + 0.1 * _unit(rng.standard_normal(SIZE))
+
+    def encode_words(self, words: list[str]) -> TextFeatures:
+        rows = np.array([_unit(self.words[word]) for word in words], np.float32).reshape(len(words), SIZE)
+        return TextFeatures(rows, tuple(words))
+
+    def contrast_words(self) -> list[str]:
+        return CONTRAST
+
+
+def _unit(values: NDArray[Any]) -> NDArray[Any]:
+    return values / np.linalg.norm(values)
+
+
+def _voxels(corners: NDArray[np.int64], features: NDArray[np.float16]) -> Occupancy:
+    made = worded_voxels.occupancy(dict.fromkeys(map(tuple, corners.tolist()), np.zeros(5)))
+    of = {tuple(corner): row for row, corner in enumerate(corners.tolist())}
+    order = [of[tuple(voxel)] for voxel in made.occupied_voxels().tolist()]
+    return made.replace(features=features[order], colors=np.zeros((len(order), 3), np.uint8))
+
+
+def _room(model: Model, offset: float, coded: bool) -> tuple[Occupancy, NDArray[np.int64]]:
+    """Four slabs of 10 x 10 x 2 voxels whose features have cosines of about 0.26 + offset with their names, and 0.18 +
+    offset with other words; and the slab of each voxel in the map."""
+    rng = np.random.default_rng(2)
+    voxels = np.argwhere(np.ones((10, 10, 2), bool))
+    corners = np.concatenate([voxels + (0, 0, 8 * n) for n in range(len(PRESENT))])
+    slab = np.repeat(np.arange(len(PRESENT)), len(voxels))
+    gap = rng.standard_normal(SIZE) * (np.arange(SIZE) > 0)
+    shared = (0.21 + offset / 0.86) * np.eye(SIZE)[0] + 0.7 * _unit(gap)
+    own = np.stack([0.16 * _unit(model.words[name] * (np.arange(SIZE) > 0)) for name in PRESENT])
+    features = shared + own[slab] + 0.5 / np.sqrt(SIZE) * rng.standard_normal((len(corners), SIZE))
+    features = (features / np.linalg.norm(features, axis=1, keepdims=True)).astype(np.float16)
+    occupancy = _voxels(corners, features)
+    if coded:
+        codec = Codec.fit(features)
+        occupancy = occupancy.replace(features=CodedFeatures(codec, codec.encode(occupancy.features)))
+    return occupancy, occupancy.occupied_voxels()[:, 2] // 8
+
+
+@pytest.mark.parametrize("offset", [-0.15, 0.0, 0.3])
+def test_present_words_are_found_and_absent_ones_are_not_whatever_the_cosines(offset: float) -> None:
+    model = Model()
+    room, slab = _room(model, offset, coded=True)
+    for result, n in zip(query(room, model, PRESENT), range(len(PRESENT)), strict=True):
+        (region,) = result.regions
+        assert region.score > 0.5, result.word
+        assert region.voxels >= 180, result.word
+        assert set(slab[region.rows]) == {n}
+    assert sum(result.matched for result in query(room, model, ABSENT)) <= 1
+    missing = next(result for result in query(room, model, ABSENT) if not result.matched)
+    assert missing.note.startswith(f"Nothing in this map looks like '{missing.word}': the best score is 0.")
+
+
+def test_a_synonym_is_found_beside_the_word_itself() -> None:
+    model = Model()
+    room, slab = _room(model, 0.0, coded=False)
+    (result,) = query(room, model, ["couch"], contrast=["sofa"])
+    assert result.matched
+    assert set(slab[result.regions[0].rows]) == {PRESENT.index("sofa")}
+    (excluded,) = query(room, model, ["couch"], negative=["sofa"])
+    assert sum(region.voxels for region in excluded.regions) < 0.5 * result.regions[0].voxels
+
+
+def test_a_threshold_that_is_given_counts_instead() -> None:
+    model = Model()
+    room, _ = _room(model, 0.0, coded=False)
+    assert not query(room, model, ["sofa"], Options(threshold=0.9))[0].matched
+
+
+def test_evidence_is_the_sum_of_deviations_over_its_spread_among_random_words() -> None:
+    """Against a plain computation of one region."""
+    model = Model()
+    room, _ = _room(model, 0.0, coded=False)
+    chance = Chance(room, model)
+    (found,) = chance.find_regions(model.encode_words(["sofa"]).features, model.encode_words(CONTRAST).features)
+    largest = np.bincount(found.component).argmax()
+    rows = found.rows[found.component == largest]
+    random = model.encode_words(list(RANDOM_WORDS)).features.astype(float)
+    features = np.asarray(room.features, float)
+    pooled = (features[rows] - features.mean(axis=0)).sum(axis=0)
+    word = model.encode_words(["sofa"]).features[0] - random.mean(axis=0)
+    surface = len(rows) * room.voxel_size**2
+    expected = pooled @ word / (random @ pooled).std() * np.sqrt(surface / (surface + 0.05))
+    assert found.evidence[largest] == pytest.approx(expected, rel=1e-2)
+    assert chance.score(np.array([chance.record.evidence])) == pytest.approx(0.5)
+
+
+def test_a_map_without_voxels_answers_in_a_sentence() -> None:
+    model = Model()
+    empty = _voxels(np.zeros((0, 3), int), np.zeros((0, SIZE), np.float16))
+    (result,) = query(empty, model, ["sofa"])
+    assert (result.regions, result.note) == ([], "The map has no occupied voxels.")
