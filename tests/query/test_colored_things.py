@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worded_voxels import WORDS, box, feature, occupancy
 
-from freeocc3d.query.colored_things import read_colors, read_only_colors
+from freeocc3d.query.colored_things import fit_colors, read_colors, read_only_colors
 from freeocc3d.query.word_query import query
 
 RED, BLUE, GRAY = (208, 26, 32), (36, 82, 196), (110, 110, 110)
@@ -76,3 +76,9 @@ def test_the_colors_that_a_phrase_adds(phrase: str, name: str, colors: str) -> N
 def test_what_asks_for_a_color_only() -> None:
     assert read_only_colors("a light-blue thing") == "light blue"
     assert [read_only_colors(phrase) for phrase in ("blue bathtub", "dark", "something", "")] == [""] * 4
+
+
+def test_a_color_between_two_is_the_nearer_one() -> None:
+    between = np.array([(80, 150, 127)], np.uint8)  # 0.77 green, 0.64 turquoise: both reach the threshold
+    assert fit_colors(between, "green").tolist() == [True]
+    assert fit_colors(between, "turquoise").tolist() == [False]
