@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.types import Occupancy
 from ..language.encoders import color
+from ..language.encoders.base import TextFeatures
 from ..language.feature_codec import compute_cosines
 from ..language.purposes import find_purpose
 from .regions import Region
@@ -64,8 +65,13 @@ def fit_colors(rgb: NDArray[np.uint8], colors: str) -> NDArray[np.bool_]:
     words = color.ColorWords()
     text, others = words.encode_words([colors]), words.encode_words(words.contrast_words())
     features = color.encode_colors(rgb)
-    attainable = np.ones(1, np.float32) if text.attainable is None else text.attainable
-    score = compute_cosines(features, text.features)[:, 0] / attainable[0]
+    score = _compare(features, text)[:, 0]
     competes = compute_cosines(text.features, others.features)[0] < words.same_word
-    against = compute_cosines(features, others.features[competes]).max(axis=1, initial=0)
+    against = _compare(features, others)[:, competes].max(axis=1, initial=0)
     return np.asarray((score >= words.threshold) & (score >= against))
+
+
+def _compare(features: NDArray[np.float32], text: TextFeatures) -> NDArray[np.float32]:
+    """(n, W) cosines over attainable cosines."""
+    cosine = compute_cosines(features, text.features)
+    return cosine if text.attainable is None else cosine / text.attainable
