@@ -109,11 +109,7 @@ def query(
     negative word that is not understood; MapError if the map's features are not those of the encoder.
     """
     options = options or Options()
-    for word in (*words, *negative):
-        if not word.strip():
-            raise FreeOccError("A word is empty: give a word or a phrase.")
-        if len(word) > _LONGEST_WORD:
-            raise FreeOccError(f"'{word[:30]}…' has {len(word)} characters; a query may have up to {_LONGEST_WORD}.")
+    _check_words([*words, *negative])
     names = (*text_encoder.contrast_words(), *contrast)
     asked, denied = ([read_phrase(word, names) for word in some] for some in (words, negative))
     text = text_encoder.encode_words(asked)
@@ -146,13 +142,9 @@ def query(
         ]
     every_score = cosine
     if not plain:
-        every_score = np.stack(
-            [
-                _probability(features, cosine[:, w], _some(others, competes[w]), text_encoder, options.scores)
-                for w in range(len(words))
-            ],
-            axis=1,
-        )
+        pairs = zip(cosine.T, (_some(others, own) for own in competes), strict=True)
+        made = [_probability(features, *pair, text_encoder, options.scores) for pair in pairs]
+        every_score = np.stack(made, axis=1)
     understood = np.array([bool(part) for part in text.understood])
     candidates = says[:, None] & (every_score >= min(options.grow * threshold, threshold)) & understood
     best = _not_beaten(features, cosine, candidates, others, competes, text_encoder.temperature)
@@ -246,6 +238,15 @@ def _query_color(
     """Answers a word that only names colors, from the colors of the voxels."""
     colored = occupancy.replace(features=encode_colors(occupancy.colors).astype(np.float16))
     return query(colored, ColorWords(), [word], options.changed(threshold=None), up=up)[0]
+
+
+def _check_words(words: list[str]) -> None:
+    """Raises FreeOccError for a word that is empty or too long."""
+    for word in words:
+        if not word.strip():
+            raise FreeOccError("A word is empty: give a word or a phrase.")
+        if len(word) > _LONGEST_WORD:
+            raise FreeOccError(f"'{word[:30]}…' has {len(word)} characters; a query may have up to {_LONGEST_WORD}.")
 
 
 def find_regions(
