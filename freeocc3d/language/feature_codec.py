@@ -237,6 +237,15 @@ def mask_known(features: Features) -> NDArray[np.bool_]:
     return np.asarray(rows.any(axis=1))
 
 
+def average_known(features: Features) -> NDArray[np.float32]:
+    """(D,) mean of the known features, or of an even sample of them; zeros if none is known."""
+    rows = np.flatnonzero(mask_known(features))
+    rows = rows[:: max(1, len(rows) // _SAMPLE)]
+    if not len(rows):
+        return np.zeros(features.shape[1], np.float32)
+    return np.asarray(np.asarray(features[rows], np.float32).mean(axis=0))
+
+
 def _compiled(count: int) -> bool:
     """Whether numba computes ``count`` scores. For fewer scores, importing numba takes longer than computing them."""
     return count >= MANY or f"{__package__}.coded_scores" in sys.modules

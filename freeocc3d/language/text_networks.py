@@ -25,6 +25,7 @@ from ..core.typed_documents import InvalidDocument, as_type
 from . import model_packages
 from .encoders.base import TextEncoder, TextFeatures
 from .vision_server import shorten_to_line
+from .word_matching import CANONICAL
 
 TEMPLATES = ("a photo of a {}.", "a photo of the {} in a room.", "there is a {} in the scene.", "a bad photo of a {}.",
              "a photo of a small {}.", "a photo of a large {}.", "{}")  # fmt: skip
@@ -32,10 +33,9 @@ TEMPLATES = ("a photo of a {}.", "a photo of the {} in a room.", "there is a {} 
 
 CONTRAST = (
     "wall", "floor", "ceiling", "door", "window", "table", "chair", "sofa", "bed", "cabinet", "shelf", "desk",
-    "curtain", "lamp", "picture", "plant", "pillow", "television", "sink", "toilet", "object", "things", "stuff",
-    "texture",
+    "curtain", "lamp", "picture", "plant", "pillow", "television", "sink", "toilet", *CANONICAL,
 )  # fmt: skip
-"""What else a voxel could be: things in most rooms, and LERF's "canonical" words."""
+"""What else a voxel could be: things in most rooms, and words that fit anything."""
 
 _KEPT = 4096  # the latest embeddings, kept in a cache file
 _LONGEST = 200  # characters of a word; longer ones are not cached

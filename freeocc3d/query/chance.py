@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from ..core.errors import ModelError
 from ..core.types import Occupancy
 from ..language.encoders.base import Encoder, TextEncoder
-from ..language.feature_codec import Features, compute_cosines, mask_known
+from ..language.feature_codec import average_known, compute_cosines, mask_known
 from ..language.random_words import RANDOM_WORDS
 from ..language.word_matching import compute_confidences
 from ..occupancy.connected_components import label_components
@@ -46,7 +46,6 @@ _ABOVE = 1.96
 """Standard deviations above the mean of the random words' best evidence: 1 of 40 normally distributed ones is higher. A
 quantile of 200 words, of which some may be there, is less certain."""
 _LEAST = 1e-3
-_SAMPLE = 20_000
 _ROWS = 16_384
 
 
@@ -73,7 +72,7 @@ class Chance:
         self._random = random[random.any(axis=1)]
         self._mean = self._random.mean(axis=0)
         self._known = mask_known(occupancy.features)
-        self._center = _mean_feature(occupancy.features, self._known)
+        self._center = average_known(occupancy.features)
         self.record = record or self._measure()
 
     def score(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -144,15 +143,6 @@ def record_encoder(encoder: Encoder, occupancy: Occupancy) -> EncoderRecord:
         with contextlib.suppress(ModelError):
             chance = Chance(occupancy, text_encoder).record
     return EncoderRecord(name=encoder.name, dimension=encoder.dimension, state=state, chance=chance)
-
-
-def _mean_feature(features: Features, known: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Returns the (D,) mean of the known features, or of an even sample of them."""
-    rows = np.flatnonzero(known)
-    rows = rows[:: max(1, len(rows) // _SAMPLE)]
-    if not len(rows):
-        return np.zeros(features.shape[1], np.float32)
-    return np.asarray(np.asarray(features[rows], np.float32).mean(axis=0))
 
 
 def _cosines(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from freeocc3d.language.encoders.base import TextEncoder, TextFeatures
 from freeocc3d.language.feature_codec import Codec, CodedFeatures
 from freeocc3d.language.random_words import RANDOM_WORDS
 from freeocc3d.query.chance import Chance
+from freeocc3d.query.objects.finding import name_objects
 from freeocc3d.query.word_query import Options, query
 
 SIZE = 256
@@ -121,6 +123,19 @@ def test_evidence_is_the_sum_of_deviations_over_its_spread_among_random_words() 
     expected = pooled @ word / (random @ pooled).std() * np.sqrt(surface / (surface + 0.05))
     assert found.evidence[largest] == pytest.approx(expected, rel=1e-2)
     assert chance.score(np.array([chance.record.evidence])) == pytest.approx(0.5)
+
+
+def test_objects_are_named_by_what_tells_them_from_the_rest_of_the_map() -> None:
+    """Even where the model gives one of the words a high cosine with every image."""
+    model = Model()
+    room, slab = _room(model, 0.0, coded=True)
+    features = np.asarray(room.features, np.float32)
+    model.words["piano"] = model.words["piano"] + 0.3 * _unit(features.mean(axis=0))
+    names = SimpleNamespace(text_encoder=model, scene_words=[*PRESENT, "piano"], occupancy=room)
+    means = np.stack([features[slab == n].mean(axis=0) for n in range(len(PRESENT))])
+    assert [own[0][0] for own in name_objects(names, means, 3)] == PRESENT
+    assert (means @ model.encode_words([*PRESENT, "piano"]).features.T).argmax(axis=1).tolist() == [4] * 4
+    assert name_objects(names, np.zeros((1, SIZE), np.float32), 3) == [()]
 
 
 def test_a_map_without_voxels_answers_in_a_sentence() -> None:

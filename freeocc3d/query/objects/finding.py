@@ -7,7 +7,10 @@ from numpy.typing import NDArray
 
 from ...core.types import Occupancy
 from ...language.encoders.base import TextEncoder
-from ...language.feature_codec import compute_cosines, mask_known
+from ...language.feature_codec import average_known, compute_cosines, mask_known
+from ...language.random_words import HOUSE_WORDS
+from ...language.synonyms import SYNONYMS
+from ...language.word_matching import CANONICAL
 from ...storage.saved_map import SavedMap
 from ..oriented_boxes import oriented_boxes
 from ..regions import best_regions
@@ -41,12 +44,29 @@ def find_objects(scan_map: SavedMap, options: Options | None = None) -> list[Obj
     views = best_views(scan_map.occupancy, scan_map.trajectory, scan_map.keyframes, regions, options.views)
     embedded = embed_views(scan_map, views, feature.shape[1])
     feature = np.where(mask_known(embedded)[:, None], embedded, feature[which])
-    named = name_features(feature, scan_map.text_encoder, scan_map.vocabulary, options.names)
+    named = name_objects(scan_map, feature, options.names)
     boxes = oriented_boxes(scan_map.occupancy, regions, scan_map.T_gravity_map)
     return [
         Object(np.sort(region.rows), own, names, box, region.volume_m3, region.centroid, tuple(seen), region.score)
         for region, own, names, box, seen in zip(regions, feature, named, boxes, views, strict=True)
     ]
+
+
+def name_objects(scan_map: SavedMap, feature: NDArray[np.float32], most: int) -> list[tuple[tuple[str, float], ...]]:
+    """Returns the most probable names of (N, D) features of objects: among the map's classes, or, for a model of any
+    words, among the names that the scene has or things of houses.
+
+    Such a model gives each word a cosine with any image, which says nothing of the object. The mean of the map's
+    features holds it, and is taken off.
+    """
+    if not scan_map.text_encoder.open_vocabulary:
+        return name_features(feature, scan_map.text_encoder, scan_map.vocabulary, most)
+    heads = (same[0] for same in SYNONYMS)
+    own = [word for word in scan_map.text_encoder.contrast_words() if word not in CANONICAL]
+    words = scan_map.scene_words or list(dict.fromkeys((*own, *heads, *HOUSE_WORDS)))
+    known = mask_known(feature)[:, None]
+    centered = np.where(known, feature - average_known(scan_map.occupancy.features), 0)
+    return name_features(centered, scan_map.text_encoder, words, most)
 
 
 def average_features(
@@ -68,8 +88,8 @@ def average_features(
 def name_features(
     features: NDArray[np.float32], text_encoder: TextEncoder, vocabulary: list[str], most: int
 ) -> list[tuple[tuple[str, float], ...]]:
-    """Returns the most probable names of (N, D) unit features, with the softmax of plain cosines over the vocabulary at
-    the encoder's temperature; none for a zero feature."""
+    """Returns the most probable names of (N, D) features, with the softmax of their products with the vocabulary's
+    at the encoder's temperature; none for a zero feature."""
     text = text_encoder.encode_words(vocabulary)
     if not vocabulary or not features.size:
         return [()] * len(features)
