@@ -1,5 +1,12 @@
 """Words to compare a word with: what they score in a map is what chance scores there. No scene holds many of them."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from .synonyms import SYNONYMS
+from .word_matching import CANONICAL
+
 HOUSE_WORDS = (
     "armchair", "ashtray", "alarm clock", "apron", "bathrobe", "bathtub", "bench", "birdcage", "blender",
     "bookcase", "bottle", "broom", "bucket", "calculator", "calendar", "candle", "clothes hanger", "coffee maker",
@@ -30,3 +37,10 @@ OTHER_WORDS = (
 """Other things that have a name and a look."""
 
 RANDOM_WORDS = (*HOUSE_WORDS, *OTHER_WORDS)
+
+
+def list_house_names(contrast: Sequence[str]) -> list[str]:
+    """Returns names for what is in a room: contrast words that name things, one of each group of synonyms, and
+    ``HOUSE_WORDS``."""
+    named = (word for word in contrast if word not in CANONICAL)
+    return list(dict.fromkeys((*named, *(same[0] for same in SYNONYMS), *HOUSE_WORDS)))

@@ -30,7 +30,7 @@ from ..core.errors import ModelError
 from ..core.types import Occupancy
 from ..language.encoders.base import Encoder, TextEncoder
 from ..language.feature_codec import average_known, compute_cosines, mask_known
-from ..language.random_words import RANDOM_WORDS
+from ..language.random_words import RANDOM_WORDS, list_house_names
 from ..language.word_matching import compute_confidences
 from ..occupancy.connected_components import label_components
 from ..settings import registry
@@ -46,7 +46,8 @@ _ABOVE = 1.96
 """Standard deviations above the mean of the random words' best evidence: 1 of 40 normally distributed ones is higher. A
 quantile of 200 words, of which some may be there, is less certain."""
 _LEAST = 1e-3
-_ROWS = 16_384
+_ROWS = 16_384  # voxels in one step, and words: arrays of voxels x words stay small
+_WORDS = 16
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,12 @@ class Chance:
 
     def find_regions(self, text: NDArray[np.float32], others: NDArray[np.float32]) -> list[WordRegions]:
         """Returns the regions of each of W words, (W, D), among C contrast words, (C, D)."""
+        found: list[WordRegions] = []
+        for start in range(0, len(text), _WORDS):
+            found += self._find_some(text[start : start + _WORDS], others)
+        return found
+
+    def _find_some(self, text: NDArray[np.float32], others: NDArray[np.float32]) -> list[WordRegions]:
         features = self.occupancy.features
         deviations, bias = text - self._mean, _OF_SCENE * (text @ self._center)
         competes = (_cosines(deviations, others - self._mean) < _SAME) & others.any(axis=1)
@@ -126,11 +133,20 @@ class Chance:
         )
 
     def _measure(self) -> ChanceRecord:
-        """Returns the evidence of chance: of the best regions of the random words, each asked alone."""
-        others = self.text_encoder.encode_words(self.text_encoder.contrast_words()).features
-        best = np.array([found.evidence.max(initial=0.0) for found in self.find_regions(self._random, others)])
+        """Returns the evidence of chance, of the best regions of the random words, each asked alone; and which names of
+        things of houses have more."""
+        contrast = self.text_encoder.contrast_words()
+        others = self.text_encoder.encode_words(contrast).features
+        best = self._best_evidence(self._random, others)
         mean, spread = (float(best.mean()), float(best.std())) if len(best) else (0.0, 0.0)
-        return ChanceRecord(evidence=max(mean + _ABOVE * spread, _LEAST), spread=max(spread, _LEAST))
+        evidence = max(mean + _ABOVE * spread, _LEAST)
+        candidates = list_house_names(contrast)
+        there = self._best_evidence(self.text_encoder.encode_words(candidates).features, others) >= evidence
+        names = [name for name, found in zip(candidates, there, strict=True) if found]
+        return ChanceRecord(evidence=evidence, spread=max(spread, _LEAST), names=names)
+
+    def _best_evidence(self, text: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.float64]:
+        return np.array([found.evidence.max(initial=0.0) for found in self.find_regions(text, others)])
 
 
 def record_encoder(encoder: Encoder, occupancy: Occupancy) -> EncoderRecord:

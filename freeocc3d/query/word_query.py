@@ -126,27 +126,26 @@ def query(
             f"The map's features have {features.shape[1]} dimensions, its encoder's words "
             f"{text.features.shape[1]}: reconstruct the map with this version."
         )
-    expressed = others.features.any(axis=1)
-    competes = (compute_cosines(text.features, others.features) < text_encoder.same_word) & expressed
-    cosine = similarity(features, text)
-    says = mask_known(features)
     plain = options.scores == "cosine"
     default = text_encoder.threshold if plain else _EVEN
     threshold = default if options.threshold is None else options.threshold
     if threshold is None:
         measured = Chance(occupancy, text_encoder, chance() if chance else None)
+        others = text_encoder.encode_words(list(dict.fromkeys((*names, *measured.record.names, *denied))))
         found = measured.find_regions(text.features, others.features)
         return [
             _answer_by_chance(occupancy, word, found[w], measured, options, up, _beaten(features, text, excluded, w))
             for w, word in enumerate(words)
         ]
-    every_score = cosine
+    expressed = others.features.any(axis=1)
+    competes = (compute_cosines(text.features, others.features) < text_encoder.same_word) & expressed
+    cosine = every_score = similarity(features, text)
     if not plain:
         pairs = zip(cosine.T, (_some(others, own) for own in competes), strict=True)
         made = [_probability(features, *pair, text_encoder, options.scores) for pair in pairs]
         every_score = np.stack(made, axis=1)
     understood = np.array([bool(part) for part in text.understood])
-    candidates = says[:, None] & (every_score >= min(options.grow * threshold, threshold)) & understood
+    candidates = mask_known(features)[:, None] & (every_score >= min(options.grow * threshold, threshold)) & understood
     best = _not_beaten(features, cosine, candidates, others, competes, text_encoder.temperature)
     results = []
     classes = bool(text.meant) and len(occupancy.colors) > 0  # whose things have colors beside

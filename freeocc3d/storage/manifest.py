@@ -49,6 +49,7 @@ Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
 Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 53) - 1)]
 Frame = Annotated[int, msgspec.Meta(ge=0, le=(1 << 31) - 1)]
+Word = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
 Checksum = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{32}\Z")]
 
 
@@ -75,10 +76,13 @@ class CaptureRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 class ChanceRecord(msgspec.Struct, frozen=True, kw_only=True):
     """What random words reach in a map; see ``query.chance``. evidence: that one in 40 reaches.  spread: standard
-    deviation of the evidence of their best regions."""
+    deviation of the evidence of their best regions.  names: names of things of houses that are in the map."""
 
     evidence: Annotated[float, msgspec.Meta(gt=0, le=1e6)]
     spread: Annotated[float, msgspec.Meta(gt=0, le=1e6)]
+    names: Annotated[
+        list[Annotated[str, msgspec.Meta(min_length=1, max_length=200)]], msgspec.Meta(max_length=1000)
+    ] = []
 
 
 class EncoderRecord(msgspec.Struct, frozen=True, kw_only=True):

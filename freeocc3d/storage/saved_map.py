@@ -197,8 +197,10 @@ class SavedMap:
     @property
     def vocabulary(self) -> list[str]:
         """The words that pictures and exports use as classes: the encoder's contrast words; with an open vocabulary,
-        the names that a model gave to the scene, if there are any."""
-        named = self.scene_words if self.text_encoder.open_vocabulary else []
+        the names that a model gave to the scene, or else those of things of houses that are in it, if there are any."""
+        chance = self.manifest.encoder.chance
+        found = chance.names if chance else []
+        named = self.scene_words or found if self.text_encoder.open_vocabulary else []
         return named or self.text_encoder.contrast_words()
 
     @property

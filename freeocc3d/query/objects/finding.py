@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 from ...core.types import Occupancy
 from ...language.encoders.base import TextEncoder
 from ...language.feature_codec import average_known, compute_cosines, mask_known
-from ...language.random_words import HOUSE_WORDS
-from ...language.synonyms import SYNONYMS
-from ...language.word_matching import CANONICAL
+from ...language.random_words import list_house_names
 from ...storage.saved_map import SavedMap
 from ..oriented_boxes import oriented_boxes
 from ..regions import best_regions
@@ -61,9 +59,7 @@ def name_objects(scan_map: SavedMap, feature: NDArray[np.float32], most: int) ->
     """
     if not scan_map.text_encoder.open_vocabulary:
         return name_features(feature, scan_map.text_encoder, scan_map.vocabulary, most)
-    heads = (same[0] for same in SYNONYMS)
-    own = [word for word in scan_map.text_encoder.contrast_words() if word not in CANONICAL]
-    words = scan_map.scene_words or list(dict.fromkeys((*own, *heads, *HOUSE_WORDS)))
+    words = scan_map.scene_words or list_house_names(scan_map.text_encoder.contrast_words())
     known = mask_known(feature)[:, None]
     centered = np.where(known, feature - average_known(scan_map.occupancy.features), 0)
     return name_features(centered, scan_map.text_encoder, words, most)
