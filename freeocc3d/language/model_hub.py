@@ -141,14 +141,14 @@ def pull_package(
 
 def is_repository(name: str) -> bool:
     """Whether a name stands for a repository of the hub: a short one, or OWNER/NAME."""
-    return name == WORDS or name in NAMES or re.fullmatch(r"[\w.-]+/\w[\w.-]*", name) is not None
+    return name == WORDS or name in NAMES or re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", name) is not None
 
 
 def unknown_name(name: str) -> ModelError:
     """The error for a name that is no repository."""
     return ModelError(
         f"'{name}' is neither an installed model nor a repository OWNER/NAME of the hub"
-        f"{model_packages.nearest(name, NAMES)}. Short names are {WORDS}, {', '.join(NAMES)}."
+        f"{model_packages.nearest(name, (WORDS, *NAMES))}. Short names are {WORDS}, {', '.join(NAMES)}."
     )
 
 

@@ -206,7 +206,8 @@ def find_text_model(name: str, folder: str, text_sha256: str) -> Package:
             return package
     raise ModelError(
         f"The words of this map need the text part of the model '{name}' ({text_sha256[:12]}…), but it is neither in "
-        f"{folder} nor in {find_models_folder()}. Copy its folder there, or reconstruct the map with another model."
+        f"{folder} nor in {find_models_folder()}. Copy its folder there, or give the map the words of another model "
+        "with 'freeocc3d relabel'."
     )
 
 

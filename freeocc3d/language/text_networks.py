@@ -126,8 +126,7 @@ class ModelWords(TextEncoder):
                         f"The text part of {package.folder} has {package.dimension} dimensions, but the map's features "
                         f"have {self._dimension}: reconstruct the map."
                     )
-            prompts = [template.replace("{}", word) for word in new for template in self._templates]
-            embedded = self._text.embed(prompts).reshape(len(new), len(self._templates), -1).mean(axis=1)
+            embedded = np.stack([self._embed_prompts(self._text, word) for word in new])
             norms = np.linalg.norm(embedded, axis=1, keepdims=True)
             embedded /= np.where(norms > 0, norms, 1)
             self._known.update(zip(new, embedded, strict=True))
@@ -135,6 +134,11 @@ class ModelWords(TextEncoder):
         empty = np.zeros(self._dimension, np.float32)
         features = [self._known[word] if word else empty for word in plain]
         return TextFeatures(np.array(features, np.float32).reshape(len(words), self._dimension), tuple(plain))
+
+    def _embed_prompts(self, network: TextNetwork, word: str) -> NDArray[np.float32]:
+        """(D,) mean embedding of a word's prompts. They are embedded apart from those of other words: an int8 network
+        rounds all texts of a batch by their common range, so a word's meaning would depend on its company."""
+        return network.embed([template.replace("{}", word) for template in self._templates]).mean(axis=0)
 
 
 class TextNetwork:
@@ -204,8 +208,9 @@ def _read_cache(path: Path, dimension: int) -> dict[str, NDArray[np.float32]]:
         return {}
     words, features = arrays["words"], arrays["features"]
     fit = features.shape == (len(words), dimension)
-    if not fit or features.dtype != np.float32 or not np.isfinite(features).all():
+    if not fit or not np.allclose(np.linalg.norm(features.astype(np.float64), axis=1), 1, atol=1e-3):
         return {}
+    features = features.astype(np.float32)
     return dict(zip(words.tolist(), features, strict=True))
 
 

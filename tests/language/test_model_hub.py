@@ -207,6 +207,8 @@ def test_a_full_disk_and_what_is_forbidden_are_told(words: Hub, monkeypatch: pyt
         ("clip-b16-opena", r"nor a repository OWNER/NAME .* \(did you mean 'clip-b16-openai'\?\)"),
         ("a/b/c", "nor a repository OWNER/NAME"),
         ("a/..", "nor a repository OWNER/NAME"),
+        ("../tiny", "nor a repository OWNER/NAME"),
+        ("wrds", r"\(did you mean 'words'\?\)"),
     ],
 )
 def test_names_that_are_none(server: Hub, name: str, message: str) -> None:

@@ -179,8 +179,18 @@ def test_a_broken_cache_is_no_cache(package: model_packages.Package, home: Path)
     for content in (b"", cache.read_bytes()[:200], b"PK nonsense", np.lib.format.magic(1, 0)):
         cache.write_bytes(content)
         assert np.array_equal(clip.load_text(state(package)).encode_words(["chair"]).features, first)
-    np.savez(cache, words=np.array(["chair"]), features=np.full((1, 24), np.nan, np.float32))
-    assert np.array_equal(clip.load_text(state(package)).encode_words(["chair"]).features, first)
+    for value in (np.nan, 0, 1e30):
+        np.savez(cache, words=np.array(["chair"]), features=np.full((1, 24), value, np.float32))
+        assert np.array_equal(clip.load_text(state(package)).encode_words(["chair"]).features, first)
+
+
+def test_a_words_meaning_does_not_depend_on_words_beside_it(home: Path, tmp_path: Path) -> None:
+    """An int8 network rounds all texts of a batch by their common range."""
+    asked = state(model_packages.read_package(tiny_models.clip_package(tmp_path / "int8", "int8")))
+    together = clip.load_text(asked).encode_words(["floor lamp", "chair", "x" * 200]).features[1]
+    (cache,) = (home / ".embeddings").glob("*.npz")
+    cache.unlink()
+    assert np.array_equal(clip.load_text(asked).encode_words(["chair"]).features[0], together)
 
 
 def test_other_templates_are_other_embeddings(package: model_packages.Package, home: Path) -> None:
