@@ -55,7 +55,12 @@ class WordSide:
         typer.Option("--tokenizer", metavar="FOLDER", help="Folder of the tokenizer, if it is not CHECKPOINT."),
     ] = None
     text: Annotated[
-        str | None, typer.Option("--text", metavar="CLIP", help="Checkpoint of the CLIP that reads words for a DINOv2.")
+        str | None,
+        typer.Option(
+            "--text",
+            metavar="FOLDER",
+            help="Weights of dino.txt for a DINO, or with --text-head the CLIP for a DINOv2.",
+        ),
     ] = None
     text_head: Annotated[
         Path | None,
@@ -72,7 +77,7 @@ def models_export(
         str,
         typer.Argument(
             metavar="CHECKPOINT",
-            help="Folder of a checkpoint of CLIP, SigLIP, DINO, DINOv2 or SAM, OWNER/NAME on the Hugging Face hub, or "
+            help="Folder of a checkpoint of CLIP, SigLIP, DINO or SAM, OWNER/NAME on the Hugging Face hub, or "
             "open_clip:ARCHITECTURE/WEIGHTS.",
         ),
     ],
@@ -108,8 +113,8 @@ def models_export(
     """
     from ..language.model_export.export_checkpoint import export_checkpoint
 
-    if (word_side.text is None) != (word_side.text_head is None):
-        raise typer.BadParameter("give --text and --text-head together.")
+    if word_side.text is None and word_side.text_head is not None:
+        raise typer.BadParameter("--text-head needs --text.")
     made = export_checkpoint(
         checkpoint, output, precision, word_side.tokenizer, word_side.text, word_side.text_head, license_name
     )

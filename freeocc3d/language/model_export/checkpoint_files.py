@@ -22,8 +22,14 @@ from .checkpoint_networks import (
     build_siglip,
     build_text_aligned,
 )
+from .dino_txt import build_dino_txt, is_dino_txt
 from .open_clip_weights import clip_from_open_clip
 from .tokenizer_files import read_tokenizer
+
+TO_SAFETENSORS = (
+    "convert what is published as .pt or .pth with safetensors.torch.save_file(torch.load(FILE, weights_only=True), …)"
+)
+"""What to do with weights that are published as pickles, which are not read here."""
 
 
 def read_checkpoint(source: str, tokenizer: Path | None, text: str | None, text_head: Path | None) -> Checkpoint:
@@ -43,11 +49,28 @@ def read_checkpoint(source: str, tokenizer: Path | None, text: str | None, text_
     if text is not None and text_head is not None:
         other = _local(text)
         return build_text_aligned(model, _clip_of(other), read_tokenizer(tokenizer or other), _safetensors(text_head))
+    if text is not None:
+        return _with_words(model, _local(text), tokenizer)
     if kind == "clip":
         return build_clip(model, read_tokenizer(tokenizer or folder), mean, std)
     if kind in ("siglip", "siglip2"):
         return build_siglip(model, read_tokenizer(tokenizer or folder), mean, std)
     return build_sam(model, mean, std) if kind == "sam" else build_backbone(model, mean, std)
+
+
+def _with_words(model: nn.Module, folder: Path, tokenizer: Path | None) -> Checkpoint:
+    """A DINO with the weights of dino.txt in ``folder``."""
+    state = {name: value for path in sorted(folder.glob("*.safetensors")) for name, value in _safetensors(path).items()}
+    if not is_dino_txt(state):
+        raise ModelError(
+            f"{folder} does not contain dino.txt's vision head and text tower as safetensors files: {TO_SAFETENSORS}. "
+            "With the CLIP of a Talk2DINO, give --text-head, too."
+        )
+    try:
+        return build_dino_txt(model, state, read_tokenizer(tokenizer or folder))
+    except (KeyError, RuntimeError, ValueError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise ModelError(f"{folder} does not contain the usual weights of dino.txt for this DINO: {said}.") from error
 
 
 def _clip_of(folder: Path) -> nn.Module:
@@ -70,14 +93,15 @@ def _from_transformers(folder: Path) -> nn.Module:
         config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
         name = {
             "clip": "CLIPModel", "siglip": "SiglipModel", "siglip2": "Siglip2Model", "vit": "ViTModel",
-            "dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel", "sam": "SamModel",
+            "dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel",
+            "dinov3_vit": "DINOv3ViTModel", "sam": "SamModel",
         }[config["model_type"]]  # fmt: skip
         loaded = getattr(transformers, name).from_pretrained(
             folder, use_safetensors=True, local_files_only=True, attn_implementation="eager"
         )
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise ModelError(
-            f"{folder} does not contain a checkpoint of CLIP, SigLIP, DINO, DINOv2 or SAM as config.json and "
+            f"{folder} does not contain a checkpoint of CLIP, SigLIP, DINO or SAM as config.json and "
             f"model.safetensors: {' '.join(str(error).split())}."
         ) from error
     return loaded.float().eval()

@@ -53,7 +53,7 @@ def build_clip(model: nn.Module, tokenizer: str, mean: list[float], std: list[fl
     tokens = torch.zeros((2, 7), dtype=torch.int64)
     return Checkpoint(
         "clip",
-        {**_image_networks(model, graphs.ClipHead(model)), "text": _text_network(network, tokens, (0, 1))},
+        {**_image_networks(model, graphs.ClipHead(model)), "text": text_network(network, tokens, (0, 1))},
         _facts(model.config.projection_dim, mean, std, vision, 1, math.exp(model.logit_scale.item())),
         clip_tokenizer(tokenizer, text.max_position_embeddings),
     )
@@ -63,7 +63,7 @@ def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[
     """From transformers' SiglipModel (SigLIP, SigLIP 2 of a fixed size) or Siglip2Model (NaFlex)."""
     text, vision = model.config.text_config, model.config.vision_config
     tokens = torch.zeros((2, text.max_position_embeddings), dtype=torch.int64)
-    words = _text_network(graphs.SiglipText(model), tokens, (0,))
+    words = text_network(graphs.SiglipText(model), tokens, (0,))
     second = text.vocab_size > SIGLIP_VOCABULARY
     stated = Tokenizer.from_str(tokenizer).token_to_id("<pad>") if second else None  # config.json states SigLIP's
     pad = text.pad_token_id if stated is None else stated
@@ -79,10 +79,9 @@ def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[
 
 
 def build_backbone(model: nn.Module, mean: list[float], std: list[float]) -> Checkpoint:
-    """From transformers' ViTModel (DINO) or Dinov2Model, with registers or without."""
-    network = CheckpointNetwork(
-        graphs.DinoPatches(model), {"image": _image(model.config)}, {"image": (0, 2, 3)}, ("features",)
-    )
+    """From transformers' ViTModel (DINO), Dinov2Model, with registers or without, or DINOv3ViTModel."""
+    patches = graphs.Dinov3Patches if model.config.model_type == "dinov3_vit" else graphs.DinoPatches
+    network = patch_network(patches(model), model.config.patch_size)
     facts = _facts(model.config.hidden_size, mean, std, model.config, 0, 1.0)
     return Checkpoint("backbone", {"image": network}, facts)
 
@@ -95,7 +94,7 @@ def build_text_aligned(model: nn.Module, text_model: nn.Module, tokenizer: str, 
     tokens = torch.zeros((2, 7), dtype=torch.int64)
     return Checkpoint(
         "dense",
-        {**seen.networks, "text": _text_network(network, tokens, (0, 1))},
+        {**seen.networks, "text": text_network(network, tokens, (0, 1))},
         {**seen.facts, "logit_scale": 1 / _TALK2DINO_TEMPERATURE},
         clip_tokenizer(tokenizer, text.max_position_embeddings),
     )
@@ -121,14 +120,18 @@ def build_sam(model: nn.Module, mean: list[float], std: list[float]) -> Checkpoi
     )
 
 
-def _image(config: Any) -> Tensor:
-    patch = config.patch_size
+def _image(patch: int) -> Tensor:
     return torch.zeros((2, 3, 3 * patch, 5 * patch))
+
+
+def patch_network(module: nn.Module, patch: int) -> CheckpointNetwork:
+    """From images to features of patches."""
+    return CheckpointNetwork(module, {"image": _image(patch)}, {"image": (0, 2, 3)}, ("features",))
 
 
 def _image_networks(model: nn.Module, head: nn.Module) -> dict[str, CheckpointNetwork]:
     config = model.config.vision_config
-    trunk, image = graphs.ImageTrunk(model.vision_model), _image(config)
+    trunk, image = graphs.ImageTrunk(model.vision_model), _image(config.patch_size)
     stream = torch.zeros((2, 11, config.hidden_size))
     return {
         "image": CheckpointNetwork(
@@ -141,7 +144,8 @@ def _image_networks(model: nn.Module, head: nn.Module) -> dict[str, CheckpointNe
     }  # fmt: skip
 
 
-def _text_network(module: nn.Module, tokens: Tensor, dynamic: tuple[int, ...]) -> CheckpointNetwork:
+def text_network(module: nn.Module, tokens: Tensor, dynamic: tuple[int, ...]) -> CheckpointNetwork:
+    """From tokens to features of texts."""
     return CheckpointNetwork(module, {"tokens": tokens}, {"tokens": dynamic}, ("features",))
 
 

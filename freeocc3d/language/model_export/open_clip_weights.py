@@ -12,7 +12,6 @@ _ONCE = {
     "vision_model.embeddings.position_embedding.weight": "visual.positional_embedding",
     "text_model.embeddings.token_embedding.weight": "token_embedding.weight",
     "text_model.embeddings.position_embedding.weight": "positional_embedding",
-    "logit_scale": "logit_scale",
 }
 """Weights outside the blocks: transformers' name -> OpenCLIP's."""
 
@@ -42,25 +41,51 @@ def clip_from_open_clip(state: dict[str, Tensor], config: dict[str, Any]) -> nn.
     from transformers import CLIPModel
 
     model = CLIPModel(_configuration(config))
-    weights = {ours: state[theirs] for ours, theirs in _ONCE.items()}
-    weights["visual_projection.weight"] = state["visual.proj"].T
+    weights = {"logit_scale": state["logit_scale"], "visual_projection.weight": state["visual.proj"].T}
+    weights |= _tower(state, "vision_model", "visual.transformer.resblocks", config["vision_cfg"]["layers"])
+    weights |= _tower(state, "text_model", "transformer.resblocks", config["text_cfg"]["layers"])
     weights["text_projection.weight"] = state["text_projection"].T
-    layers = dict(_LAYERS)
-    for tower, blocks, count in (
-        ("vision_model", "visual.transformer.resblocks", config["vision_cfg"]["layers"]),
-        ("text_model", "transformer.resblocks", config["text_cfg"]["layers"]),
-    ):
-        for n in range(count):
-            theirs, ours = f"{blocks}.{n}", f"{tower}.encoder.layers.{n}"
-            layers |= {f"{ours}.{name}": f"{theirs}.{their_name}" for name, their_name in _BLOCK_LAYERS.items()}
-            for kind in ("weight", "bias"):
-                parts = state[f"{theirs}.attn.in_proj_{kind}"].chunk(3)
-                for letter, part in zip("qkv", parts, strict=True):
-                    weights[f"{ours}.self_attn.{letter}_proj.{kind}"] = part
-    for ours, theirs in layers.items():
-        weights |= {f"{ours}.{kind}": state[f"{theirs}.{kind}"] for kind in ("weight", "bias")}
     model.load_state_dict({name: value.contiguous() for name, value in weights.items()}, strict=True)
     return model.eval()
+
+
+def clip_text_from_open_clip(state: dict[str, Tensor], heads: int) -> nn.Module:
+    """Makes transformers' CLIPTextModelWithProjection with the text tower of an OpenCLIP ViT, and GELU.
+
+    state: the weights by OpenCLIP's names.  heads: of its attention.
+    Raises KeyError or RuntimeError if the weights do not belong to such a tower.
+    """
+    from transformers import CLIPTextConfig, CLIPTextModelWithProjection
+
+    tokens, width = state["token_embedding.weight"].shape
+    layers = len({name.split(".")[2] for name in state if name.startswith("transformer.resblocks.")})
+    config = CLIPTextConfig(
+        hidden_size=width, num_hidden_layers=layers, num_attention_heads=heads, hidden_act="gelu", vocab_size=tokens,
+        intermediate_size=len(state["transformer.resblocks.0.mlp.c_fc.weight"]),
+        max_position_embeddings=len(state["positional_embedding"]), projection_dim=state["text_projection"].shape[1],
+        eos_token_id=tokens - 1, bos_token_id=tokens - 2, pad_token_id=tokens - 1,
+    )  # fmt: skip
+    weights = _tower(state, "text_model", "transformer.resblocks", layers)
+    weights["text_projection.weight"] = state["text_projection"].T
+    model = CLIPTextModelWithProjection(config)
+    model.load_state_dict({name: value.contiguous() for name, value in weights.items()}, strict=True)
+    return model.eval()
+
+
+def _tower(state: dict[str, Tensor], tower: str, blocks: str, count: int) -> dict[str, Tensor]:
+    """The weights of a tower by transformers' names, all but its projection."""
+    weights = {ours: state[theirs] for ours, theirs in _ONCE.items() if ours.startswith(tower)}
+    layers = {ours: theirs for ours, theirs in _LAYERS.items() if ours.startswith(tower)}
+    for n in range(count):
+        theirs, ours = f"{blocks}.{n}", f"{tower}.encoder.layers.{n}"
+        layers |= {f"{ours}.{name}": f"{theirs}.{their_name}" for name, their_name in _BLOCK_LAYERS.items()}
+        for kind in ("weight", "bias"):
+            parts = state[f"{theirs}.attn.in_proj_{kind}"].chunk(3)
+            for letter, part in zip("qkv", parts, strict=True):
+                weights[f"{ours}.self_attn.{letter}_proj.{kind}"] = part
+    for ours, theirs in layers.items():
+        weights |= {f"{ours}.{kind}": state[f"{theirs}.{kind}"] for kind in ("weight", "bias")}
+    return weights
 
 
 def _configuration(config: dict[str, Any]) -> Any:

@@ -191,14 +191,49 @@ class DinoPatches(nn.Module):
         self.register_buffer("first", torch.cat(first, dim=1))
         self.register_buffer("table", table[1:])
 
+    @property
+    def prefix(self) -> int:
+        """Number of tokens before those of the patches."""
+        return int(self.first.shape[1])
+
     def forward(self, image: Tensor) -> Tensor:
+        x, grid = self.tokens(image)
+        return x[:, self.prefix :].unflatten(1, grid)
+
+    def tokens(self, image: Tensor) -> tuple[Tensor, tuple[int, int]]:
+        """All tokens after the last norm, and the grid of the patches among them."""
         x = self.patches(image)
         height, width = x.shape[-2:]
         x = x.flatten(2).transpose(1, 2) + positions(self.table, self.grid, height, width, self.antialias)
         x = torch.cat((self.first.expand(x.shape[0], -1, -1), x), dim=1)
         for layer in self.layers:
             x = layer(x)
-        return self.norm(x)[:, self.first.shape[1] :].unflatten(1, (height, width))
+        return self.norm(x), (height, width)
+
+
+class Dinov3Patches(DinoPatches):
+    """Patch features (B, h, w, C) of DINOv3, which turns queries and keys by their patch's place in -1…1."""
+
+    def __init__(self, model: nn.Module):
+        nn.Module.__init__(self)
+        own = model.embeddings
+        self.patches, self.layers, self.norm = own.patch_embeddings, model.model.layer, model.norm
+        self.register_buffer("first", torch.cat((own.cls_token, own.register_tokens), dim=1).detach())
+        self.register_buffer("frequencies", 2 * torch.pi * model.rope_embeddings.inv_freq.detach())
+
+    def tokens(self, image: Tensor) -> tuple[Tensor, tuple[int, int]]:
+        """All tokens after the last norm, and the grid of the patches among them."""
+        x = self.patches(image)
+        height, width = x.shape[-2:]
+        places = torch.meshgrid(
+            *(2 * (torch.arange(n, device=x.device) + 0.5) / n - 1 for n in (height, width)), indexing="ij"
+        )
+        angles = torch.stack([place.flatten() for place in places], dim=-1)[..., None] * self.frequencies
+        angles = angles.flatten(1).tile(2)
+        x = torch.cat((self.first.expand(x.shape[0], -1, -1), x.flatten(2).transpose(1, 2)), dim=1)
+        for layer in self.layers:
+            x = layer(x, position_embeddings=(angles.cos(), angles.sin()))
+        return self.norm(x), (height, width)
 
 
 class Talk2DinoHead(nn.Module):
