@@ -73,7 +73,8 @@ class Chance:
         self._random = random[random.any(axis=1)]
         self._mean = self._random.mean(axis=0)
         self._known = mask_known(occupancy.features)
-        self._center = average_known(occupancy.features)
+        stated = record.mean_feature if record else None
+        self._center = average_known(occupancy.features) if stated is None else stated
         self.record = record or self._measure()
 
     def score(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -143,7 +144,8 @@ class Chance:
         candidates = list_house_names(contrast)
         there = self._best_evidence(self.text_encoder.encode_words(candidates).features, others) >= evidence
         names = [name for name, found in zip(candidates, there, strict=True) if found]
-        return ChanceRecord(evidence=evidence, spread=max(spread, _LEAST), names=names)
+        center = self._center.astype("<f2").tobytes()
+        return ChanceRecord(evidence=evidence, spread=max(spread, _LEAST), names=names, center=center)
 
     def _best_evidence(self, text: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.float64]:
         return np.array([found.evidence.max(initial=0.0) for found in self.find_regions(text, others)])

@@ -76,13 +76,20 @@ class CaptureRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 class ChanceRecord(msgspec.Struct, frozen=True, kw_only=True):
     """What random words reach in a map; see ``query.chance``. evidence: that one in 40 reaches.  spread: standard
-    deviation of the evidence of their best regions.  names: names of things of houses that are in the map."""
+    deviation of the evidence of their best regions.  names: names of things of houses that are in the map.  center:
+    (D,) float16, little-endian, the mean of the map's features; a map of a part keeps that of the whole."""
 
     evidence: Annotated[float, msgspec.Meta(gt=0, le=1e6)]
     spread: Annotated[float, msgspec.Meta(gt=0, le=1e6)]
     names: Annotated[
         list[Annotated[str, msgspec.Meta(min_length=1, max_length=200)]], msgspec.Meta(max_length=1000)
     ] = []
+    center: Annotated[bytes, msgspec.Meta(max_length=1 << 17)] = b""
+
+    @property
+    def mean_feature(self) -> NDArray[np.float32] | None:
+        """``center``; None if the map does not state it."""
+        return np.frombuffer(self.center, "<f2").astype(np.float32) if self.center else None
 
 
 class EncoderRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -306,10 +313,19 @@ def _problem(manifest: Manifest) -> str:
         return "'counts' holds fewer frames than have a pose or are keyframes"
     if manifest.refined and manifest.refined.box and not np.abs(np.array(manifest.refined.box)).max() <= _FARTHEST:
         return "'refined.box' holds a number that is not finite"
+    if not _is_center(manifest.encoder):
+        return "'encoder.chance.center' is not the mean of features of 'encoder.dimension'"
     if any("\0" in text for text in (manifest.capture.path, manifest.encoder.name)):
         return "'capture.path' or 'encoder.name' holds a character that no name has"
     outside = next((name for name in manifest.files if not _FILE.fullmatch(name)), None)
     return "" if outside is None else f"'files' names {outside[:200]}, which lies outside the map's folder"
+
+
+def _is_center(encoder: EncoderRecord) -> bool:
+    center = encoder.chance.center if encoder.chance else b""
+    if not center:
+        return True
+    return len(center) == 2 * encoder.dimension and bool(np.linalg.norm(np.frombuffer(center, "<f2")) <= 1 + _UNIT)
 
 
 def _among(value: float, bounds: tuple[float, float]) -> bool:

@@ -195,6 +195,15 @@ class SavedMap:
         return restored
 
     @property
+    def mean_feature(self) -> NDArray[np.float32]:
+        """(D,) mean of the features of the map, or of the map that it is a part of."""
+        from ..language.feature_codec import average_known
+
+        chance = self.manifest.encoder.chance
+        stated = chance.mean_feature if chance else None
+        return average_known(self.occupancy.features) if stated is None else stated
+
+    @property
     def vocabulary(self) -> list[str]:
         """The words that pictures and exports use as classes: the encoder's contrast words; with an open vocabulary,
         the names that a model gave to the scene, or else those of things of houses that are in it, if there are any."""

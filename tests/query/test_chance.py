@@ -7,6 +7,7 @@ import functools
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from helpers import worded_voxels
@@ -121,6 +122,18 @@ def test_a_synonym_is_found_beside_the_word_itself() -> None:
     assert len(rows) < sum(region.voxels for region in result.regions)
 
 
+def test_a_part_of_a_map_is_compared_with_the_whole() -> None:
+    """As a map of a box around a thing is: of its own features, the thing's are the mean."""
+    model, room, slab, record = _asked(0.3)
+    codes = np.where((slab == PRESENT.index("sofa"))[:, None], room.features.codes, 0).astype(np.uint8)
+    part = room.replace(features=CodedFeatures(room.features.codec, codes))
+    found = [
+        sum(region.voxels for region in query(part, model, ["sofa"], chance=lambda own=own: own)[0].regions)
+        for own in (record, msgspec.structs.replace(record, center=b""))
+    ]
+    assert found[0] >= 160 > found[1], found
+
+
 def test_a_threshold_that_is_given_counts_instead() -> None:
     model, room, *_ = _asked(0.3)
     assert not query(room, model, ["sofa"], Options(threshold=0.9))[0].matched
@@ -150,7 +163,7 @@ def test_objects_are_named_by_what_tells_them_from_the_rest_of_the_map() -> None
     model = copy.deepcopy(model)
     features = np.asarray(room.features, np.float32)
     model.words["piano"] = model.embed("piano") + 0.3 * _unit(features.mean(axis=0))
-    names = SimpleNamespace(text_encoder=model, scene_words=[*PRESENT, "piano"], occupancy=room)
+    names = SimpleNamespace(text_encoder=model, scene_words=[*PRESENT, "piano"], mean_feature=features.mean(axis=0))
     means = np.stack([features[slab == n].mean(axis=0) for n in range(len(PRESENT))])
     assert [own[0][0] for own in name_objects(names, means, 3)] == PRESENT
     assert (means @ model.encode_words([*PRESENT, "piano"]).features.T).argmax(axis=1).tolist() == [4] * 4

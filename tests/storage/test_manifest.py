@@ -22,6 +22,9 @@ from freeocc3d.storage.manifest import (
     write_manifest,
 )
 
+CLIP = {"name": "clip", "dimension": 2, "state": {}}
+CHANCE = {"evidence": 3.0, "spread": 1.0}
+
 
 @pytest.mark.parametrize(
     "changes",
@@ -110,6 +113,10 @@ def test_a_map_from_before_scales_and_gravity_frames_is_read(tmp_path: Path) -> 
         ("refined", {"map": "x", "box": [0, 0, 0, 1, 1, float("inf")]}, "'refined.box'"),
         ("vocabulary", {"model": 3, "keyframes": [], "names": {}}, "'vocabulary.model' has a whole number"),
         ("encoder", {"name": ["color"], "state": {}}, "'encoder.name' has a list"),
+        ("encoder", {**CLIP, "chance": {**CHANCE, "evidence": float("nan")}}, "'encoder.chance.evidence' has a number"),
+        ("encoder", {**CLIP, "chance": {**CHANCE, "center": "no base64"}}, "'encoder.chance.center'"),
+        ("encoder", {**CLIP, "chance": {**CHANCE, "center": "ADwAPAA8"}}, "'encoder.chance.center' is not the mean"),
+        ("encoder", {**CLIP, "chance": {**CHANCE, "center": "AH4AAA=="}}, "'encoder.chance.center' is not the mean"),
         ("finest_voxel_m", float("inf"), "'finest_voxel_m'"),
         ("origin", [0.0, 0.0], "'origin' has 2 entries instead of 3"),
         ("up", None, "'up' has nothing instead of a list"),

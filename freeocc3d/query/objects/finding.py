@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ...core.types import Occupancy
 from ...language.encoders.base import TextEncoder
-from ...language.feature_codec import average_known, compute_cosines, mask_known
+from ...language.feature_codec import compute_cosines, mask_known
 from ...language.random_words import list_house_names
 from ...storage.saved_map import SavedMap
 from ..oriented_boxes import oriented_boxes
@@ -61,7 +61,7 @@ def name_objects(scan_map: SavedMap, feature: NDArray[np.float32], most: int) ->
         return name_features(feature, scan_map.text_encoder, scan_map.vocabulary, most)
     words = scan_map.scene_words or list_house_names(scan_map.text_encoder.contrast_words())
     known = mask_known(feature)[:, None]
-    centered = np.where(known, feature - average_known(scan_map.occupancy.features), 0)
+    centered = np.where(known, feature - scan_map.mean_feature, 0)
     return name_features(centered, scan_map.text_encoder, words, most)
 
 
