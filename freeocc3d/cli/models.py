@@ -77,7 +77,7 @@ def models_export(
         str,
         typer.Argument(
             metavar="CHECKPOINT",
-            help="Folder of a checkpoint of CLIP, SigLIP, DINO or SAM, OWNER/NAME on the Hugging Face hub, or "
+            help="Folder of a checkpoint of CLIP, SigLIP, DINO, RADIO or SAM, OWNER/NAME on the Hugging Face hub, or "
             "open_clip:ARCHITECTURE/WEIGHTS.",
         ),
     ],

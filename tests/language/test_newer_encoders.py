@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -162,3 +163,121 @@ def test_weights_of_another_dino_txt_are_refused(tmp_path: Path) -> None:
     write_tokenizer(tmp_path / "txt")
     with pytest.raises(ModelError, match=r"usual weights of dino\.txt for this DINO: .*nothing uses extra"):
         read_checkpoint(str(tmp_path / "dino"), None, str(tmp_path / "txt"), None)
+
+
+RADIO_HEADS, RADIO_WIDTH, PREFIX = 6, 48, 4
+
+
+def radio() -> nn.Module:
+    """A ViT-S of small width with its adaptor, as in the file of weights on the hub."""
+    width, out = RADIO_WIDTH, 32
+    blocks = nn.ModuleList(
+        tree(
+            norm1=nn.LayerNorm(width, 1e-6), attn__qkv=nn.Linear(width, 3 * width), attn__proj=nn.Linear(width, width),
+            norm2=nn.LayerNorm(width, 1e-6), mlp__fc1=nn.Linear(width, 2 * width), mlp__fc2=nn.Linear(2 * width, width),
+        )
+        for _ in range(2)
+    )  # fmt: skip
+    adaptor = tree(
+        fc1=nn.Linear(width, 40), blocks=nn.ModuleList([nn.Sequential(nn.LayerNorm(40), nn.GELU(), nn.Linear(40, 40))]),
+        final=nn.Sequential(nn.LayerNorm(40), nn.GELU(), nn.Linear(40, out)),
+    )  # fmt: skip
+    with tiny_models.seeded(21):
+        made = tiny_models.lively(
+            tree(
+                model__patch_generator__embedder=nn.Linear(3 * 64, width, bias=False),
+                model__patch_generator__pos_embed=nn.Parameter(torch.zeros(1, 25, width)),
+                model__patch_generator__cls_token__token=nn.Parameter(torch.zeros(PREFIX, width)), model__blocks=blocks,
+                adaptors=nn.ModuleDict({"siglip2-g": tree(head_mlp=adaptor, feat_mlp__fc1=nn.Linear(width, 40))}),
+            )
+        )  # fmt: skip
+    made.input_conditioner = nn.Module()
+    made.input_conditioner.register_buffer("norm_mean", torch.tensor([0.1, 0.2, 0.3])[:, None, None])
+    made.input_conditioner.register_buffer("norm_std", torch.tensor([0.4, 0.5, 0.6])[:, None, None])
+    return made
+
+
+def recursive_attention(block: nn.Module, x: Tensor) -> Tensor:
+    batch, _, width = x.shape
+    once = block.attn.proj(attention(x, block.attn.qkv, RADIO_HEADS))
+    v = block.attn.qkv(x).chunk(3, dim=-1)[2]
+    out = torch.zeros_like(once)
+    for b in range(batch):
+        for head in range(RADIO_HEADS):
+            own = slice(head * width // RADIO_HEADS, (head + 1) * width // RADIO_HEADS)
+            unit = F.normalize(once[b, :, own], dim=-1)
+            weights = 10 * unit @ unit.T
+            weights[weights < 0] = -torch.inf
+            out[b, :, own] = weights.softmax(dim=-1) @ v[b, :, own]
+    return block.attn.proj(out)
+
+
+def radio_patches(image: Tensor, own: nn.Module, height: int, width: int) -> Tensor:
+    """RADSeg's features of (2, 3, 8 height, 8 width)."""
+    net, mlp = own.model, own.adaptors["siglip2-g"].head_mlp
+    pixels = image.reshape(2, 3, height, 8, width, 8).permute(0, 2, 4, 1, 3, 5).reshape(2, height * width, 192)
+    table = net.patch_generator.pos_embed.reshape(1, 5, 5, -1).permute(0, 3, 1, 2)
+    longer = max(height, width)
+    table = F.interpolate(table, size=(longer, longer), mode="bilinear", align_corners=True)[..., :height, :width]
+    x = net.patch_generator.embedder(pixels) + table.flatten(2).transpose(1, 2)
+    x = torch.cat((net.patch_generator.cls_token.token.expand(2, -1, -1), x), dim=1)
+    for n, block in enumerate(net.blocks):
+        y = block.norm1(x)
+        last = n == len(net.blocks) - 1
+        x = x + (recursive_attention(block, y) if last else block.attn.proj(attention(y, block.attn.qkv, RADIO_HEADS)))
+        x = x + block.mlp.fc2(F.gelu(block.mlp.fc1(block.norm2(x))))
+    gathered = []
+    for patches in x[:, PREFIX:]:
+        unit = F.normalize(patches, dim=-1)
+        weights = 10 * (unit @ unit.T - (unit @ unit.T).mean())
+        weights[weights < 0] = -torch.inf
+        gathered.append(weights.softmax(dim=-1) @ patches)
+    x = mlp.fc1(torch.stack(gathered))
+    for block in mlp.blocks:
+        x = x + block(x)
+    return mlp.final(x).reshape(2, height, width, -1)
+
+
+def write_radio(folder: Path) -> nn.Module:
+    model = radio()
+    save(model, folder / "model.safetensors", "radio_model.")
+    stated = {
+        "architectures": ["RADIOModel"], "args": {"model": "vit_small_patch16_224"}, "preferred_resolution": [512, 512]
+    }  # fmt: skip
+    (folder / "config.json").write_text(json.dumps(stated))
+    return model
+
+
+def write_siglip(folder: Path) -> Any:
+    model = tiny_models.siglip()
+    model.save_pretrained(folder)
+    (folder / "tokenizer.json").write_text(tiny_models.tokenizer())
+    return model
+
+
+def test_radio_equals_radsegs_forward_pass(tmp_path: Path) -> None:
+    model, siglip = write_radio(tmp_path / "radio"), write_siglip(tmp_path / "siglip")
+    made = read_checkpoint(str(tmp_path / "radio"), None, str(tmp_path / "siglip"), None)
+    facts = made.facts
+    assert (made.kind, facts["dimension"], facts["patch"], facts["input_size"]) == ("dense", 32, 8, 512)
+    assert facts["mean"] + facts["std"] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    assert facts["logit_bias"] == pytest.approx(siglip.logit_bias.item(), abs=1e-4)
+    with torch.no_grad():
+        for size in ((3, 6), (7, 4), (5, 5)):
+            given = images(8 * size[0], 8 * size[1])
+            seen = radio_patches(given, model, *size)
+            assert torch.allclose(made.networks["image"].module(given), seen, atol=1e-4)
+    assert_exported(made, tmp_path / "image.onnx", given, seen)
+
+
+def test_what_a_radio_lacks_is_reported(tmp_path: Path) -> None:
+    model = write_radio(tmp_path)
+    with pytest.raises(ModelError, match="name that with --text"):
+        read_checkpoint(str(tmp_path), None, None, None)
+    write_siglip(tmp_path / "siglip")
+    for change, said in ((lambda: setattr(model.model.blocks[0], "ls1", nn.Linear(2, 2)), "nothing uses"),
+                         (lambda: delattr(model, "adaptors"), "without an adaptor for words")):  # fmt: skip
+        change()
+        save(model, tmp_path / "model.safetensors", "radio_model.")
+        with pytest.raises(ModelError, match=said):
+            read_checkpoint(str(tmp_path), None, str(tmp_path / "siglip"), None)

@@ -24,6 +24,7 @@ from .checkpoint_networks import (
 )
 from .dino_txt import build_dino_txt, is_dino_txt
 from .open_clip_weights import clip_from_open_clip
+from .radio import build_radio
 from .tokenizer_files import read_tokenizer
 
 TO_SAFETENSORS = (
@@ -43,6 +44,8 @@ def read_checkpoint(source: str, tokenizer: Path | None, text: str | None, text_
     if (folder / "open_clip_config.json").is_file():
         model, mean, std = _from_open_clip_folder(folder)
         return build_clip(model, read_tokenizer(tokenizer or folder), mean, std)
+    if "RADIOModel" in _architectures(folder):
+        return _radio(folder, text, tokenizer)
     model = _from_transformers(folder)
     mean, std = _normalization(folder, model.config.model_type)
     kind = model.config.model_type
@@ -73,6 +76,34 @@ def _with_words(model: nn.Module, folder: Path, tokenizer: Path | None) -> Check
         raise ModelError(f"{folder} does not contain the usual weights of dino.txt for this DINO: {said}.") from error
 
 
+def _architectures(folder: Path) -> list[str]:
+    """What config.json says the network is, in the names of its authors."""
+    try:
+        stated = json.loads((folder / "config.json").read_text(encoding="utf-8")).get("architectures")
+    except (OSError, ValueError, AttributeError):
+        return []
+    return stated if isinstance(stated, list) else []
+
+
+def _radio(folder: Path, text: str | None, tokenizer: Path | None) -> Checkpoint:
+    if text is None:
+        raise ModelError(
+            f"{folder} is a RADIO, whose words are those of the SigLIP 2 that its adaptor imitates: name that with "
+            "--text (google/siglip2-giant-opt-patch16-384 for C-RADIO v3, google/siglip2-so400m-patch16-naflex for v4)."
+        )
+    other = _local(text)
+    words, config = _from_transformers(other), json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    if words.config.model_type not in ("siglip", "siglip2"):
+        raise ModelError(f"{other} is no SigLIP 2, whose words a RADIO needs.")
+    try:
+        return build_radio(
+            config, _safetensors(folder / "model.safetensors"), words, read_tokenizer(tokenizer or other)
+        )
+    except (KeyError, RuntimeError, ValueError, TypeError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise ModelError(f"{folder} is not a usual RADIO: {said}.") from error
+
+
 def _clip_of(folder: Path) -> nn.Module:
     opened = (folder / "open_clip_config.json").is_file()
     return _from_open_clip_folder(folder)[0] if opened else _from_transformers(folder)
@@ -101,7 +132,7 @@ def _from_transformers(folder: Path) -> nn.Module:
         )
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise ModelError(
-            f"{folder} does not contain a checkpoint of CLIP, SigLIP, DINO or SAM as config.json and "
+            f"{folder} does not contain a checkpoint of CLIP, SigLIP, DINO, RADIO or SAM as config.json and "
             f"model.safetensors: {' '.join(str(error).split())}."
         ) from error
     return loaded.float().eval()

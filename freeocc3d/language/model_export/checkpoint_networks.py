@@ -59,14 +59,18 @@ def build_clip(model: nn.Module, tokenizer: str, mean: list[float], std: list[fl
     )
 
 
-def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[float]) -> Checkpoint:
-    """From transformers' SiglipModel (SigLIP, SigLIP 2 of a fixed size) or Siglip2Model (NaFlex)."""
+def build_siglip(
+    model: nn.Module, tokenizer: str, mean: list[float], std: list[float], punctuation: bool | None = None
+) -> Checkpoint:
+    """From transformers' SiglipModel (SigLIP, SigLIP 2 of a fixed size) or Siglip2Model (NaFlex). punctuation: whether
+    words keep it; None = as in SigLIP or SigLIP 2."""
     text, vision = model.config.text_config, model.config.vision_config
     tokens = torch.zeros((2, text.max_position_embeddings), dtype=torch.int64)
     words = text_network(graphs.SiglipText(model), tokens, (0,))
     second = text.vocab_size > SIGLIP_VOCABULARY
     stated = Tokenizer.from_str(tokenizer).token_to_id("<pad>") if second else None  # config.json states SigLIP's
     pad = text.pad_token_id if stated is None else stated
+    keeps = second if punctuation is None else punctuation
     return Checkpoint(
         "clip",
         {**_image_networks(model, graphs.SiglipHead(model)), "text": words},
@@ -74,7 +78,7 @@ def build_siglip(model: nn.Module, tokenizer: str, mean: list[float], std: list[
             **_facts(vision.hidden_size, mean, std, vision, 0, math.exp(model.logit_scale.item())),
             "logit_bias": round(model.logit_bias.item(), 4),
         },
-        siglip_tokenizer(tokenizer, text.max_position_embeddings, pad, without_punctuation=not second),
+        siglip_tokenizer(tokenizer, text.max_position_embeddings, pad, without_punctuation=not keeps),
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from .checkpoint_networks import DINO_MEAN, DINO_STD, Checkpoint, build_backbone
 from .open_clip_weights import clip_text_from_open_clip
 from .tokenizer_files import clip_tokenizer
 from .transformer_graphs import ClipText, DinoPatches
-from .vision_blocks import Block, part_of, take_linear, take_norm
+from .vision_blocks import Block, part_of, refuse_rest, take_linear, take_norm
 
 _EPSILON = 1e-5
 _HEAD_WIDTH = 64
@@ -71,8 +71,7 @@ def build_dino_txt(model: nn.Module, state: dict[str, Tensor], tokenizer: str) -
     text = _text(state)
     image = DinoTxtPatches(seen.networks["image"].module, state, model.config.num_attention_heads)
     scale = state.pop("logit_scale", torch.tensor(math.log(1 / _FIRST_TEMPERATURE))).exp().item()
-    if state:
-        raise KeyError(f"nothing uses {min(state)}")
+    refuse_rest(state)
     facts = {**seen.facts, "dimension": text.project.out_features // 2, "logit_scale": round(scale, 4)}
     words = text_network(text, torch.zeros((2, 7), dtype=torch.int64), (0, 1))
     networks = {"image": patch_network(image, model.config.patch_size), "text": words}

@@ -33,9 +33,15 @@ def take_norm(state: dict[str, Tensor], name: str, epsilon: float) -> nn.LayerNo
     return made
 
 
+def refuse_rest(state: dict[str, Tensor]) -> None:
+    """Raises KeyError for weights that nothing took."""
+    if state:
+        raise KeyError(f"nothing uses {min(state)}")
+
+
 class Block(nn.Module):
     """A transformer's block, with the names that timm gives its weights: with two layers or SwiGLU (w1, w2, w3) after
-    the attention, and with a scale of each channel (ls1, ls2) or without. Raises KeyError."""
+    the attention, and with a scale of each channel (ls1, ls2) or without. Raises KeyError for other weights."""
 
     def __init__(self, state: dict[str, Tensor], heads: int, epsilon: float):
         super().__init__()
@@ -48,6 +54,7 @@ class Block(nn.Module):
         one = torch.ones(len(self.norm1.weight))
         self.register_buffer("scale1", state.pop("ls1.gamma", one))
         self.register_buffer("scale2", state.pop("ls2.gamma", one))
+        refuse_rest(state)
 
     def forward(self, x: Tensor) -> Tensor:
         q, k, v = self.queries_keys_values(x)
