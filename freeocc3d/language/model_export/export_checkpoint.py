@@ -29,7 +29,8 @@ def export_checkpoint(
     tokenizer: folder with tokenizer.json, or vocab.json and merges.txt, if the checkpoint has neither.
     text: folder with dino.txt's weights for a DINO as safetensors files, checkpoint of the SigLIP 2 of a RADIO, or of
     the CLIP whose words are projected into the space of a DINOv2.
-    text_head: the safetensors file of that projection, Talk2DINO's.  licence: license of the weights; None = the one on the model card.
+    text_head: the safetensors file of that projection, Talk2DINO's.
+    licence: license of the weights; None = the one on the model card.
 
     Raises ModelError if the checkpoint does not exist or the folder exists, DependencyError if a package is missing.
     """
