@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from ..core.errors import ModelError
 from ..core.types import Occupancy
 from ..language.encoders.base import Encoder, TextEncoder
-from ..language.feature_codec import average_known, compute_cosines, mask_known
+from ..language.feature_codec import Features, average_known, compute_cosines, mask_known
 from ..language.random_words import RANDOM_WORDS, list_house_names
 from ..language.word_matching import compute_confidences
 from ..occupancy.connected_components import label_components
@@ -81,6 +81,13 @@ class Chance:
         """0…1, 0.5 for evidence that one of 40 random words reaches, near 1 for evidence that none does."""
         return np.asarray(1 / (1 + np.exp(np.clip((self.record.evidence - evidence) / self.record.spread, -50, 50))))
 
+    def compare(self, features: Features, text: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Returns (V, W) f^T t - b(t), by which (V, D) voxels tell (W, D) words apart."""
+        return compute_cosines(features, text) - self._bias(text)
+
+    def _bias(self, text: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(_OF_SCENE * (text @ self._center), np.float32)
+
     def find_regions(self, text: NDArray[np.float32], others: NDArray[np.float32]) -> list[WordRegions]:
         """Returns the regions of each of W words, (W, D), among C contrast words, (C, D)."""
         found: list[WordRegions] = []
@@ -90,18 +97,17 @@ class Chance:
 
     def _find_some(self, text: NDArray[np.float32], others: NDArray[np.float32]) -> list[WordRegions]:
         features = self.occupancy.features
-        deviations, bias = text - self._mean, _OF_SCENE * (text @ self._center)
+        deviations = text - self._mean
         competes = (_cosines(deviations, others - self._mean) < _SAME) & others.any(axis=1)
         cosine = compute_cosines(features, np.concatenate((text, self._mean[None])))
         fits = cosine[:, :-1] - cosine[:, -1:] - deviations @ self._center
         candidates = self._known[:, None] & (fits > 0) & text.any(axis=1)
-        shift = (_OF_SCENE * (others @ self._center)).astype(np.float32)
-        own = cosine[:, :-1] - bias.astype(np.float32)
+        own = cosine[:, :-1] - self._bias(text)
         asked = np.flatnonzero(candidates.any(axis=1))
         confidence = np.zeros(candidates.shape, np.float32)
         for start in range(0, len(asked), _ROWS):
             rows = asked[start : start + _ROWS]
-            against = compute_cosines(features[rows], others) - shift
+            against = self.compare(features[rows], others)
             confidence[rows] = compute_confidences(
                 own[rows], against, candidates[rows], competes, self.text_encoder.temperature
             )

@@ -102,9 +102,9 @@ def query(
     """Asks for several words. A word that nothing matches has no regions.
 
     contrast: words for other things in the scan, added to the encoder's own.  negative: words for what is not meant. A
-    voxel whose plain cosine with one of them is higher than with the word does not match, even if the word includes
-    it, as "table" includes a coffee table.  up: (3,) unit vector, map frame.  chance: what random words reach in the
-    map, if it is known.
+    voxel whose plain cosine with one of them (f^T t - b(t) of ``query.chance``) is higher than with the word does not
+    match, even if the word includes it, as "table" includes a coffee table.  up: (3,) unit vector, map frame.  chance:
+    what random words reach in the map, if it is known.
     Raises FreeOccError for an empty, too long or excluded word, one that says what is not meant ("not red"), or a
     negative word that is not understood; MapError if the map's features are not those of the encoder.
     """
@@ -134,7 +134,7 @@ def query(
         others = text_encoder.encode_words(list(dict.fromkeys((*names, *measured.record.names, *denied))))
         found = measured.find_regions(text.features, others.features)
         return [
-            _answer_by_chance(occupancy, word, found[w], measured, options, up, _beaten(features, text, excluded, w))
+            _answer_by_chance(occupancy, word, found[w], measured, options, up, _beaten(measured, text, excluded, w))
             for w, word in enumerate(words)
         ]
     expressed = others.features.any(axis=1)
@@ -186,7 +186,8 @@ def _answer_by_chance(
     scores = np.zeros(len(excluded), np.float32)
     scores[rows] = score[component]
     kept = scores[rows] >= _EVEN
-    rows, component, confidence = rows[kept], component[kept], confidence[kept]
+    rows, confidence = rows[kept], confidence[kept]
+    component = label_components(occupancy.occupied_voxels()[rows], occupancy.occupied_edges()[rows])
     component = cut_necks(occupancy, rows, component, scores[rows], np.asarray(up), options.narrow)
     least = options.min_voxels, options.min_share
     regions = best_regions(occupancy, rows, component, scores[rows], confidence, *least, options.top_k, word)
@@ -203,12 +204,13 @@ def _nothing_like(word: str, scores: NDArray[np.float32], threshold: float) -> s
     return f"Nothing in this map looks like '{word}': {why}."
 
 
-def _beaten(features: Features, text: TextFeatures, excluded: TextFeatures, w: int) -> NDArray[np.bool_]:
+def _beaten(chance: Chance, text: TextFeatures, excluded: TextFeatures, w: int) -> NDArray[np.bool_]:
     """Returns (V,) whether a voxel is nearer to an excluded word than to word ``w``."""
+    features = chance.occupancy.features
     if not len(excluded.understood):
         return np.zeros(len(features), bool)
-    meant = compute_cosines(features, text.features[w : w + 1])
-    return np.asarray((compute_cosines(features, excluded.features) > meant).any(axis=1))
+    meant = chance.compare(features, text.features[w : w + 1])
+    return np.asarray((chance.compare(features, excluded.features) > meant).any(axis=1))
 
 
 def _in_color(

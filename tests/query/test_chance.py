@@ -117,9 +117,22 @@ def test_a_synonym_is_found_beside_the_word_itself() -> None:
     assert set(slab[result.regions[0].rows]) == {PRESENT.index("sofa")}
     (excluded,) = query(room, model, ["couch"], negative=["sofa"], chance=lambda: record)
     rows = np.concatenate([np.zeros(0, int), *(region.rows for region in excluded.regions)])
-    couch, sofa = model.encode_words(["couch", "sofa"]).features @ np.asarray(room.features, np.float32).T
-    assert (couch[rows] >= sofa[rows]).all()
-    assert len(rows) < sum(region.voxels for region in result.regions)
+    features = np.asarray(room.features, np.float32)
+    couch, sofa = model.encode_words(["couch", "sofa"]).features @ (features - 0.5 * record.mean_feature).T
+    assert (couch[rows] >= sofa[rows] - 1e-4).all()
+    assert 0 < len(rows) < sum(region.voxels for region in result.regions)
+
+
+def test_what_lies_on_both_sides_of_what_is_not_meant_is_two_things() -> None:
+    model, room, _, record = _asked(0.3)
+    sofa, couch = model.encode_words(["sofa", "couch"]).features
+    middle = np.isin(room.occupied_voxels()[:, 0], (4, 5))
+    features = np.asarray(room.features, np.float32) + 2 * np.where(middle, 1, -1)[:, None] * (couch - sofa)
+    features /= np.linalg.norm(features, axis=1, keepdims=True)
+    (result,) = query(
+        room.replace(features=features.astype(np.float16)), model, ["sofa"], negative=["couch"], chance=lambda: record
+    )
+    assert [region.voxels > 70 for region in result.regions] == [True, True]
 
 
 def test_a_part_of_a_map_is_compared_with_the_whole() -> None:
