@@ -106,8 +106,8 @@ def models_export(
 ) -> None:
     """Turn a checkpoint into a model package: ONNX networks, tokenizer and manifest.
 
-    CHECKPOINT holds config.json with model.safetensors, or
-    open_clip_config.json with open_clip_model.safetensors.
+    CHECKPOINT holds config.json with model.safetensors,
+    open_clip_config.json with open_clip_model.safetensors, or PE-….safetensors.
     Words also need tokenizer.json, or vocab.json with merges.txt.
     Weights are read from safetensors files only.
     """

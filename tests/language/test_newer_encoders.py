@@ -12,7 +12,7 @@ import pytest
 import tiny_models
 import torch
 from safetensors.torch import save_file
-from test_model_export import write_tokenizer
+from test_model_export import Block, write_tokenizer
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -281,3 +281,118 @@ def test_what_a_radio_lacks_is_reported(tmp_path: Path) -> None:
         save(model, tmp_path / "model.safetensors", "radio_model.")
         with pytest.raises(ModelError, match=said):
             read_checkpoint(str(tmp_path), None, str(tmp_path / "siglip"), None)
+
+
+def perception_encoder(width: int, heads: int, named: bool, scaled: bool) -> nn.Module:
+    """A Perception Encoder's image tower with two blocks; named: with a class token and what leads to words."""
+    with tiny_models.seeded(31):
+        made = tree(
+            conv1=nn.Conv2d(3, width, 8, 8, bias=False), ln_pre=nn.LayerNorm(width),
+            positional_embedding=nn.Parameter(torch.zeros(16 + named, width)),
+            transformer__resblocks=nn.ModuleList(Block(width, heads, nn.Identity()) for _ in range(2)),
+        )  # fmt: skip
+        for block in made.transformer.resblocks if scaled else ():
+            block.ls_1 = tree(gamma=nn.Parameter(torch.ones(width)))
+            block.ls_2 = tree(gamma=nn.Parameter(torch.ones(width)))
+        if named:
+            made.class_embedding, made.ln_post = nn.Parameter(torch.zeros(width)), nn.LayerNorm(width)
+            mlp = tree(c_fc=nn.Linear(width, 2 * width), c_proj=nn.Linear(2 * width, width))
+            pool = nn.MultiheadAttention(width, 8, batch_first=True)
+            made.attn_pool = tree(
+                attn=pool, layernorm=nn.LayerNorm(width), mlp=mlp, probe=nn.Parameter(torch.zeros(1, 1, width))
+            )  # fmt: skip
+            made.proj = nn.Parameter(torch.zeros(width, 16))
+        return tiny_models.lively(made)
+
+
+def turned(x: Tensor, height: int, width: int, prefix: int) -> Tensor:
+    """Pairs of channels of (B, heads, N, d) as complex numbers, turned by their patch's place."""
+    quarter = x.shape[-1] // 4
+    out = torch.view_as_complex(x.reshape(*x.shape[:-1], -1, 2)).clone()
+    for row in range(height):
+        for column in range(width):
+            for n in range(quarter):
+                speed = 10_000.0 ** (-n / quarter)
+                at = prefix + row * width + column
+                out[:, :, at, n] *= np.exp(1j * speed * (column + prefix))
+                out[:, :, at, quarter + n] *= np.exp(1j * speed * (row + prefix))
+    return torch.view_as_real(out).flatten(-2)
+
+
+def perception_tokens(image: Tensor, own: nn.Module, heads: int) -> Tensor:
+    """After the last block."""
+    x = own.conv1(image)
+    height, width = x.shape[-2:]
+    prefix = len(own.positional_embedding) - 16
+    table = own.positional_embedding[prefix:].reshape(1, 4, 4, -1).permute(0, 3, 1, 2)
+    table = F.interpolate(table, size=(height, width), mode="bilinear", align_corners=False)
+    x = (x + table).flatten(2).transpose(1, 2)
+    if prefix:
+        first = own.class_embedding + own.positional_embedding[0]
+        x = torch.cat((first.expand(len(x), 1, -1), x), dim=1)
+    x = own.ln_pre(x)
+    for block in own.transformer.resblocks:
+        projected = F.linear(block.ln_1(x), block.attn.in_proj_weight, block.attn.in_proj_bias)
+        q, k, v = (part.unflatten(-1, (heads, -1)).transpose(1, 2) for part in projected.chunk(3, dim=-1))
+        q, k = turned(q, height, width, prefix), turned(k, height, width, prefix)
+        mixed = (q @ k.transpose(-1, -2) / q.shape[-1] ** 0.5).softmax(dim=-1) @ v
+        x = x + scale_of(block, "ls_1") * block.attn.out_proj(mixed.transpose(1, 2).flatten(2))
+        y = block.mlp["c_proj"](F.gelu(block.mlp["c_fc"](block.ln_2(x))))
+        x = x + scale_of(block, "ls_2") * y
+    return x
+
+
+def scale_of(block: nn.Module, name: str) -> Tensor | float:
+    return getattr(block, name).gamma if hasattr(block, name) else 1.0
+
+
+def test_pe_core_equals_its_forward_pass(tmp_path: Path) -> None:
+    words = len(tiny_models.vocabulary()[0])
+    with tiny_models.seeded(32):
+        model = tree(
+            token_embedding=nn.Embedding(words, 16), positional_embedding=nn.Parameter(torch.zeros(32, 16)),
+            transformer__resblocks=nn.ModuleList(Block(16, 8, nn.GELU()) for _ in range(2)), ln_final=nn.LayerNorm(16),
+            text_projection=nn.Parameter(torch.zeros(16, 16)), logit_scale=nn.Parameter(torch.tensor(4.0)),
+        )  # fmt: skip
+        tiny_models.lively(model)
+    model.visual = own = perception_encoder(24, 3, named=True, scaled=False)
+    save(model, tmp_path / "PE-Core-T16-384.safetensors")
+    write_tokenizer(tmp_path)
+    made = read_checkpoint(str(tmp_path), None, None, None)
+    facts = [made.facts[name] for name in ("dimension", "patch", "input_size", "prefix_tokens")]
+    assert (made.kind, facts, made.facts["mean"]) == ("clip", [16, 8, 384, 1], [0.5] * 3)
+    assert made.facts["logit_scale"] == pytest.approx(np.exp(4.0), rel=1e-4)
+    given, tokens = images(24, 40), torch.tensor([[3, 1, 9, words - 1], [2, words - 1, 0, 0]])
+    with torch.no_grad():
+        q, k, v, stream = made.networks["image"].module(given)
+        mixed = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
+        features, _, pooled = made.networks["head"].module(mixed, stream)
+        x = own.ln_post(perception_tokens(given, own, 3))
+        assert torch.allclose(pooled, pool(x, own), atol=1e-4)
+        assert torch.allclose(features[:, 5], pool(x[:, 5:6], own), atol=1e-4)
+        y = model.token_embedding(tokens) + model.positional_embedding[:4]
+        for block in model.transformer.resblocks:
+            y = block(y, torch.full((4, 4), float("-inf")).triu(1))
+        last = model.ln_final(y)[[0, 1], [3, 1]] @ model.text_projection
+        assert torch.allclose(made.networks["text"].module(tokens), last, atol=1e-4)
+
+
+def pool(x: Tensor, own: nn.Module) -> Tensor:
+    y = own.attn_pool.attn(own.attn_pool.probe.expand(len(x), -1, -1), x, x, need_weights=False)[0]
+    mlp = own.attn_pool.mlp
+    return (y + mlp.c_proj(F.gelu(mlp.c_fc(own.attn_pool.layernorm(y)))))[:, 0] @ own.proj
+
+
+def test_pe_spatial_is_a_backbone(tmp_path: Path) -> None:
+    own = perception_encoder(64, 16, named=False, scaled=True)
+    save(own, tmp_path / "PE-Spatial-G14-448.safetensors")
+    made = read_checkpoint(str(tmp_path), None, None, None)
+    assert (made.kind, made.facts["dimension"], made.tokenizer) == ("backbone", 64, None)
+    given = images(24, 40)
+    with torch.no_grad():
+        seen = perception_tokens(given, own, 16).reshape(2, 3, 5, 64)
+    assert_exported(made, tmp_path / "image.onnx", given, seen)
+    own.extra = nn.Linear(2, 2)
+    save(own, tmp_path / "PE-Spatial-G14-448.safetensors")
+    with pytest.raises(ModelError, match=r"not a usual Perception Encoder: .*nothing uses extra"):
+        read_checkpoint(str(tmp_path), None, None, None)

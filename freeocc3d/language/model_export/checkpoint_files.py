@@ -24,6 +24,7 @@ from .checkpoint_networks import (
 )
 from .dino_txt import build_dino_txt, is_dino_txt
 from .open_clip_weights import clip_from_open_clip
+from .perception_encoder import PerceptionFile, build_perception_encoder, find_perception_encoder
 from .radio import build_radio
 from .tokenizer_files import read_tokenizer
 
@@ -44,6 +45,8 @@ def read_checkpoint(source: str, tokenizer: Path | None, text: str | None, text_
     if (folder / "open_clip_config.json").is_file():
         model, mean, std = _from_open_clip_folder(folder)
         return build_clip(model, read_tokenizer(tokenizer or folder), mean, std)
+    if found := find_perception_encoder(folder):
+        return _perception_encoder(found, tokenizer or folder)
     if "RADIOModel" in _architectures(folder):
         return _radio(folder, text, tokenizer)
     model = _from_transformers(folder)
@@ -83,6 +86,16 @@ def _architectures(folder: Path) -> list[str]:
     except (OSError, ValueError, AttributeError):
         return []
     return stated if isinstance(stated, list) else []
+
+
+def _perception_encoder(found: PerceptionFile, tokenizer: Path) -> Checkpoint:
+    words = read_tokenizer(tokenizer) if found.purpose == "Core" else None
+    weights = _safetensors(found.path)
+    try:
+        return build_perception_encoder(found, weights, words)
+    except (KeyError, RuntimeError, ValueError, IndexError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise ModelError(f"{found.path} is not a usual Perception Encoder: {said}.") from error
 
 
 def _radio(folder: Path, text: str | None, tokenizer: Path | None) -> Checkpoint:
@@ -133,7 +146,7 @@ def _from_transformers(folder: Path) -> nn.Module:
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise ModelError(
             f"{folder} does not contain a checkpoint of CLIP, SigLIP, DINO, RADIO or SAM as config.json and "
-            f"model.safetensors: {' '.join(str(error).split())}."
+            f"model.safetensors, nor a Perception Encoder as PE-….safetensors: {' '.join(str(error).split())}."
         ) from error
     return loaded.float().eval()
 

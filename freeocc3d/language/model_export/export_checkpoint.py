@@ -23,9 +23,10 @@ def export_checkpoint(
 ) -> model_packages.Package:
     """Writes the checkpoint as a model package, and reads it back.
 
-    source: a folder with config.json and model.safetensors (CLIP, SigLIP, DINO, SAM of transformers, RADIO), a folder
-    with open_clip_config.json and open_clip_model.safetensors, ``open_clip:ARCHITECTURE/WEIGHTS``, or OWNER/NAME on the
-    Hugging Face hub.  output: the folder to write; a plain name means a folder in the models folder.
+    source: a folder with config.json and model.safetensors (CLIP, SigLIP, DINO, SAM of transformers, RADIO), with
+    open_clip_config.json and open_clip_model.safetensors, or with PE-….safetensors (Perception Encoder),
+    ``open_clip:ARCHITECTURE/WEIGHTS``, or OWNER/NAME on the Hugging Face hub.
+    output: the folder to write; a plain name means a folder in the models folder.
     tokenizer: folder with tokenizer.json, or vocab.json and merges.txt, if the checkpoint has neither.
     text: folder with dino.txt's weights for a DINO as safetensors files, checkpoint of the SigLIP 2 of a RADIO, or of
     the CLIP whose words are projected into the space of a DINOv2.
