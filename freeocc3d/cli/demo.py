@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -57,5 +58,5 @@ def demo(
         if result.matched:
             written.append(output / f"query_{result.word.replace(' ', '_')}.png")
             map_pictures.write_query_picture(made, [result], written[-1], overwrite)
-    print(f"\n{REAL.format(output / 'map', output / 'map-with-words')}")
+    print(f"\n{REAL.format(*(shlex.quote(str(output / name)) for name in ('map', 'map-with-words')))}")
     print("pictures: " + ", ".join(str(path) for path in written))

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from ..storage.manifest import ChanceRecord
 
 _LONGEST_WORD = 200
-_MISSPELT = 0.75  # least ratio of difflib: "soffa" is a misspelling, "canoe" for "camera" is not
+_MISSPELT = 0.75  # least ratio of difflib: "yelow" is a misspelling, "canoe" for "camera" is not
 _EVEN = 0.5  # a probability
 _ROWS = 16384  # voxels per step: float32 copies of all features never exist
 _MANY_ROWS = 1 << 18  # voxels per step of compiled code: its threads are worth their start only for many
@@ -118,7 +118,8 @@ def query(
         if not part:
             raise FreeOccError(f"'{word}' cannot be excluded{_only_known(word, text_encoder)}")
         if part in text.understood:
-            raise FreeOccError(f"'{word}' is asked for and excluded: leave one out.")
+            meant = "is" if word in words else f"is '{part}' to this map, which is"
+            raise FreeOccError(f"'{word}' {meant} asked for and excluded: leave one out.")
     others = text_encoder.encode_words(list(dict.fromkeys((*names, *denied))))
     features = occupancy.features
     if len(features) and features.shape[1] != text.features.shape[1]:
