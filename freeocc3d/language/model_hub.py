@@ -39,6 +39,8 @@ CHECKPOINTS = ".checkpoints"
 
 _CONFIGS = ("config.json", "open_clip_config.json", "preprocessor_config.json", "README.md")
 _WEIGHTS = ("open_clip_model.safetensors", "model.safetensors")
+_PARTS = re.compile(r"model-\d+-of-\d+\.safetensors|model\.safetensors\.index\.json")
+"""Names of weights in several files, and of the list of what is in which."""
 _TIMEOUT_S = 15.0
 """Time for a listing, and for each ``_LEAST_BYTES`` of a file."""
 _LEAST_BYTES = 1 << 14
@@ -187,14 +189,14 @@ def _make_package(
 
 def _checkpoint_files(repository: str, remote: dict[str, _Remote]) -> list[str]:
     """Names of the files of a checkpoint that an export needs. Raises ModelError if its weights are not safetensors."""
-    weights = next((file for file in _WEIGHTS if file in remote), None)
-    if weights is None:
+    weights = next(([file] for file in _WEIGHTS if file in remote), sorted(filter(_PARTS.fullmatch, remote)))
+    if not weights:
         raise ModelError(
             f"{repository} has neither a model package ({model_packages.MANIFESTS[0]}) nor weights as safetensors. "
             "Other weights are not read, because they may run code."
         )
     words = ["tokenizer.json"] if "tokenizer.json" in remote else ["vocab.json", "merges.txt"]
-    return [file for file in (*_CONFIGS, *words, weights) if file in remote]
+    return [file for file in (*_CONFIGS, *words, *weights) if file in remote]
 
 
 def _endpoint() -> str:

@@ -120,8 +120,9 @@ class Package:
 
     @property
     def text_sha256(self) -> str:
-        """Identifies the text part: a hash of the hashes of the text network and the tokenizer."""
-        own = "".join(self.files[self.parts[part]] for part in ("text", "tokenizer"))
+        """Identifies the text part: a hash of the hashes of the text network, the tokenizer, and weights beside it."""
+        names = self.parts["text"], self.parts["tokenizer"], f"{self.parts['text']}.data"
+        own = "".join(self.files[name] for name in names if name in self.files)
         return hashlib.sha256(own.encode()).hexdigest()
 
     def file(self, part: str) -> Path:

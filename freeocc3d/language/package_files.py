@@ -36,7 +36,8 @@ def write_files(
         if tokenizer is not None:
             parts["tokenizer"] = "tokenizer.json"
             (made / parts["tokenizer"]).write_text(tokenizer, encoding="utf-8")
-        hashes = {file: model_packages.hash_file(made / file) for file in parts.values()}
+        files = [file for own in parts.values() for file in (own, f"{own}.data") if (made / file).is_file()]
+        hashes = {file: model_packages.hash_file(made / file) for file in files}
         whole = {"format": model_packages.FORMAT, **manifest, "parts": parts, "files": hashes}
         (made / model_packages.MANIFESTS[0]).write_text(yaml.safe_dump(whole, sort_keys=False), encoding="utf-8")
         package = model_packages.read_package(made)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import shutil
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ def _exported_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
     export = package_writer.write_onnx
 
+    @functools.wraps(export)
     def write_onnx(network: package_writer.CheckpointNetwork, path: Path) -> None:
         name = f"{_hash(network)}.onnx"
         shutil.copy(make_once(tmp_path_factory, name, lambda made: export(network, made)), path)

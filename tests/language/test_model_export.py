@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 import pytest
 import tiny_models
 import torch
@@ -17,6 +19,7 @@ from torch.nn import functional as F
 from freeocc3d.core.errors import ModelError
 from freeocc3d.language import model_packages
 from freeocc3d.language.encoders import clip
+from freeocc3d.language.model_export import package_writer
 from freeocc3d.language.model_export.checkpoint_files import read_checkpoint
 from freeocc3d.language.model_export.package_writer import write_package
 from freeocc3d.language.model_export.tokenizer_files import end_token
@@ -148,6 +151,29 @@ def test_the_command_exports_a_clip_of_transformers(tmp_path: Path, monkeypatch:
     model_packages.verify_files(package)
     assert (package.licence, package.source, package.input_size) == ("mit", str(source), 32)
     assert "exists: choose another" in refused("models", "export", source, "-o", tmp_path / "models" / "tiny")
+
+
+def test_weights_too_large_for_one_file_lie_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(package_writer, "LARGEST", 0)
+    monkeypatch.setattr(package_writer, "write_onnx", inspect.unwrap(package_writer.write_onnx))
+    tiny_models.dinov2().save_pretrained(tmp_path / "source")
+    write_package(read_checkpoint(str(tmp_path / "source"), None, None, None), tmp_path / "m", "m", "s", "l")
+    package = model_packages.read_package(tmp_path / "m")
+    assert set(package.files) == {"image.onnx", "image.onnx.data"}
+    sizes = {"fp32": (tmp_path / "m" / "image.onnx.data").stat().st_size}
+    given = torch.randn(2, 3, 21, 42)
+    found = {"fp32": package.session("image").run(["features"], {"image": given.numpy()})[0]}
+    for precision in ("fp16", "int8"):
+        path = tmp_path / precision / "image.onnx"
+        path.parent.mkdir()
+        package_writer.change_precision(tmp_path / "m" / "image.onnx", path, precision, large=True)
+        sizes[precision] = path.with_name("image.onnx.data").stat().st_size
+        (found[precision],) = onnxruntime.InferenceSession(path).run(["features"], {"image": given.numpy()})
+    assert sizes["fp32"] > sizes["fp16"] > sizes["int8"] > 10_000
+    with torch.no_grad():
+        expected = tiny_models.dinov2()(given).last_hidden_state[:, 1:].reshape(found["fp32"].shape).numpy()
+    for precision, tolerance in (("fp32", 1e-4), ("fp16", 2e-2), ("int8", 0.5)):
+        assert np.abs(found[precision] - expected).max() < tolerance
 
 
 def test_dino_and_dinov2_checkpoints_are_backbones(tmp_path: Path) -> None:

@@ -94,15 +94,20 @@ def test_a_manifest_cannot_reach_out_of_its_folder(server: Hub, home: Path) -> N
         model_hub.pull_package(REPOSITORY)
 
 
-def test_a_checkpoint_is_pulled_without_what_could_run_code(server: Hub, home: Path) -> None:
+PARTS = ("model-00001-of-00002.safetensors", "model-00002-of-00002.safetensors", "model.safetensors.index.json")
+
+
+@pytest.mark.parametrize("weights", [("model.safetensors",), PARTS], ids=["one", "parts"])
+def test_a_checkpoint_is_pulled_without_what_could_run_code(server: Hub, home: Path, weights: tuple[str, ...]) -> None:
     for name in ("manifest.yaml", "image.onnx", "text.onnx"):
         (server.folder / name).unlink()
     (server.folder / "config.json").write_text("{}")
-    (server.folder / "model.safetensors").write_bytes(b"weights")
+    for name in weights:
+        (server.folder / name).write_bytes(name.encode())
     (server.folder / "modeling.py").write_text("import os")
     folder = model_hub.pull_package(REPOSITORY)
     assert folder == home / ".checkpoints" / "tiny"
-    assert {path.name for path in folder.iterdir()} == {"config.json", "model.safetensors", "tokenizer.json"}
+    assert {path.name for path in folder.iterdir()} == {"config.json", *weights, "tokenizer.json"}
     assert not model_packages.list_installed()
 
 
