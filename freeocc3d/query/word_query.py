@@ -118,8 +118,8 @@ def query(
         if not part:
             raise FreeOccError(f"'{word}' cannot be excluded{_only_known(word, text_encoder)}")
         if part in text.understood:
-            meant = "is" if word in words else f"is '{part}' to this map, which is"
-            raise FreeOccError(f"'{word}' {meant} asked for and excluded: leave one out.")
+            same = "" if word in words else f" '{part}' to this map, which is"
+            raise FreeOccError(f"'{word}' is{same} asked for and excluded: leave one out.")
     others = text_encoder.encode_words(list(dict.fromkeys((*names, *denied))))
     features = occupancy.features
     if len(features) and features.shape[1] != text.features.shape[1]:
