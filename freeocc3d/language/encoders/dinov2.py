@@ -1,4 +1,4 @@
-"""Patches in the space of words as a model package: DINO with a text-aligned head, RADIO, convolutional CLIPs."""
+"""Patches in the space of words as a model package: DINO aligned with text, RADIO, convolutional CLIPs."""
 
 from __future__ import annotations
 
