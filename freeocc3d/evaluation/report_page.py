@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..core.atomic_files import write_whole
 from ..core.errors import DependencyError
 from ..viewer.grid_pictures import LabelGrid, draw_grids
 from ..viewer.palette import assign_class_colors, color_by_value
 from ..viewer.scene_rendering import CUT, turn_upright
+from ..viewer.self_contained_pages import embed_image, make_environment, write_page
 from .scene_scoring import ScoredScene
 from .scoring import PRIMARY_MASK, TOP, Evaluation
 
@@ -41,22 +39,11 @@ def write_report(evaluation: Evaluation, path: Path, overwrite: bool = False) ->
 
     Raises ExportError: the file exists, or cannot be written.
     """
-    page = _page(evaluation)
-    write_whole(path, lambda target: _write_text(target, page), overwrite)
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    write_page(path, _page(evaluation), overwrite)
 
 
 def _page(evaluation: Evaluation) -> str:
-    environment = Environment(
-        loader=PackageLoader("freeocc3d", "evaluation"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = make_environment("evaluation")
     environment.filters |= {"percent": _percent, "cm": _cm, "count": lambda number: f"{number:,}"}
     environment.globals |= {"rgb": _rgb}
     scores = evaluation.scores
@@ -185,9 +172,7 @@ def _pictures(own: Evaluation) -> tuple[dict[str, str], str]:
         return {}, f"There are no pictures. {error}"
     if not pictures:
         return {}, "There are no pictures: neither the truth nor the prediction has occupied voxels."
-    return {
-        name: f"data:image/png;base64,{base64.b64encode(picture).decode()}" for name, picture in pictures.items()
-    }, ""
+    return {name: embed_image("png", picture) for name, picture in pictures.items()}, ""
 
 
 def compare_voxels(

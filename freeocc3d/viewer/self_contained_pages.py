@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -13,24 +13,32 @@ from numpy.typing import NDArray
 from ..core.atomic_files import write_whole
 from ..query.best_views import RegionView
 
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 _CROP = 320, 240
 """Greatest width and height of a crop, pixels."""
 _MARGIN = 0.25  # share of a box that a crop shows on each side of it
 _QUALITY = 85
 
 
-def fill_template(template: str, /, **values: Any) -> str:
-    """Returns the text of a template of this folder, with values whose special characters are escaped."""
+def make_environment(room: str) -> Environment:
+    """Returns what fills the templates of a folder of the package: it escapes special characters of values, and raises
+    an error for a value that is missing."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(
-        loader=PackageLoader("freeocc3d", "viewer"),
+    return Environment(
+        loader=PackageLoader("freeocc3d", room),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(template).render(**values)
+
+
+def fill_template(template: str, /, **values: Any) -> str:
+    """Returns the text of a template of this folder, with values whose special characters are escaped."""
+    return make_environment("viewer").get_template(template).render(**values)
 
 
 def write_page(path: Path, text: str, overwrite: bool) -> None:

@@ -10,7 +10,7 @@ from .figures import Figures, tabulate
 from .fusion_of_mistakes import Scene
 from .true_frame import put_keyframes_in_world
 
-SIDES, COVERAGES = (224, 336, 448), (None, 0.99, 0.98, 0.95)
+SIDES, COVERAGES = (224, 336, 448), (None, 0.98, 0.97, 0.95)
 PATCH, BLUR, STRIDE = 16, 0.7, 4
 """Edge of a patch in pixels; how far patches see their neighbors, a standard deviation in patches; pixels between
 features."""
