@@ -135,8 +135,10 @@ def query(
         others = text_encoder.encode_words(list(dict.fromkeys((*names, *measured.record.names, *denied))))
         found = measured.find_regions(text.features, others.features)
         return [
-            _answer_by_chance(occupancy, word, found[w], measured, options, up, _beaten(measured, text, excluded, w))
-            for w, word in enumerate(words)
+            _answer_by_chance(
+                occupancy, words[w], part, found[w], measured, options, up, _beaten(measured, text, excluded, w)
+            )
+            for w, part in enumerate(text.understood)
         ]
     expressed = others.features.any(axis=1)
     competes = (compute_cosines(text.features, others.features) < text_encoder.same_word) & expressed
@@ -173,6 +175,7 @@ def query(
 def _answer_by_chance(
     occupancy: Occupancy,
     word: str,
+    understood: str,
     found: WordRegions,
     chance: Chance,
     options: Options,
@@ -192,8 +195,8 @@ def _answer_by_chance(
     component = cut_necks(occupancy, rows, component, scores[rows], np.asarray(up), options.narrow)
     least = options.min_voxels, options.min_share
     regions = best_regions(occupancy, rows, component, scores[rows], confidence, *least, options.top_k, word)
-    note = "" if regions else _nothing_like(word, scores, _EVEN)
-    return QueryResult(word, word, note, regions, scores)
+    note = "" if regions else _nothing_like(understood, scores, _EVEN)
+    return QueryResult(word, understood, note, regions, scores)
 
 
 def _nothing_like(word: str, scores: NDArray[np.float32], threshold: float) -> str:

@@ -115,6 +115,9 @@ def test_a_synonym_is_found_beside_the_word_itself() -> None:
     (result,) = query(room, model, ["couch"], contrast=["sofa"], chance=lambda: record)
     assert result.matched
     assert set(slab[result.regions[0].rows]) == {PRESENT.index("sofa")}
+    (phrase,) = query(room, model, ["a photo of a couch."], contrast=["sofa"], chance=lambda: record)
+    assert (phrase.word, phrase.understood) == ("a photo of a couch.", "couch")
+    assert phrase.regions[0].voxels == result.regions[0].voxels
     (excluded,) = query(room, model, ["couch"], negative=["sofa"], chance=lambda: record)
     rows = np.concatenate([np.zeros(0, int), *(region.rows for region in excluded.regions)])
     features = np.asarray(room.features, np.float32)
