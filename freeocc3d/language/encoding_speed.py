@@ -8,8 +8,10 @@ import time
 
 import numpy as np
 
+from ..core.atomic_files import replace_text
 from ..core.errors import FreeOccError
 from ..core.regular_files import read_text
+from ..core.typed_documents import as_type, parse_json
 from ..core.types import Frame, Intrinsics
 from ..settings import config
 from . import model_packages, word_models
@@ -26,8 +28,7 @@ def measure_frame(package: model_packages.Package) -> float | None:
     kept_in, key = model_packages.find_models_folder() / _KEPT, package.files[package.parts["image"]]
     known: dict[str, float] = {}
     with contextlib.suppress(OSError, ValueError):
-        read = json.loads(read_text(kept_in, _LARGEST))
-        known = {name: value for name, value in read.items() if isinstance(value, float)}
+        known = as_type(parse_json(read_text(kept_in, _LARGEST), finite=True), dict[str, float])
     if key not in known:
         if package.kind not in word_models.ENCODERS:
             return None
@@ -45,7 +46,7 @@ def measure_frame(package: model_packages.Package) -> float | None:
             return None
         known[key] = min(times)
         with contextlib.suppress(OSError):
-            kept_in.write_text(json.dumps(known), encoding="utf-8")
+            replace_text(kept_in, json.dumps(known))
     return known[key]
 
 
