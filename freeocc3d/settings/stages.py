@@ -166,7 +166,7 @@ class LanguageOptions(TypedOptions, frozen=True):
     keyframes: Annotated[float, Meta(gt=0, le=1e6)] | None = None
     """Keyframes to encode: a value up to 1 is a share of all keyframes, a larger one a number. If not all are encoded,
     sharp keyframes that together show the most surface are chosen. The time of layer 3 is proportional to this number.
-    null = all, or as many as show 98 % of the surface for networks that answer any words."""
+    null = all, or as many as show 97 % of the surface for networks that answer any words."""
     visible_within: Advanced[Meters] = 0.02
     """A Gaussian is visible if the depth map shows something within this many meters of it…"""
     visible_share: Advanced[Annotated[float, Meta(ge=0, le=10)]] = 0.01
