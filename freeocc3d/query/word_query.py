@@ -134,12 +134,9 @@ def query(
         measured = Chance(occupancy, text_encoder, chance() if chance else None)
         others = text_encoder.encode_words(list(dict.fromkeys((*names, *measured.record.names, *denied))))
         found = measured.find_regions(text.features, others.features)
-        return [
-            _answer_by_chance(
-                occupancy, words[w], part, found[w], measured, options, up, _beaten(measured, text, excluded, w)
-            )
-            for w, part in enumerate(text.understood)
-        ]
+        beaten = [_beaten(measured, text, excluded, w) for w in range(len(words))]
+        answers = zip(words, text.understood, found, beaten, strict=True)
+        return [_answer_by_chance(occupancy, measured, options, up, *answer) for answer in answers]
     expressed = others.features.any(axis=1)
     competes = (compute_cosines(text.features, others.features) < text_encoder.same_word) & expressed
     cosine = every_score = similarity(features, text)
@@ -174,12 +171,12 @@ def query(
 
 def _answer_by_chance(
     occupancy: Occupancy,
-    word: str,
-    understood: str,
-    found: WordRegions,
     chance: Chance,
     options: Options,
     up: Sequence[float] | NDArray[np.float64],
+    word: str,
+    understood: str,
+    found: WordRegions,
     excluded: NDArray[np.bool_],
 ) -> QueryResult:
     """Answers a word by those of its regions that random words hardly reach. The score of a voxel is that of its
