@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ..core.atomic_files import refuse_existing
-from .console import Json, MapPath, Overwrite
+from .console import Json, MapPath, Overwrite, show, show_document
 from .map_summary import MEASURE_NAMES, length_text
 
 if TYPE_CHECKING:
@@ -44,7 +43,10 @@ def check(
         from ..viewer.check_picture import write_check_picture
 
         write_check_picture(loaded, found.views, found.agreement, picture, overwrite)
-    print(json.dumps(check_document(loaded, found)) if as_json else check_text(loaded, found))
+    if as_json:
+        show_document(check_document(loaded, found))
+    else:
+        show(*told_lines(loaded, found))
 
 
 def check_document(loaded: Map, found: MapCheck) -> dict[str, Any]:
@@ -79,7 +81,7 @@ def check_document(loaded: Map, found: MapCheck) -> dict[str, Any]:
     }
 
 
-def check_text(loaded: Map, found: MapCheck) -> str:
+def told_lines(loaded: Map, found: MapCheck) -> list[str]:
     """What ``check`` prints for people."""
     rows = [("", "measured", "usual", "")]
     rows += [
@@ -95,7 +97,7 @@ def check_text(loaded: Map, found: MapCheck) -> str:
         ends = [(frames[pair.target], frames[pair.source], length_text(pair.off_m, loaded.metric)) for pair in worst]
         lines.append(f"worst      frames {', '.join(f'{first} and {last} ({off})' for first, last, off in ends)}")
     lines += [f"note       {note}" for note in found.notes]
-    return "\n".join([*lines, f"verdict    {found.verdict or 'nothing could be measured'}"])
+    return [*lines, f"verdict    {found.verdict or 'nothing could be measured'}"]
 
 
 def _value(measure: Measure, metric: bool) -> str:

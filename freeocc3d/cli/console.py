@@ -1,8 +1,9 @@
-"""What all commands share: arguments, and progress on stderr."""
+"""What all commands share: arguments, answers on stdout, and progress on stderr. Nothing else here prints."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import sys
 import time
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ..core.errors import printable
 from ..core.progress import Progress
 
 
@@ -28,10 +30,31 @@ Set = Annotated[
 Overwrite = Annotated[bool, flag("--overwrite", "Replace what exists.")]
 
 
-def say(text: str, end: str = "\n") -> None:
-    """Print to stderr. A log that is full or that nobody reads any more ends no work."""
+def show(*lines: str) -> None:
+    """Print lines to stdout. Names in them are of maps, captures and models from outside: what would move the cursor,
+    break the line or turn the writing around becomes an escape, so that each argument is one line of the answer."""
+    print("\n".join(map(printable, lines)), flush=True)
+
+
+def show_document(document: Any) -> None:
+    """Print plain values to stdout as one line of JSON, which holds each name exactly."""
+    print(json.dumps(document), flush=True)
+
+
+def say(line: str) -> None:
+    """Print a line to stderr, as ``show`` does."""
+    _write_to_log(f"{printable(line)}\n")
+
+
+def ask_for_line() -> None:
+    """Print a prompt to stderr."""
+    _write_to_log("> ")
+
+
+def _write_to_log(text: str) -> None:
+    """A log that is full or that nobody reads any more ends no work."""
     with contextlib.suppress(OSError):
-        print(text, end=end, file=sys.stderr, flush=True)
+        print(text, end="", file=sys.stderr, flush=True)
 
 
 class ConsoleProgress(Progress):
@@ -84,8 +107,8 @@ class ConsoleProgress(Progress):
             elapsed = self._drawn - self._start
             left = elapsed / done * (self._total - done) if done else 0.0
             line += f" [{'=' * filled}{' ' * (30 - filled)}] {done}/{self._total}, {left:.0f} s left"
-        say(f"\r\x1b[K{line}", end="")
+        _write_to_log(f"\r\x1b[K{printable(line)}")
 
     def _clear(self) -> None:
         if self._on_terminal:
-            say("\r\x1b[K", end="")
+            _write_to_log("\r\x1b[K")

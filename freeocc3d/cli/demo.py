@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from .console import ConsoleProgress, Overwrite
-from .map_summary import summary_text
-from .query_answers import answers_text
+from .console import ConsoleProgress, Overwrite, show
+from .map_summary import summary_lines
+from .query_answers import answers_lines
 
 WORDS = "red cup", "blue chair", "something to sit on", "bathtub"
 """The words that the demo asks: the last one names nothing in the room."""
@@ -48,15 +48,14 @@ def demo(
     settings = config.load(None, [f"capture.synthetic.frames={frames}", "language.encoder=labels"])
     with ConsoleProgress() as progress:
         made = run.reconstruct("builtin:room", output / "map", settings, overwrite=overwrite, progress=progress)
-    print(summary_text(made))
+    show(*summary_lines(made))
     written = [output / "map.png"]
     map_pictures.write_map_picture(made, written[0], overwrite=overwrite)
     results = made.query_words(list(WORDS), top_k=4)
-    print(f"\n{STAND_IN}\n")
-    print(answers_text(results))
+    show("", *STAND_IN.splitlines(), "", *answers_lines(results))
     for result in results:
         if result.matched:
             written.append(output / f"query_{result.word.replace(' ', '_')}.png")
             map_pictures.write_query_picture(made, [result], written[-1], overwrite)
-    print(f"\n{REAL.format(*(shlex.quote(str(output / name)) for name in ('map', 'map-with-words')))}")
-    print("pictures: " + ", ".join(str(path) for path in written))
+    real = REAL.format(*(shlex.quote(str(output / name)) for name in ("map", "map-with-words")))
+    show("", *real.splitlines(), f"pictures: {', '.join(str(path) for path in written)}")

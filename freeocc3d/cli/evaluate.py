@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +9,7 @@ from typing import Annotated
 import typer
 
 from ..core.atomic_files import refuse_existing
-from .console import Json, Overwrite, Set
+from .console import Json, Overwrite, Set, show, show_document
 from .option_groups import grouped
 
 
@@ -96,7 +95,7 @@ class Report:
 def evaluate(scored: Scored, truth: Truth, rules: Rules, report: Report) -> None:
     """Score maps, or the results of other systems, against the truth."""
     from ..evaluation import scoring
-    from .scores import scores_document, scores_text
+    from .scores import scores_document, scores_lines
 
     others = (scored.gaussians, scored.grid, scored.frames)
     if sum(path is not None for path in others) + bool(scored.maps) != 1:
@@ -121,4 +120,7 @@ def evaluate(scored: Scored, truth: Truth, rules: Rules, report: Report) -> None
         from ..evaluation.report_page import write_report
 
         write_report(evaluation, report.html, report.overwrite)
-    print(json.dumps(scores_document(evaluation)) if report.as_json else scores_text(evaluation))
+    if report.as_json:
+        show_document(scores_document(evaluation))
+    else:
+        show(*scores_lines(evaluation))

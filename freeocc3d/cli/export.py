@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from ..core.atomic_files import refuse_existing
-from .console import ConsoleProgress, MapPath, Overwrite, Set, say
+from .console import ConsoleProgress, MapPath, Overwrite, Set, say, show
 
 
 def export(
@@ -45,4 +45,4 @@ def export(
     if not loaded.metric:
         say("note: the map's scale is unknown, so lengths are not meters (see freeocc3d scale).")
     files = [path for path in output.rglob("*") if path.is_file()] if output.is_dir() else [output]
-    print(f"{output}: {sum(path.stat().st_size for path in files):,} bytes")
+    show(f"{output}: {sum(path.stat().st_size for path in files):,} bytes")

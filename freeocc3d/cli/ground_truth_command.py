@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..core.atomic_files import refuse_existing
-from .console import ConsoleProgress, Overwrite, Set
+from .console import ConsoleProgress, Overwrite, Set, show
 
 if TYPE_CHECKING:
     from ..evaluation.true_occupancy import GroundTruth
@@ -33,10 +33,10 @@ def ground_truth(
     with ConsoleProgress() as progress:
         truth = replicaocc_truth.build_truth(capture, overrides or [], progress)
     save_ground_truth(truth, output, overwrite)
-    print(truth_text(truth, output))
+    show(*truth_lines(truth, output))
 
 
-def truth_text(truth: GroundTruth, path: Path) -> str:
+def truth_lines(truth: GroundTruth, path: Path) -> list[str]:
     """A summary for people."""
     import numpy as np
 
@@ -47,7 +47,8 @@ def truth_text(truth: GroundTruth, path: Path) -> str:
     counts = np.bincount(truth.labels[occupied], minlength=len(truth.classes))
     common = ", ".join(f"{truth.classes[k]} {counts[k]:,}" for k in np.argsort(-counts, kind="stable") if counts[k])
     x, y, z = truth.shape
-    return (
+    return [
         f"{path}: {x} x {y} x {z} voxels of {truth.voxel_size:g} m, {int(known.sum()):,} observed, "
-        f"{int(occupied.sum()):,} occupied\nclasses: {common}"
-    )
+        f"{int(occupied.sum()):,} occupied",
+        f"classes: {common}",
+    ]

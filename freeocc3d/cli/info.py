@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-
-from .console import Json, MapPath
-from .map_summary import summary_document, summary_text
+from .console import Json, MapPath, show, show_document
+from .map_summary import summary_document, summary_lines
 
 
 def info(map_path: MapPath, as_json: Json = False) -> None:
@@ -13,4 +11,7 @@ def info(map_path: MapPath, as_json: Json = False) -> None:
     from ..query.scan_map import load_map
 
     loaded = load_map(map_path)
-    print(json.dumps(summary_document(loaded)) if as_json else summary_text(loaded))
+    if as_json:
+        show_document(summary_document(loaded))
+    else:
+        show(*summary_lines(loaded))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..core.errors import printable
-from .console import Json, Set
+from .console import Json, Set, show, show_document
 
 if TYPE_CHECKING:
     from ..pipeline.inspection import Inspection
@@ -24,7 +22,10 @@ def inspect(
     from ..settings import config
 
     found = inspection.inspect(capture, config.load(None, overrides or []))
-    print(json.dumps(found.to_dict()) if as_json else "\n".join(_lines(found)))
+    if as_json:
+        show_document(found.to_dict())
+    else:
+        show(*_lines(found))
 
 
 def _lines(found: Inspection) -> list[str]:
@@ -42,7 +43,7 @@ def _lines(found: Inspection) -> list[str]:
     rows += [("to fix", notice.text) for notice in found.notices]
     if not found.problems and not found.notices:
         rows.append(("to fix", "nothing that shows"))
-    return [f"{name:<10} {printable(text)}" for name, text in rows]
+    return [f"{name:<10} {text}" for name, text in rows]
 
 
 def _frames(found: Inspection) -> str:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .console import Json, flag
+from .console import Json, flag, show, show_document
 
 if TYPE_CHECKING:
     from ..settings.registry import Backend
@@ -30,16 +29,15 @@ def list_backends(
     from ..settings.default_yaml import default_yaml
 
     if as_yaml:
-        print(default_yaml(), end="")
+        show(*default_yaml().splitlines())
         return
     folders = registry.FOLDERS if kind is None else [registry.folder_of(kind)]
     found = {registry.FOLDERS[folder]: registry.backends(folder).values() for folder in folders}
     if as_json:
-        print(json.dumps({title: {b.name: _facts(b) for b in backends} for title, backends in found.items()}))
+        show_document({title: {b.name: _facts(b) for b in backends} for title, backends in found.items()})
         return
     for title, backends in found.items():
-        print(f"{title}s")
-        _print(backends, advanced)
+        show(f"{title}s", *_lines(backends, advanced))
 
 
 def _facts(backend: Backend) -> dict[str, object]:
@@ -50,13 +48,13 @@ def _facts(backend: Backend) -> dict[str, object]:
     return {"summary": backend.summary, "missing": backend.missing, "options": options}
 
 
-def _print(backends: Iterable[Backend], advanced: bool) -> None:
+def _lines(backends: Iterable[Backend], advanced: bool) -> Iterator[str]:
     for backend in backends:
         missing = f"  [needs {', '.join(backend.missing)}]" if backend.missing else ""
-        print(f"  {backend.name:<14} {backend.summary}{missing}")
+        yield f"  {backend.name:<14} {backend.summary}{missing}"
         for option in backend.options:
             if advanced or not option.advanced:
-                print(f"      {option.name} = {option.default!r}  ({option.type}) {option.doc}")
+                yield f"      {option.name} = {option.default!r}  ({option.type}) {option.doc}"
         hidden = sum(option.advanced for option in backend.options)
         if hidden and not advanced:
-            print(f"      ({hidden} more with --advanced)")
+            yield f"      ({hidden} more with --advanced)"

@@ -15,7 +15,7 @@ from .. import __version__
 from ..core.errors import FreeOccError, Interrupted, is_interrupt, printable
 from . import models
 from .check import check
-from .console import flag, say
+from .console import flag, say, show
 from .demo import demo
 from .evaluate import evaluate
 from .export import export
@@ -64,7 +64,7 @@ def _options(
     debug: Annotated[bool, flag("--debug", "Show the traceback of an error. May also follow a command.")] = False,
 ) -> None:
     if version:
-        print(__version__)
+        show(__version__)
         raise typer.Exit
 
 

@@ -73,7 +73,7 @@ def summary_document(loaded: Map) -> dict[str, Any]:
     }
 
 
-def summary_text(loaded: Map) -> str:
+def summary_lines(loaded: Map) -> list[str]:
     """What ``info`` prints for people."""
     said = summary_document(loaded)
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in said["seconds"].items())
@@ -98,8 +98,7 @@ def summary_text(loaded: Map) -> str:
             f"{submap['keyframes']} as keyframes; {'mapped' if submap['mapped'] else 'apart, not in the map'}"
             for submap in said["submap_frames"]
         ]
-    lines += [f"warning    {notice.text}" for notice in read_notices(said["warnings"])]
-    return "\n".join(lines)
+    return lines + [f"warning    {notice.text}" for notice in read_notices(said["warnings"])]
 
 
 def _frames_text(said: dict[str, Any]) -> str:

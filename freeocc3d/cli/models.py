@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..core.errors import FreeOccError, ModelError
-from .console import ConsoleProgress, Json
+from .console import ConsoleProgress, Json, show, show_document
 from .option_groups import grouped
 
 Precision = Literal["fp32", "fp16", "int8"]
@@ -41,9 +40,9 @@ def models_pull(
     with ConsoleProgress() as progress:
         folder = model_hub.pull_package(name, revision, progress, precision)
     if folder.parent.name == model_hub.CHECKPOINTS:
-        print(f"{folder}: a checkpoint; export it: freeocc3d models export {folder} -o {folder.name}")
+        show(f"{folder}: a checkpoint; export it: freeocc3d models export {folder} -o {folder.name}")
     else:
-        print(folder)
+        show(str(folder))
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def models_export(
     made = export_checkpoint(
         checkpoint, output, precision, word_side.tokenizer, word_side.text, word_side.text_head, license_name
     )
-    print(f"{made.folder}: {made.kind}, {made.dimension} dimensions, {made.precision}, {made.bytes:,} bytes")
+    show(f"{made.folder}: {made.kind}, {made.dimension} dimensions, {made.precision}, {made.bytes:,} bytes")
 
 
 @app.command("list")
@@ -133,12 +132,12 @@ def models_list(
 
     rows = _available_models() if available else _installed_models()
     if as_json:
-        print(json.dumps({"folder": str(model_packages.find_models_folder()), "models": rows}))
+        show_document({"folder": str(model_packages.find_models_folder()), "models": rows})
         return
     for name, facts in rows.items():
-        print(f"{name:<24} unusable: {facts['error']}" if "error" in facts else f"{name:<24} {_described(facts)}")
+        show(f"{name:<24} unusable: {facts['error']}" if "error" in facts else f"{name:<24} {_described(facts)}")
     if not rows:
-        print(f"There are no models in {model_packages.find_models_folder()}.")
+        show(f"There are no models in {model_packages.find_models_folder()}.")
 
 
 def _installed_models() -> dict[str, dict[str, Any]]:
@@ -208,6 +207,6 @@ def models_verify(
         except ModelError as error:
             damaged.append(str(error))
         else:
-            print(f"{folder}: {len(package.files)} files match their hashes")
+            show(f"{folder}: {len(package.files)} files match their hashes")
     if damaged:
         raise ModelError(" ".join(damaged))

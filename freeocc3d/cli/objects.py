@@ -3,7 +3,6 @@ inside."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +12,7 @@ import typer
 from .. import __version__
 from ..core.atomic_files import refuse_existing
 from ..core.errors import FreeOccError
-from .console import Json, MapPath, Overwrite
+from .console import Json, MapPath, Overwrite, show, show_document
 
 if TYPE_CHECKING:
     from ..query.objects.object import Object
@@ -64,9 +63,9 @@ def objects(
 
         write_objects_page(loaded, found, relations, shown, html, overwrite)
     if as_json:
-        print(json.dumps(objects_document(loaded, found, relations, shown)))
+        show_document(objects_document(loaded, found, relations, shown))
     else:
-        print(objects_text(loaded, found, relations, shown))
+        show(*objects_lines(loaded, found, relations, shown))
 
 
 def _chosen(found: Sequence[Object], names: Sequence[str]) -> list[int]:
@@ -103,9 +102,9 @@ def objects_document(
     }
 
 
-def objects_text(
+def objects_lines(
     loaded: Map, found: Sequence[Object], relations: Sequence[Sequence[Relation]], shown: Sequence[int]
-) -> str:
+) -> list[str]:
     """What ``objects`` prints for people."""
     from ..query.objects.description import tell_relations
 
@@ -113,7 +112,7 @@ def objects_text(
     if len(shown) < len(found):
         count = f"{len(shown)} of {count}"
     if not found:
-        return "No objects were found."
+        return ["No objects were found."]
     unit = "m" if loaded.metric else "units"
     rows = [("#", "name", "prob.", f"size ({unit})", f"center ({unit})", "frame", "relations")]
     for row in shown:
@@ -135,5 +134,5 @@ def objects_text(
         "  ".join(f"{text:{'>' if column in right else '<'}{widths[column]}}" for column, text in enumerate(cells))
         for cells in rows
     ]
-    note = "" if loaded.metric else "\nThe map's scale is unknown, so lengths are not meters (see freeocc3d scale)."
-    return "\n".join([f"{count}.", *(line.rstrip() for line in lines)]) + note
+    note = "The map's scale is unknown, so lengths are not meters (see freeocc3d scale)."
+    return [f"{count}.", *(line.rstrip() for line in lines), *([] if loaded.metric else [note])]

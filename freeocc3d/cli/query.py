@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ import typer
 from .. import __version__
 from ..core.atomic_files import refuse_existing
 from ..core.errors import FreeOccError
-from .console import ConsoleProgress, Json, MapPath, Overwrite, flag
+from .console import ConsoleProgress, Json, MapPath, Overwrite, ask_for_line, flag, say, show, show_document
 from .option_groups import grouped
 
 if TYPE_CHECKING:
@@ -151,7 +150,7 @@ def query(map_path: MapPath, asked: Asked, place: Place, ranking: Ranking, answe
     from ..query.scan_map import load_map
 
     if asked.list_classes:
-        print("\n".join(load_map(map_path).vocabulary))
+        show(*load_map(map_path).vocabulary)
         return
     _refuse_conflicts(asked, answer, closer)
     for target in answer.files:
@@ -172,7 +171,7 @@ def query(map_path: MapPath, asked: Asked, place: Place, ranking: Ranking, answe
             loaded = _refined(loaded, results[0].regions[0], closer.refine_to, output, answer.overwrite)
             results = ask(loaded, question)
         _write_files(loaded, results, answer)
-        print(_answer(map_path, loaded, results, answer))
+        _show(map_path, loaded, results, answer)
 
 
 def _refuse_conflicts(asked: Asked, answer: Answer, closer: Closer) -> None:
@@ -233,17 +232,18 @@ def _write_files(loaded: Map, results: list[QueryResult], answer: Answer) -> Non
         write_query_page(loaded, results, answer.html, answer.overwrite)
 
 
-def _answer(map_path: Path, loaded: Map, results: Sequence[QueryResult], answer: Answer) -> str:
-    from .query_answers import answers_document, answers_text
+def _show(map_path: Path, loaded: Map, results: Sequence[QueryResult], answer: Answer) -> None:
+    from .query_answers import answers_document, answers_lines
 
     frame = _frame(loaded, answer.frame)
     if answer.as_json:
         from .region_details import describe_regions
 
         more = describe_regions(loaded, results, answer.views, frame.T_frame_map)
-        return json.dumps(answers_document(map_path, results, more, loaded.metric, frame))
-    unit = "" if loaded.metric else "\nThe map's scale is unknown, so lengths are not meters (see freeocc3d scale)."
-    return answers_text(results, loaded.metric, frame) + unit
+        show_document(answers_document(map_path, results, more, loaded.metric, frame))
+        return
+    unit = "The map's scale is unknown, so lengths are not meters (see freeocc3d scale)."
+    show(*answers_lines(results, loaded.metric, frame), *([] if loaded.metric else [unit]))
 
 
 def _frame(loaded: Map, name: str) -> AnswerFrame:
@@ -270,7 +270,7 @@ def _answer_lines(loaded: Map, question: Question, answer: Answer) -> None:
 
     while True:
         if sys.stdin.isatty():
-            print("> ", end="", file=sys.stderr, flush=True)
+            ask_for_line()
         line = sys.stdin.readline()
         if not line:
             return
@@ -279,13 +279,13 @@ def _answer_lines(loaded: Map, question: Question, answer: Answer) -> None:
             continue
         try:
             results = ask(loaded, replace(question, words=words))
-            print(_answer(loaded.path, loaded, results, answer), flush=True)
+            _show(loaded.path, loaded, results, answer)
         except FreeOccError as error:
             said = " ".join(str(error).split())
             if answer.as_json:
-                print(json.dumps({"version": __version__, "map": str(loaded.path), "error": said}), flush=True)
+                show_document({"version": __version__, "map": str(loaded.path), "error": said})
             else:
-                print(f"freeocc3d: {said}", file=sys.stderr, flush=True)
+                say(f"freeocc3d: {said}")
 
 
 def _refined(loaded: Map, region: Region, voxel_size: float, output: Path, overwrite: bool) -> Any:

@@ -68,7 +68,7 @@ def _region(region: Region) -> dict[str, Any]:
     }
 
 
-def answers_text(results: Sequence[QueryResult], metric: bool = True, frame: AnswerFrame | None = None) -> str:
+def answers_lines(results: Sequence[QueryResult], metric: bool = True, frame: AnswerFrame | None = None) -> list[str]:
     """A table for people, in meters and liters, or in the map's units if not ``metric``, in the map's frame by
     default."""
     move = (lambda region: region) if frame is None else frame.move
@@ -92,7 +92,7 @@ def answers_text(results: Sequence[QueryResult], metric: bool = True, frame: Ans
                 f"{per_unit3 * region.volume_m3:{len(f'volume ({volume})')}.{digits}f}  {region.voxels:6d}"
                 + (f"  {region.number} {region.name}" if region.number is not None else "")
             )
-    return "\n".join(lines)
+    return lines
 
 
 def _count(number: int, what: str) -> str:

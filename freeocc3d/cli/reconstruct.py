@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..core.errors import ConfigError
-from .console import ConsoleProgress, NewMap, Overwrite, Set, flag
-from .map_summary import summary_text
+from .console import ConsoleProgress, NewMap, Overwrite, Set, flag, show
+from .map_summary import summary_lines
 from .words import Words, obtain_words
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def reconstruct(
         if words is not None:
             settings = use_package(settings, obtain_words(words, progress))
         made = run.reconstruct(capture, output, settings, overwrite=overwrite, resume=resume, progress=progress)
-    print(summary_text(made))
+    show(*summary_lines(made))
 
 
 def _move(settings: Settings, device: str) -> Settings:

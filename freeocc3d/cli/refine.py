@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from .console import ConsoleProgress, MapPath, NewMap, Overwrite
-from .map_summary import summary_text
+from .console import ConsoleProgress, MapPath, NewMap, Overwrite, show
+from .map_summary import summary_lines
 
 
 def refine(
@@ -38,4 +38,4 @@ def refine(
         else:
             corners = box_refinement.Box(np.array(box[:3]), np.array(box[3:]))
             made = box_refinement.refine_box(scan_map, corners, voxel, output, overwrite=overwrite, progress=progress)
-    print(summary_text(made))
+    show(*summary_lines(made))

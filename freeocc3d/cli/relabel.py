@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from .console import ConsoleProgress, MapPath, NewMap, Overwrite
-from .map_summary import summary_text
+from .console import ConsoleProgress, MapPath, NewMap, Overwrite, show
+from .map_summary import summary_lines
 from .words import WordsHelp, obtain_words
 
 
@@ -25,4 +25,4 @@ def relabel(
     with ConsoleProgress() as progress:
         package = obtain_words(words, progress)
         made = relabeling.relabel_map(scan_map, package, output, overwrite=overwrite, progress=progress)
-    print(summary_text(made))
+    show(*summary_lines(made))

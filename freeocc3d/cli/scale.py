@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from .console import MapPath, NewMap, Overwrite
-from .map_summary import summary_text
+from .console import MapPath, NewMap, Overwrite, show
+from .map_summary import summary_lines
 
 
 def scale(
@@ -49,4 +49,4 @@ def scale(
     elif poses is not None:
         factor, by = scaling.scale_by_poses(loaded, poses), "poses"
     assert factor is not None
-    print(summary_text(scaling.scale_map(loaded, factor, by, output, overwrite=overwrite)))
+    show(*summary_lines(scaling.scale_map(loaded, factor, by, output, overwrite=overwrite)))

@@ -71,7 +71,7 @@ def _figures(evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def scores_text(evaluation: Evaluation) -> str:
+def scores_lines(evaluation: Evaluation) -> list[str]:
     """Tables for people; percent and centimeters."""
     scores = evaluation.scores
     lines = [
@@ -97,7 +97,7 @@ def scores_text(evaluation: Evaluation) -> str:
             for k in (-scores.class_voxels).argsort(kind="stable")
             if scores.class_voxels[k]
         ]
-    return "\n".join(lines + [f"note: {note}" for note in evaluation.notes])
+    return lines + [f"note: {note}" for note in evaluation.notes]
 
 
 def _lists_of_classes(evaluation: Evaluation) -> list[str]:

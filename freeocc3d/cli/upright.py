@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .console import ConsoleProgress, MapPath, NewMap, Overwrite
-from .map_summary import summary_text
+from .console import ConsoleProgress, MapPath, NewMap, Overwrite, show
+from .map_summary import summary_lines
 
 
 def upright(map_path: MapPath, output: NewMap, overwrite: Overwrite = False) -> None:
@@ -13,4 +13,4 @@ def upright(map_path: MapPath, output: NewMap, overwrite: Overwrite = False) -> 
 
     with ConsoleProgress() as progress:
         made = stand_upright(load_map(map_path), output, overwrite=overwrite, progress=progress)
-    print(summary_text(made))
+    show(*summary_lines(made))

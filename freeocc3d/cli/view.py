@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .console import MapPath, Overwrite
+from .console import MapPath, Overwrite, show
 
 
 def view(
@@ -26,4 +26,4 @@ def view(
         map_pictures.write_map_picture(loaded, picture, by, overwrite)
     else:
         map_pictures.write_query_picture(loaded, loaded.query_words([word]), picture, overwrite)
-    print(picture)
+    show(str(picture))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from freeocc3d.cli.map_summary import summary_document, summary_text
+from freeocc3d.cli.map_summary import summary_document, summary_lines
 from freeocc3d.query.scan_map import Map, load_map
 
 PROMISED = {
@@ -39,7 +39,7 @@ def test_the_bytes_are_those_of_the_files(loaded: Map) -> None:
 
 
 def test_the_text_has_a_line_for_each_fact(loaded: Map) -> None:
-    lines = {line.split()[0]: line for line in summary_text(loaded).splitlines()}
+    lines = {line.split()[0]: line for line in "\n".join(summary_lines(loaded)).splitlines()}
     assert {"map", "capture", "frames", "gaussians", "voxels", "encoder", "time", "memory"} <= set(lines)
     assert str(loaded.path) in lines["map"]
     assert "8 with a pose" in lines["frames"]
@@ -49,5 +49,8 @@ def test_the_text_has_a_line_for_each_fact(loaded: Map) -> None:
 def test_warnings_of_the_run_come_last(loaded: Map, monkeypatch: pytest.MonkeyPatch) -> None:
     report = {**loaded.report, "warnings": [{"code": "frames-lost", "text": "Two frames are lost."}, "An old text."]}
     monkeypatch.setitem(vars(loaded), "report", report)
-    assert summary_text(loaded).splitlines()[-2:] == ["warning    Two frames are lost.", "warning    An old text."]
+    assert "\n".join(summary_lines(loaded)).splitlines()[-2:] == [
+        "warning    Two frames are lost.",
+        "warning    An old text.",
+    ]
     assert summary_document(loaded)["warnings"] == report["warnings"]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from worded_voxels import WORDS, box, feature, occupancy
 
-from freeocc3d.cli.query_answers import answers_document, answers_text
+from freeocc3d.cli.query_answers import answers_document, answers_lines
 from freeocc3d.query.word_query import query
 
 
@@ -22,6 +22,6 @@ def test_json_has_the_documented_keys_and_is_json() -> None:
 
 def test_text_names_each_word_and_region() -> None:
     room = occupancy(box((0, 0, 0), (2, 2, 2), feature(SOFA=1)))
-    text = answers_text(query(room, WORDS, ["sofa", "unicorn"]))
+    text = "\n".join(answers_lines(query(room, WORDS, ["sofa", "unicorn"])))
     assert "sofa: 1 region" in text
     assert "unicorn: no match" in text

@@ -11,7 +11,7 @@ from command_line import refused, run
 from small_captures import data_folder
 
 import freeocc3d
-from freeocc3d.cli.scores import scores_document, scores_text
+from freeocc3d.cli.scores import scores_document, scores_lines
 from freeocc3d.core.errors import FreeOccError
 from freeocc3d.core.tum_files import write_tum
 from freeocc3d.core.types import Trajectory
@@ -82,7 +82,7 @@ def test_lists_of_classes_over_which_miou_is_given() -> None:
     assert scored.miou() == pytest.approx(11 / 12)
     assert scored.miou_over["top_20"] is None
     assert scored.miou_over["shared_8"] is None
-    assert "top_20, top_30, top_40 (the truth holds 12 classes)" in scores_text(scored)
+    assert "top_20, top_30, top_40 (the truth holds 12 classes)" in "\n".join(scores_lines(scored))
 
 
 def test_a_claim_without_classes_has_no_miou_which_is_not_zero() -> None:
@@ -92,7 +92,7 @@ def test_a_claim_without_classes_has_no_miou_which_is_not_zero() -> None:
     assert document["per_class"] == {}
     assert document["classes_in_miou"] == []
     assert document["iou"] == 1.0
-    assert "mIoU           –" in scores_text(scored)
+    assert "mIoU           –" in "\n".join(scores_lines(scored))
 
 
 @pytest.fixture(scope="module")

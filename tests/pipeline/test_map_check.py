@@ -11,8 +11,8 @@ import pytest
 from benchmark.self_check import check_lines, measure_check
 
 from freeocc3d import Map
-from freeocc3d.cli.check import check_document, check_text
-from freeocc3d.cli.map_summary import summary_text
+from freeocc3d.cli.check import check_document, told_lines
+from freeocc3d.cli.map_summary import summary_lines
 from freeocc3d.core.errors import FrameError
 from freeocc3d.core.types import OCCUPIED
 from freeocc3d.editing.scaling import scale_map
@@ -50,11 +50,11 @@ def test_the_run_has_told_the_same(room: Map, checked: MapCheck, monkeypatch: py
         value = told[name].value
         assert said["value"] == (value and pytest.approx(value, rel=1e-4)), name
     assert "check" in room.report["seconds"]  # what it takes longer than pictures and files
-    assert f"check      {report['verdict']}, depth differs by" in summary_text(room)
+    assert f"check      {report['verdict']}, depth differs by" in "\n".join(summary_lines(room))
     poor = {**report["measures"]["unmeasured"], "verdict": "poor"}
     changed = {**room.report, "check": {"verdict": "poor", "measures": {"unmeasured": poor}}}
     monkeypatch.setitem(vars(room), "report", changed)
-    assert "check      poor (occupied voxels in which no depth ends)\n" in summary_text(room) + "\n"
+    assert "check      poor (occupied voxels in which no depth ends)\n" in "\n".join(summary_lines(room)) + "\n"
 
 
 def test_wrong_poses_and_voxels_show(room: Map, checked: MapCheck, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,10 +114,10 @@ def test_the_benchmark_compares_other_poses_of_the_same_keyframes(room: Map, che
 def test_a_map_of_unknown_scale_is_told_in_units(room: Map, checked: MapCheck, monkeypatch: pytest.MonkeyPatch) -> None:
     manifest = msgspec.structs.replace(room.manifest, scale=MapScale(metric=False))
     monkeypatch.setattr(room, "manifest", manifest)
-    assert " cm" not in check_text(room, checked)
-    assert " units, " in check_text(room, checked)
+    assert " cm" not in "\n".join(told_lines(room, checked))
+    assert " units, " in "\n".join(told_lines(room, checked))
     assert check_document(room, checked)["metric"] is False
-    assert " units from one keyframe to the next" in summary_text(room)
+    assert " units from one keyframe to the next" in "\n".join(summary_lines(room))
 
 
 def test_verdicts_follow_the_limits() -> None:

@@ -240,7 +240,7 @@ def test_labels_of_the_capture_answer_by_class(tmp_path) -> None:
 
 
 def test_two_places_are_two_submaps_and_the_largest_is_mapped(two_places) -> None:
-    from freeocc3d.cli.map_summary import summary_text
+    from freeocc3d.cli.map_summary import summary_lines
 
     made = two_places
     assert made.manifest.counts.submaps == 2
@@ -255,7 +255,7 @@ def test_two_places_are_two_submaps_and_the_largest_is_mapped(two_places) -> Non
     assert [frame.index for frame in made.keyframes] == made.trajectory.keyframes.tolist()
     assert len(list((made.path / "keyframes").glob("*.color.jpg"))) == len(made.keyframes)
     assert made.gaussians.anchor_keyframe.max() < len(made.keyframes)
-    text = summary_text(made)
+    text = "\n".join(summary_lines(made))
     assert "2 submaps" in text
     assert "frames 15 to 22: 8 with a pose" in text
     assert "apart, not in the map" in text
