@@ -16,6 +16,7 @@ from ..core.voxel_keys import pack_voxels
 from ..query.scan_map import Map
 from ..tracking.view_agreement import Agreement, ComparedView, PairAgreement, compare_views
 from .floor_plans import FloorPlan
+from .lettering import HEADING, LEGEND, write_text
 from .scene_rendering import BACKGROUND
 
 SIZE = 1600, 960
@@ -29,7 +30,7 @@ _PAIRS = 150  # of each kind whose points are drawn, evenly chosen
 _CELL, _LEAST = 2, 5  # voxels along a cell, and points of a cell, whose median is drawn
 _TOP = 4.0  # the color scale ends at this multiple of the median of all pairs
 _COLUMNS = 120  # sampled points along a row of a shown pair
-_TEXT, _UNKNOWN, _PATH = (40, 40, 40), (222, 222, 222), (90, 90, 90)
+_UNKNOWN, _PATH = (222, 222, 222), (90, 90, 90)
 
 
 def write_check_picture(
@@ -44,7 +45,7 @@ def write_check_picture(
     pairs = [*agreement.revisits, *agreement.steps]
     top = _TOP * float(np.median([pair.off_m for pair in pairs])) if pairs else 0.0
     name = Path(scan_map.manifest.capture.path).name
-    _put(picture, f"{name}: where the depth of keyframes differs, from above", (16, 36))
+    write_text(picture, f"{name}: where the depth of keyframes differs, from above", (16, 36), HEADING)
     if pairs and top > 0:
         _draw_plan(picture, scan_map, views, agreement, top)
         worst = sorted(agreement.revisits or agreement.steps, key=lambda pair: -pair.off_m)[:WORST]
@@ -142,7 +143,7 @@ def _draw_pair(
         below = y + size[1] + 18
     frames = scan_map.manifest.keyframes
     said = f"frames {frames[pair.source]} and {frames[pair.target]}: {_length(pair.off_m, scan_map.metric)}"
-    _put(picture, said, (_PLAN, below), 0.5)
+    write_text(picture, said, (_PLAN, below), LEGEND)
 
 
 def _draw_scale(picture: NDArray[np.uint8], top: float, metric: bool) -> None:
@@ -150,7 +151,7 @@ def _draw_scale(picture: NDArray[np.uint8], top: float, metric: bool) -> None:
     y = SIZE[1] - 34
     picture[y : y + 14, 16 : 16 + len(ramp)] = ramp
     said = f"0 to {_length(top, metric)}; gray: seen by no two compared keyframes"
-    _put(picture, said, (16 + len(ramp) + 12, y + 12), 0.5)
+    write_text(picture, said, (16 + len(ramp) + 12, y + 12), LEGEND)
 
 
 def _colors(off: NDArray[np.float64], top: float) -> NDArray[np.uint8]:
@@ -161,8 +162,3 @@ def _colors(off: NDArray[np.float64], top: float) -> NDArray[np.uint8]:
 
 def _length(value: float, metric: bool) -> str:
     return f"{100 * value:.1f} cm" if metric else f"{value:.2g} units"
-
-
-def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: float = 0.62) -> None:
-    printable = text.encode("ascii", "replace").decode()
-    cv2.putText(picture, printable, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _TEXT, 1, cv2.LINE_AA)

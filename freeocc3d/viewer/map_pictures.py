@@ -17,6 +17,7 @@ from ..query.oriented_boxes import OrientedBox
 from ..query.regions import Region
 from ..query.scan_map import Map
 from ..query.word_query import QueryResult
+from .lettering import HEADING, LEGEND, measure_text, write_text
 from .palette import HIGHLIGHTS, assign_class_colors, color_by_height, highlight_regions
 from .scene_rendering import (
     BACKGROUND,
@@ -31,7 +32,6 @@ from .scene_rendering import (
 
 SIZE = 1600, 900
 _BAR = 56  # pixels above and below the views
-_TEXT = (40, 40, 40)
 _LEGEND_ROWS = 2
 _LONGEST_NAME = 48  # characters of a word in the legend
 _MARGIN, _SWATCH, _GAP, _MORE = 16, 22, 20, 130  # pixels: left edge, box before a name, after it, room for "and N more"
@@ -153,16 +153,16 @@ def _framed(views: NDArray[np.uint8], title: str, legend: list[tuple[str, tuple[
     """Returns the views with the title above and the legend below."""
     picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
     picture[_BAR : _BAR + views.shape[0], : views.shape[1]] = views
-    _put(picture, title, (16, 36), 0.62)
-    widths = [_SWATCH + cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.52, 1)[0][0] for text, _ in legend]
+    write_text(picture, title, (16, 36), HEADING)
+    widths = [_SWATCH + measure_text(text, LEGEND) for text, _ in legend]
     places = _placed(widths)
     baselines = (SIZE[1] - 20,) if not places or places[-1][0] == 0 else (SIZE[1] - 36, SIZE[1] - 12)
     for (text, color), (row, x) in zip(legend, places, strict=False):
         y = baselines[row]
         cv2.rectangle(picture, (x, y - 14), (x + 16, y + 2), color, -1, cv2.LINE_AA)
-        _put(picture, text, (x + _SWATCH, y), 0.52)
+        write_text(picture, text, (x + _SWATCH, y), LEGEND)
     if left_out := len(legend) - len(places):
-        _put(picture, f"and {left_out} more", (SIZE[0] - _MORE, baselines[-1]), 0.52)
+        write_text(picture, f"and {left_out} more", (SIZE[0] - _MORE, baselines[-1]), LEGEND)
     return picture
 
 
@@ -178,11 +178,6 @@ def _placed(widths: list[int]) -> list[tuple[int, int]]:
         places.append((row, x))
         x += width + _GAP
     return places
-
-
-def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: float) -> None:
-    printable = text.encode("ascii", "replace").decode()
-    cv2.putText(picture, printable, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _TEXT, 1, cv2.LINE_AA)
 
 
 def _size(scan_map: Map) -> str:

@@ -15,6 +15,7 @@ from ..core.transforms import transform
 from ..query.objects.object import Object
 from ..query.scan_map import Map
 from .floor_plans import FloorPlan
+from .lettering import HEADING, LEGEND, SMALL, measure_text, write_text
 from .palette import color_by_number
 from .scene_rendering import BACKGROUND
 
@@ -22,9 +23,8 @@ SIZE = 1600, 960
 """Width and height of the picture, pixels."""
 
 _PLAN, _BAR, _MARGIN, _ROW = 1180, 56, 30, 22  # width of the plan; the heading; around the plan; lines of the list
-_TEXT = (40, 40, 40)
 _FLOOR, _WALL = 236, 170  # gray of the lowest and the highest voxels of no object
-_LABEL, _NUMBER = (255, 255, 255), 0.5  # color behind a number, and its scale
+_LABEL = (255, 255, 255)  # color behind a number
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
 _LONGEST_NAME = 22
 _AROUND = ((0, 0), (0, -1), (0, 1), (1, 0), (-1, 0), (1, -1), (-1, 1), (1, 1), (-1, -1), (0, -2), (0, 2), (2, 0))
@@ -55,7 +55,7 @@ def draw_objects(scan_map: Map, objects: Sequence[Object], shown: Sequence[int])
     _draw_plan(picture, scan_map, objects, shown, colors)
     name = Path(scan_map.manifest.capture.path).name
     count = f"{len(shown)} of {len(objects)}" if len(shown) < len(objects) else str(len(objects))
-    _put(picture, f"{name}: {count} objects from above", (16, 36), 0.62)
+    write_text(picture, f"{name}: {count} objects from above", (16, 36), HEADING)
     room = (SIZE[1] - _BAR - _MARGIN) // _ROW
     listed = shown if len(shown) <= room else shown[: room - 1]
     for line, row in enumerate(listed):
@@ -63,9 +63,9 @@ def draw_objects(scan_map: Map, objects: Sequence[Object], shown: Sequence[int])
         cv2.rectangle(picture, (_PLAN, y - 12), (_PLAN + 14, y + 2), colors[row].tolist(), -1)
         name = thing.name if len(thing.name) <= _LONGEST_NAME else thing.name[: _LONGEST_NAME - 3] + "..."
         size = " x ".join(f"{edge:.2f}" for edge in thing.box.extent)
-        _put(picture, f"{row + 1} {name}, {size}{' m' if scan_map.metric else ''}", (_PLAN + 22, y), 0.45)
+        write_text(picture, f"{row + 1} {name}, {size}{' m' if scan_map.metric else ''}", (_PLAN + 22, y), SMALL)
     if len(listed) < len(shown):
-        _put(picture, f"and {len(shown) - len(listed)} more", (_PLAN + 22, _BAR + 14 + len(listed) * _ROW), 0.45)
+        write_text(picture, f"and {len(shown) - len(listed)} more", (_PLAN + 22, _BAR + 14 + len(listed) * _ROW), SMALL)
     return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
 
 
@@ -100,16 +100,10 @@ def _draw_plan(
     taken: list[NDArray[np.float64]] = []
     for row in sorted(shown, key=lambda row: -len(objects[row].rows)):
         place = plan.pixel(objects[row].centroid[None])[0]
-        (width, height), _ = cv2.getTextSize(str(row + 1), cv2.FONT_HERSHEY_SIMPLEX, _NUMBER, 1)
-        size = np.array((width + 8, height + 8))
+        size = np.array((measure_text(str(row + 1), LEGEND) + 8, LEGEND + 6))
         free = [place + size * step for step in _AROUND]
         at = next((one for one in free if all((abs(one - other) >= size).any() for other in taken)), place)
         taken.append(at)
         low, high = np.rint(at - size / 2).astype(int), np.rint(at + size / 2).astype(int)
         cv2.rectangle(picture, low.tolist(), (high - 1).tolist(), _LABEL, -1)
-        _put(picture, str(row + 1), (int(low[0]) + 4, int(high[1]) - 5), _NUMBER)
-
-
-def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: float) -> None:
-    printable = text.encode("ascii", "replace").decode()
-    cv2.putText(picture, printable, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _TEXT, 1, cv2.LINE_AA)
+        write_text(picture, str(row + 1), (int(low[0]) + 4, int(high[1]) - 5), LEGEND)

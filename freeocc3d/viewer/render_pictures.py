@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from ..core.types import Gaussians
 from ..gaussians.rasterizers.base import Rasterizer
 from ..gaussians.rendered_views import CapturedView, measure_fidelity, render_gaussians
+from .lettering import HEADING, LEGEND, SMALL, write_text
 from .scene_rendering import BACKGROUND
 
 SHOWN = 4
 """Most views in the picture."""
 _WIDTH, _GAP, _BAR, _CAPTION = 400, 8, 56, 30
-_TEXT = (40, 40, 40)
 _COLUMNS = "photograph", "rendered", "measured depth", "rendered depth"
 
 
@@ -34,10 +34,12 @@ def write_render_picture(
     rows = [_row(gaussians, frame, view, rasterizer, metric) for frame, view in views]
     width = len(_COLUMNS) * (_WIDTH + _GAP) + _GAP
     heading = np.full((_BAR, width, 3), BACKGROUND, np.uint8)
-    _put(heading, f"{capture.name}: {len(gaussians):,} Gaussians rendered as keyframes saw them", (16, 36), 0.62)
+    write_text(
+        heading, f"{capture.name}: {len(gaussians):,} Gaussians rendered as keyframes saw them", (16, 36), HEADING
+    )
     names = np.full((_CAPTION, width, 3), BACKGROUND, np.uint8)
     for column, name in enumerate(_COLUMNS):
-        _put(names, name, (_GAP + column * (_WIDTH + _GAP), 20), 0.52)
+        write_text(names, name, (_GAP + column * (_WIDTH + _GAP), 20), LEGEND)
     picture = np.concatenate([heading, names, *rows])
     path.write_bytes(cv2.imencode(".png", picture[:, :, ::-1])[1].tobytes())
 
@@ -66,7 +68,7 @@ def _row(
     if found.depth_l1_m is not None:
         off = f"{100 * found.depth_l1_m:.1f} cm" if metric else f"{found.depth_l1_m:.3f} units"
         facts.append(f"depth off by {off}, shown from {low:.1f} to {high:.1f} {'m' if metric else 'units'}")
-    _put(row, ", ".join(facts), (_GAP, height + 20), 0.45)
+    write_text(row, ", ".join(facts), (_GAP, height + 20), SMALL)
     return row
 
 
@@ -76,8 +78,3 @@ def _colored(depth_m: NDArray[np.float32], low: float, high: float) -> NDArray[n
     picture = cv2.applyColorMap(np.rint(255 * scaled).astype(np.uint8), cv2.COLORMAP_TURBO)[:, :, ::-1].copy()
     picture[depth_m <= 0] = 0
     return picture
-
-
-def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: float) -> None:
-    printable = text.encode("ascii", "replace").decode()
-    cv2.putText(picture, printable, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _TEXT, 1, cv2.LINE_AA)

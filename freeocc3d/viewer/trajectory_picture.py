@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.types import Gaussians, Submap, Trajectory
 from ..tracking.upright.up_direction import estimate_up
+from .lettering import HEADING, LEGEND, SMALL, measure_text, write_text
 from .scene_rendering import BACKGROUND, choose_cut_height, turn_upright
 
 SIZE = 1500, 1000
@@ -18,7 +19,7 @@ SIZE = 1500, 1000
 
 _TRACKED, _FOUND, _BETWEEN = (40, 90, 200), (240, 130, 20), (150, 90, 200)
 _KEYFRAME, _HELD, _WRONG = (15, 35, 90), (0, 150, 90), (215, 40, 40)
-_TEXT, _FAINT = (40, 40, 40), (150, 150, 150)
+_RULER, _FAINT = (40, 40, 40), (150, 150, 150)
 _BAR, _LEGEND, _MARGIN = 56, 60, 40
 _ASIDE = 360  # width of the column for unconnected submaps
 _SHOWN = 3  # most of them in the picture
@@ -51,13 +52,13 @@ def write_path_picture(
         box = (width, _BAR + number * height, _ASIDE, height)
         _draw(picture, box, submap, trajectory, None, unit)
         label = f"apart: frames {submap.frames[0]}-{submap.frames[-1]}, {len(submap.keyframes)} keyframes"
-        _put(picture, label, (width + 12, box[1] + 18), 0.45)
+        write_text(picture, label, (width + 12, box[1] + 18), SMALL)
     if len(apart) > _SHOWN:
-        _put(picture, f"and {len(apart) - _SHOWN} more", (width + 12, SIZE[1] - _LEGEND - 8), 0.45)
+        write_text(picture, f"and {len(apart) - _SHOWN} more", (width + 12, SIZE[1] - _LEGEND - 8), SMALL)
     posed = int(trajectory.has_pose.sum())
     used = int((trajectory.status != "unused").sum())
     count = f"{len(submaps)} submap{'s' if len(submaps) != 1 else ''}"
-    _put(picture, f"{capture.name}: {posed} of {used} frames with a pose, {count}, from above", (16, 36), 0.62)
+    write_text(picture, f"{capture.name}: {posed} of {used} frames with a pose, {count}, from above", (16, 36), HEADING)
     _legend(picture, submaps, trajectory)
     encoded = cv2.imencode(".png", picture[:, :, ::-1])[1]
     path.write_bytes(encoded.tobytes())
@@ -111,7 +112,7 @@ def _draw(
         _line(picture, place, place + _HEADING_PX * heading, _KEYFRAME, 1)
         cv2.circle(picture, _fixed(place), 3 << 3, _KEYFRAME, -1, cv2.LINE_AA, shift=3)
     for place, text, down in ((places[0], "start", -8), (places[-1], "end", 18)):
-        _put(picture, text, (int(place[0]) + 8, int(place[1]) + down), 0.5)
+        write_text(picture, text, (int(place[0]) + 8, int(place[1]) + down), LEGEND)
     _ruler(picture, box, scale, unit)
 
 
@@ -141,8 +142,8 @@ def _ruler(picture: NDArray[np.uint8], box: tuple[int, int, int, int], scale: fl
     x0, y0, _, height = box
     meters = max((m for m in _RULERS_M if m * scale < 220), default=_RULERS_M[0])
     y, x = y0 + height - 12, x0 + 16
-    cv2.line(picture, (x, y), (x + round(meters * scale), y), _TEXT, 2, cv2.LINE_AA)
-    _put(picture, f"{meters:g} {unit.removesuffix('s') if meters == 1 else unit}", (x, y - 8), 0.5)
+    cv2.line(picture, (x, y), (x + round(meters * scale), y), _RULER, 2, cv2.LINE_AA)
+    write_text(picture, f"{meters:g} {unit.removesuffix('s') if meters == 1 else unit}", (x, y - 8), LEGEND)
 
 
 def _legend(picture: NDArray[np.uint8], submaps: Sequence[Submap], trajectory: Trajectory) -> None:
@@ -164,8 +165,8 @@ def _legend(picture: NDArray[np.uint8], submaps: Sequence[Submap], trajectory: T
     for text, color, shown in entries:
         if shown:
             cv2.rectangle(picture, (x, y - 12), (x + 14, y + 2), color, -1)
-            _put(picture, text, (x + 22, y), 0.5)
-            x += 22 + cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0] + 26
+            write_text(picture, text, (x + 22, y), LEGEND)
+            x += 22 + measure_text(text, LEGEND) + 26
 
 
 def _line(
@@ -182,8 +183,3 @@ def _fixed(place: NDArray[np.floating]) -> tuple[int, int]:
     """Returns a pixel in OpenCV's fixed-point form, with three binary digits after the point."""
     u, v = np.rint(8 * place).astype(int).tolist()
     return u, v
-
-
-def _put(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: float) -> None:
-    printable = text.encode("ascii", "replace").decode()
-    cv2.putText(picture, printable, at, cv2.FONT_HERSHEY_SIMPLEX, scale, _TEXT, 1, cv2.LINE_AA)
