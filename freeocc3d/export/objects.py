@@ -32,7 +32,7 @@ from ..query.objects.description import describe_objects
 from ..query.objects.object import Object
 from ..query.scan_map import Map
 from ..settings.typed_options import TypedOptions
-from ..viewer.palette import color_by_number
+from ..viewer.distinct_colors import distinct_colors
 from .export_frames import UprightFrame, to_frame
 from .gltf_files import Z_UP_TO_Y_UP, MeshNode, write_glb
 
@@ -83,7 +83,7 @@ def write(scan_map: Map, path: Path, options: Options) -> None:
 def _write_meshes(
     scan_map: Map, objects: Sequence[Object], path: Path, options: Options, T_frame_map: NDArray[np.float64]
 ) -> None:
-    plain = color_by_number(len(objects))
+    plain = distinct_colors(len(objects))
     described = describe_objects(objects, scan_map.relations_of(objects), T_frame_map)
     meshes = []
     for number, thing in enumerate(objects):

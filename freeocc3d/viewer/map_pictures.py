@@ -17,8 +17,9 @@ from ..query.oriented_boxes import OrientedBox
 from ..query.regions import Region
 from ..query.scan_map import Map
 from ..query.word_query import QueryResult
+from .distinct_colors import distinct_colors
 from .lettering import HEADING, LEGEND, measure_text, write_text
-from .palette import HIGHLIGHTS, assign_class_colors, color_by_height, highlight_regions
+from .palette import assign_class_colors, color_by_height, highlight_regions
 from .scene_rendering import (
     BACKGROUND,
     CUT,
@@ -75,8 +76,8 @@ def draw_query(scan_map: Map, results: Sequence[QueryResult]) -> bytes:
     colors = highlight_regions(scan_map.occupancy.colors, [result.regions for result in results])
     legend = []
     boxes: list[tuple[Region, tuple[int, int, int]]] = []
-    for number, result in enumerate(results):
-        color = tuple(HIGHLIGHTS[number % len(HIGHLIGHTS)].tolist())
+    for result, chosen in zip(results, distinct_colors(len(results)), strict=True):
+        color = tuple(chosen.tolist())
         legend.append((_found(result), color))
         boxes += [(region, color) for region in result.regions]
     return _drawn(scan_map, colors, boxes, _title(scan_map), legend)

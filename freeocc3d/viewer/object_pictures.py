@@ -14,9 +14,9 @@ from ..core.errors import ExportError
 from ..core.transforms import transform
 from ..query.objects.object import Object
 from ..query.scan_map import Map
+from .distinct_colors import distinct_colors
 from .floor_plans import FloorPlan
 from .lettering import HEADING, LEGEND, SMALL, measure_text, write_text
-from .palette import color_by_number
 from .scene_rendering import BACKGROUND
 
 SIZE = 1600, 960
@@ -51,7 +51,7 @@ def draw_objects(scan_map: Map, objects: Sequence[Object], shown: Sequence[int])
     if not len(scan_map.occupancy.colors):
         raise ExportError(f"The map {scan_map.path} has no occupied voxels to draw.")
     picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
-    colors = color_by_number(len(objects))
+    colors = distinct_colors(len(objects))
     _draw_plan(picture, scan_map, objects, shown, colors)
     name = Path(scan_map.manifest.capture.path).name
     count = f"{len(shown)} of {len(objects)}" if len(shown) < len(objects) else str(len(objects))

@@ -10,8 +10,8 @@ from .. import __version__
 from ..query.objects.object import Object
 from ..query.objects.relations import Relation
 from ..query.scan_map import Map
+from .distinct_colors import distinct_colors
 from .object_pictures import draw_objects
-from .palette import color_by_number
 from .self_contained_pages import crop_view, embed_image, fill_template, write_page
 
 MOST_IMAGES = 300
@@ -38,7 +38,7 @@ def write_objects_page(
 def _page(
     scan_map: Map, objects: Sequence[Object], relations: Sequence[Sequence[Relation]], shown: Sequence[int]
 ) -> str:
-    colors = color_by_number(len(objects)).tolist()
+    colors = distinct_colors(len(objects)).tolist()
     images = _images(scan_map, objects, shown, colors)
     cards: list[dict[str, Any]] = [
         {

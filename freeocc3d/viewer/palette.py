@@ -9,11 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.types import Occupancy
 from ..query.regions import Region
-
-HIGHLIGHTS = np.array(
-    [(255, 64, 32), (20, 120, 255), (30, 190, 70), (240, 60, 200), (255, 170, 0), (0, 190, 200)], np.uint8
-)
-"""Strong colors for the words of a query, in turn."""
+from .distinct_colors import distinct_colors, every_color, measure_distances, pale_colors
 
 _KNOWN = {
     "wall": (200, 205, 210), "floor": (150, 125, 100), "ceiling": (225, 225, 215), "window": (150, 200, 235),
@@ -24,30 +20,38 @@ _KNOWN = {
 }  # fmt: skip
 
 
+_UNKNOWN = (90, 90, 90)
+_APART = 0.03
+"""Least distance of the colors of two classes, as ``distinct_colors.measure_distances`` has it, while there is room."""
+
+
 def assign_class_colors(names: list[str]) -> NDArray[np.uint8]:
-    """Returns (C + 1, 3) RGB: row 0 for "nothing known", row k for names[k - 1]. A name always has the same color."""
-    rows = [(90, 90, 90), *(_KNOWN.get(name) or _hashed(name) for name in names)]
-    return np.array(rows, np.uint8)
+    """Returns (C + 1, 3) RGB: row 0 for "nothing known", row k for names[k - 1]. A name always has the same color,
+    unless an earlier one of the names has one that looks alike: then it has the nearest color that does not."""
+    fixed = {name: _KNOWN[name] for name in names if name in _KNOWN}
+    taken = np.array([_UNKNOWN, *fixed.values()], np.uint8)
+    every = every_color()
+    room = measure_distances(every, taken).min(axis=1)
+    for name in dict.fromkeys(names):
+        if name in fixed:
+            continue
+        color = np.array([_hashed(name)], np.uint8)
+        if measure_distances(color, taken).min() < _APART:
+            apart = every[room >= _APART] if room.max() >= _APART else every[[np.argmax(room)]]
+            color = apart[[np.argmin(measure_distances(color, apart))]]
+        fixed[name] = tuple(color[0].tolist())
+        taken = np.concatenate((taken, color))
+        room = np.minimum(room, measure_distances(every, color)[:, 0])
+    return np.array([_UNKNOWN, *(fixed[name] for name in names)], np.uint8)
 
 
 def highlight_regions(colors: NDArray[np.uint8], words: list[list[Region]]) -> NDArray[np.uint8]:
-    """Returns (V, 3) voxel colors: regions in their word's strong color, everything else pale and gray."""
-    gray = colors.astype(np.float32).mean(axis=1, keepdims=True)
-    pale = 0.25 * colors + 0.35 * gray + 0.4 * 215.0
-    out = np.clip(pale, 0, 255).astype(np.uint8)
-    for number, regions in enumerate(words):
+    """Returns (V, 3) voxel colors: regions in their word's color of ``distinct_colors``, everything else pale."""
+    out = pale_colors(colors)
+    for color, regions in zip(distinct_colors(len(words)), words, strict=True):
         for region in regions:
-            out[region.rows] = HIGHLIGHTS[number % len(HIGHLIGHTS)]
+            out[region.rows] = color
     return out
-
-
-def color_by_number(count: int) -> NDArray[np.uint8]:
-    """Returns (count, 3) RGB: one color for each number from 0. Neighbors differ: hues turn by the golden ratio, which
-    divides the circle most evenly, whatever the count, and every other color is darker."""
-    number = np.arange(count)
-    hue = 6 * (number * (5**0.5 - 1) / 2 % 1)
-    ramp = np.clip(np.abs((hue[:, None] + (3.0, 5.0, 1.0)) % 6 - 3) - 1, 0, 1)  # of red, green and blue
-    return np.asarray(np.where(number % 2, 175, 235)[:, None] * (0.25 + 0.75 * ramp), np.float64).astype(np.uint8)
 
 
 def color_by_height(occupancy: Occupancy, up: NDArray[np.float64]) -> NDArray[np.uint8]:

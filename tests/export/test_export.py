@@ -10,7 +10,7 @@ from scenes import occupancy_of
 from freeocc3d.core.errors import ConfigError, ExportError
 from freeocc3d.export import export_map, npz, ply
 from freeocc3d.query.regions import Region
-from freeocc3d.viewer.palette import HIGHLIGHTS
+from freeocc3d.viewer.distinct_colors import distinct_colors
 
 OCCUPIED = [(-9, 2, 0), (-8, 2, 0), (5, -3, 7), (6, 7, 8), (6, 7, 9)]
 FREE = [(-9, 3, 0), (0, 0, 0), (6, 7, 10)]
@@ -118,7 +118,7 @@ def test_a_querys_matches_stand_out(tmp_path) -> None:
     result = SimpleNamespace(regions=[region])
     ply.write_query_ply(occupancy, [result], tmp_path / "q.ply")
     mesh = o3d.io.read_triangle_mesh(str(tmp_path / "q.ply"))
-    strong = (np.rint(255 * np.asarray(mesh.vertex_colors)) == HIGHLIGHTS[0]).all(axis=1)
+    strong = (np.rint(255 * np.asarray(mesh.vertex_colors)) == distinct_colors(1)[0]).all(axis=1)
     assert strong.sum() == 24
     center = occupancy.centers(occupancy.occupied_voxels())[2]
     assert np.abs(np.asarray(mesh.vertices)[strong] - center).max() < 0.051

@@ -13,7 +13,8 @@ from freeocc3d.core.types import Trajectory
 from freeocc3d.query.oriented_boxes import oriented_boxes
 from freeocc3d.query.regions import Region
 from freeocc3d.viewer import map_pictures
-from freeocc3d.viewer.palette import HIGHLIGHTS, assign_class_colors
+from freeocc3d.viewer.distinct_colors import distinct_colors
+from freeocc3d.viewer.palette import assign_class_colors
 from freeocc3d.viewer.scene_rendering import choose_cut_height, turn_lengthwise
 
 
@@ -82,7 +83,7 @@ def test_a_match_is_in_the_view_however_far_off(tmp_path) -> None:
     result = SimpleNamespace(word="far", regions=[region])
     map_pictures.write_query_picture(room, [result], tmp_path / "far.png")
     view = cv2.imread(str(tmp_path / "far.png"))[56:-56, :800, ::-1].astype(int)
-    assert (np.abs(view - HIGHLIGHTS[0]).max(axis=-1) < 40).any()
+    assert (np.abs(view - distinct_colors(1)[0]).max(axis=-1) < 40).any()
 
 
 def test_by_class_and_height(tmp_path) -> None:
@@ -105,8 +106,8 @@ def test_a_query_picture_shows_matches_strongly_and_nothing_else(tmp_path) -> No
     map_pictures.write_query_picture(room, [found], tmp_path / "found.png")
     map_pictures.write_query_picture(room, [nothing], tmp_path / "nothing.png")
     legend = 16 * 17
-    assert shown(tmp_path / "found.png", HIGHLIGHTS[0], 40) > legend + 500
-    assert shown(tmp_path / "nothing.png", HIGHLIGHTS[0], 40) <= 1.2 * legend
+    assert shown(tmp_path / "found.png", distinct_colors(1)[0], 40) > legend + 500
+    assert shown(tmp_path / "nothing.png", distinct_colors(1)[0], 40) <= 1.2 * legend
 
 
 def test_an_empty_map_and_an_unwritable_place_are_reported(tmp_path) -> None:
@@ -133,7 +134,7 @@ def test_a_match_above_the_cut_is_drawn(tmp_path, monkeypatch) -> None:
         region = Region(0.7, 0.9, np.zeros(3), np.zeros(3), np.zeros(3), 0.04, rows)
         found = SimpleNamespace(word="lamp", regions=[region])
         map_pictures.write_query_picture(room, [found], tmp_path / "lamp.png", overwrite=True)
-        return shown(tmp_path / "lamp.png", HIGHLIGHTS[0], 40) - 16 * 17
+        return shown(tmp_path / "lamp.png", distinct_colors(1)[0], 40) - 16 * 17
 
     assert strong(above) > 2000
     few = np.flatnonzero(below)[:41]

@@ -14,8 +14,8 @@ from test_answer_page import Strict, decoded
 from freeocc3d.core.errors import ExportError
 from freeocc3d.query.scan_map import Map
 from freeocc3d.viewer import objects_page
+from freeocc3d.viewer.distinct_colors import distinct_colors
 from freeocc3d.viewer.object_pictures import draw_objects
-from freeocc3d.viewer.palette import color_by_number
 
 
 @pytest.fixture(scope="module")
@@ -61,18 +61,11 @@ def test_the_plan_shows_each_object_in_its_color_at_its_place(room: Map) -> None
     changed = np.argwhere((without[plan] != drawn[plan]).any(axis=2))
     assert len(changed)
     hue = drawn[plan][tuple(changed.T)].astype(float).mean(axis=0) - 128
-    expected = color_by_number(len(objects))[low].astype(float) - 128
+    expected = distinct_colors(len(objects))[low].astype(float) - 128
     assert np.corrcoef(hue, expected)[0, 1] > 0.8
     across, along = np.ptp(changed, axis=0)
     extent = objects[low].box.extent
     assert max(across, along) / max(min(across, along), 1) == pytest.approx(extent[0] / extent[1], rel=0.35)
-
-
-def test_many_colors_differ() -> None:
-    colors = color_by_number(60).astype(int)
-    apart = np.abs(colors[:, None] - colors[None]).sum(axis=2) + 999 * np.eye(60, dtype=int)
-    assert apart.min() > 5
-    assert np.abs(np.diff(colors, axis=0)).sum(axis=1).min() > 150
 
 
 def test_an_empty_map_is_not_drawn(room: Map, monkeypatch) -> None:
