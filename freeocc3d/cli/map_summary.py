@@ -67,6 +67,7 @@ def summary_document(loaded: Map) -> dict[str, Any]:
             for name in dict.fromkeys(file.split("/")[0] for file in manifest.files)
         },
         "seconds": report["seconds"],
+        "relabeled": report.get("relabeled"),
         "peak_memory_bytes": report["peak_memory_bytes"],
         "check": report.get("check"),
         "warnings": report["warnings"],
@@ -76,7 +77,6 @@ def summary_document(loaded: Map) -> dict[str, Any]:
 def summary_lines(loaded: Map) -> list[str]:
     """What ``info`` prints for people."""
     said = summary_document(loaded)
-    seconds = ", ".join(f"{name} {value:.1f}" for name, value in said["seconds"].items())
     lines = [
         f"map        {said['map']}  ({sum(said['bytes'].values()) / 1e6:.1f} MB)",
         f"capture    {said['capture']['path']}  ({said['capture']['format']})",
@@ -88,7 +88,8 @@ def summary_lines(loaded: Map) -> list[str]:
         *([] if said["scale"]["by"] == "sensor" else [_scale_text(said["scale"])]),
         f"encoder    {said['encoder']}, which knows {said['encoder_knows']}",
         *([_vocabulary_text(said["vocabulary"])] if said["vocabulary"] else []),
-        f"time       {sum(said['seconds'].values()):.1f} s: {seconds}",
+        f"time       {_seconds_text(said['seconds'])}",
+        *([_relabeled_text(said["relabeled"])] if said["relabeled"] else []),
         f"memory     {said['peak_memory_bytes'] / 1e9:.2f} GB at peak",
         *([_check_text(said["check"], said["metric"])] if said["check"] else []),
     ]
@@ -111,6 +112,15 @@ def _refined_text(refined: dict[str, Any]) -> str:
     return (
         f"refined    {'a box of ' if 'box' in refined else 'from '}{refined['map']}, which has these frames and times"
     )
+
+
+def _seconds_text(seconds: dict[str, float]) -> str:
+    stages = ", ".join(f"{name} {value:.1f}" for name, value in seconds.items())
+    return f"{sum(seconds.values()):.1f} s: {stages}"
+
+
+def _relabeled_text(relabeled: dict[str, Any]) -> str:
+    return f"relabeled  from {relabeled['map']} in {_seconds_text(relabeled['seconds'])}; the other times are its own"
 
 
 def _voxels_text(said: dict[str, Any]) -> str:

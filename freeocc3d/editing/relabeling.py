@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -43,21 +45,33 @@ def relabel_map(
     encoder: Encoder = settings.load_backend("language", None)
     with WorkFolder.made_of(scan_map.path, Path(output), overwrite) as work:
         gaussians, T = scan_map.gaussians, scan_map.trajectory.T_world_keyframe
-        features = lifting.lift_features(gaussians, scan_map.keyframes, T, encoder, settings.language, progress)
+        with work.timed("language"):
+            features = lifting.lift_features(gaussians, scan_map.keyframes, T, encoder, settings.language, progress)
         progress.stage("occupancy")
         splatting = settings.occupancy.changed(voxel_size=occupancy.voxel_size)
         cell = settings.gaussians.cell_size or 0.5 * settings.occupancy.voxel_size
         scale = anchors.compute_least_scale(settings.gaussians, cell, occupancy.voxel_size)
-        voxels = build.compute_features(occupancy, gaussians, features, splatting, scale)
+        with work.timed("occupancy"):
+            voxels = build.compute_features(occupancy, gaussians, features, splatting, scale)
         progress.stage("saving")
         relabeled = dataclasses.replace(occupancy, features=voxels)
+        with work.timed("words"):
+            record = record_encoder(encoder, relabeled)
         parts = MapParts(
-            msgspec.structs.replace(scan_map.manifest, encoder=record_encoder(encoder, relabeled)),
+            msgspec.structs.replace(scan_map.manifest, encoder=record),
             settings,
-            lambda: scan_map.report,
+            lambda: _report(scan_map, work.seconds),
             relabeled,
             Codec.fit(features),
             features,
         )
         write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)
+
+
+def _report(scan_map: Map, seconds: Mapping[str, float]) -> dict[str, Any]:
+    """The report of the run that made the map, but for the time of the features that are gone, with the time that the
+    new ones took."""
+    kept = {stage: value for stage, value in scan_map.report["seconds"].items() if stage != "language"}
+    own = {stage: round(value, 3) for stage, value in seconds.items()}
+    return {**scan_map.report, "seconds": kept, "relabeled": {"map": str(scan_map.path), "seconds": own}}

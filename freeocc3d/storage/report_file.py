@@ -56,6 +56,11 @@ class _Check(msgspec.Struct):
     measures: dict[str, _Measure]
 
 
+class _Relabeled(msgspec.Struct):
+    map: str
+    seconds: dict[str, float]
+
+
 class _Report(msgspec.Struct):
     seconds: dict[str, float]
     peak_memory_bytes: _Count
@@ -66,6 +71,7 @@ class _Report(msgspec.Struct):
     submaps: list[_Submap] = []
     rendering: _Rendering | None = None
     check: _Check | None = None
+    relabeled: _Relabeled | None = None
 
 
 def read_report(path: Path) -> dict[str, Any]:
@@ -90,6 +96,7 @@ def _problem(report: _Report) -> str:
         ("frame_log.timestamp", log.timestamp),
         ("frame_log.confidence", log.confidence),
         ("seconds", list(report.seconds.values())),
+        ("relabeled", list(report.relabeled.seconds.values()) if report.relabeled else []),
         ("color_focal", [report.color_focal]),
         ("rendering", msgspec.structs.astuple(report.rendering or _Rendering())),
         ("check", [measure.value for measure in (report.check.measures if report.check else {}).values()]),

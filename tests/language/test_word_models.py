@@ -121,6 +121,20 @@ def test_a_map_gets_words_later(room: Map, hub: Hub, tmp_path: Path) -> None:
     assert "exists: choose another folder" in refused("relabel", room.path, "-o", tmp_path / "map")
 
 
+def test_a_relabeled_map_tells_its_own_times(room: Map, hub: Hub, tmp_path: Path) -> None:
+    """And the stages of the run that its first map had, but for the features that it has no longer."""
+    said = run("relabel", room.path, "-o", tmp_path / "map", "--words", "clip-b16").stdout
+    assert f"relabeled  from {room.path} in " in said
+    document = json.loads(run("info", tmp_path / "map", "--json").stdout)
+    before = json.loads(run("info", room.path, "--json").stdout)
+    assert before["relabeled"] is None
+    assert document["seconds"] == {name: s for name, s in before["seconds"].items() if name != "language"}
+    assert "language" in before["seconds"]
+    assert document["relabeled"]["map"] == str(room.path)
+    assert set(document["relabeled"]["seconds"]) == {"language", "occupancy", "words", "saving"}
+    assert all(seconds >= 0 for seconds in document["relabeled"]["seconds"].values())
+
+
 def test_voxels_get_the_features_that_a_run_gives_them(room: Map) -> None:
     settings, occupancy = relabeling.read_settings(room), room.occupancy
     edge = settings.occupancy.voxel_size
