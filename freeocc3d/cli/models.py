@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
-from ..core.errors import FreeOccError, ModelError
-from .console import ConsoleProgress, Json, show, show_document
+from ..core.errors import FreeOccError, ModelError, printable
+from .console import ConsoleProgress, Json, flag, show, show_document
 from .option_groups import grouped
 
 Precision = Literal["fp32", "fp16", "int8"]
 
-app = typer.Typer(help="Fetch, export, list and verify the networks that encoders use.", no_args_is_help=True)
+app = typer.Typer(help="Fetch, export, list, verify and remove the networks that encoders use.", no_args_is_help=True)
 
 
 @app.command("pull")
@@ -210,3 +211,29 @@ def models_verify(
             show(f"{folder}: {len(package.files)} files match their hashes")
     if damaged:
         raise ModelError(" ".join(damaged))
+
+
+@app.command("remove")
+def models_remove(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a model: see 'freeocc3d models list'.")],
+    yes: Annotated[bool, flag("--yes", "Do not ask.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Remove a model from the models folder: its package, its checkpoint, and what is fetched of them.
+
+    A map with its words needs the model again to be asked.
+    """
+    from ..language import model_removal
+
+    found = model_removal.find_removable(name)
+    what = f"{', '.join(map(str, found.folders))} ({found.bytes / 1e6:.1f} MB)"
+    if not yes:
+        if not (sys.stdin.isatty() and sys.stderr.isatty()):
+            raise ModelError(f"This removes {what}: add --yes if it shall.")
+        if not typer.confirm(f"Remove {printable(what)}?", default=False, err=True):
+            raise ModelError(f"The model '{name}' is kept.")
+    model_removal.remove(found)
+    if as_json:
+        show_document({"removed": [str(folder) for folder in found.folders], "bytes": found.bytes})
+    else:
+        show(f"removed {what}")
