@@ -92,8 +92,7 @@ class Package:
     parts: part ("image", "text", "tokenizer"…) -> file name.  files: file name -> sha256.  dimension: D of features.
     mean, std: (3,) of RGB in 0…1.  patch: edge of a patch in pixels.  input_size: edge of the training images in
     pixels.  prefix_tokens: number of tokens before those of the patches.  logit_scale: factor of the cosines in
-    training, one over the softmax temperature.  logit_bias: what training by a sigmoid adds to the scaled cosines;
-    None = trained by a softmax.
+    training, one over the softmax temperature.
     """
 
     folder: Path
@@ -109,7 +108,6 @@ class Package:
     input_size: int
     prefix_tokens: int
     logit_scale: float
-    logit_bias: float | None
     parts: Mapping[str, str]
     files: Mapping[str, str]
 
@@ -276,7 +274,6 @@ class _Manifest(msgspec.Struct):
     files: dict[str, str]
     prefix_tokens: Annotated[int, Meta(ge=0, le=1024)] = 0
     logit_scale: Annotated[float, Meta(ge=1e-3, le=1e6)] = 100.0
-    logit_bias: Annotated[float, Meta(ge=-1e6, le=1e6)] | None = None
 
 
 def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:
@@ -286,10 +283,10 @@ def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:
     try:
         said = as_type(manifest, _Manifest)
         _check_parts(said)
-        numbers = *said.mean, *said.std, said.logit_scale, said.logit_bias or 0.0
+        numbers = *said.mean, *said.std, said.logit_scale
         if not all(map(math.isfinite, numbers)):
             raise InvalidDocument("its numbers must be finite")
-        if min(said.std) < _LEAST_STD or max(map(abs, numbers[:-2])) > _MOST_LEVEL:
+        if min(said.std) < _LEAST_STD or max(map(abs, numbers[:-1])) > _MOST_LEVEL:
             raise InvalidDocument(
                 f"'mean' and 'std' must be at most {_MOST_LEVEL:g}, and 'std' at least {_LEAST_STD:g}"
             )

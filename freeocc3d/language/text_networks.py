@@ -67,7 +67,6 @@ class Wording:
             "text_sha256": package.text_sha256,
             "dimension": package.dimension,
             "temperature": 1.0 / package.logit_scale,
-            "bias": package.logit_bias,
             "templates": list(self.templates),
             "contrast": list(self.contrast),
             "threshold": self.threshold,
@@ -85,7 +84,6 @@ class _State(msgspec.Struct):
     model: str
     folder: str
     text_sha256: str
-    bias: Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)] | None = None
 
 
 class ModelWords(TextEncoder):
@@ -100,7 +98,6 @@ class ModelWords(TextEncoder):
         except InvalidDocument as error:
             raise MapError(f"The map's encoder is damaged: its state has no usable value: {error}.") from error
         self.threshold, self.temperature, self._dimension = kept.threshold, kept.temperature, kept.dimension
-        self.bias = kept.bias
         self._templates, self._contrast = kept.templates, kept.contrast
         self._model, self._folder, self._sha256 = kept.model, kept.folder, kept.text_sha256
         key = hashlib.sha256("\n".join((self._sha256, *self._templates)).encode()).hexdigest()[:32]

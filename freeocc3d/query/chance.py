@@ -14,6 +14,9 @@ m of random words' features r, and the mean c of the map's features:
  3. The word is there if a region's evidence is higher than that of almost all random words' best regions in this map:
     higher than their mean plus 1.96 standard deviations.
 
+What training by a sigmoid adds to each scaled cosine (SigLIP's logit_bias) is the same for all words: it cancels in
+every step.
+
 Sources: the gap between images and words: V. W. Liang et al., Mind the Gap, NeurIPS 2022. Scores relative to those of
 other queries: S. V. Bogolin et al., Cross Modal Retrieval with Querybank Normalisation, CVPR 2022.
 """

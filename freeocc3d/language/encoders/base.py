@@ -50,8 +50,6 @@ class TextEncoder(ABC):
     None = what random words reach in the map decides (``query.chance``), for an encoder of any words."""
     temperature: float
     """Softmax temperature that turns scores into a confidence relative to the contrast words."""
-    bias: float | None = None
-    """What training added to cosine / temperature before a sigmoid; None = training compared words by a softmax."""
     same_word: float = 0.9
     """A contrast word does not compete if its text feature has at least this cosine to that of the query word: it means
     the same, or a part of it."""

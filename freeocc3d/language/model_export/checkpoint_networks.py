@@ -74,10 +74,7 @@ def build_siglip(
     return Checkpoint(
         "clip",
         {**_image_networks(model, graphs.SiglipHead(model)), "text": words},
-        {
-            **_facts(vision.hidden_size, mean, std, vision, 0, math.exp(model.logit_scale.item())),
-            "logit_bias": round(model.logit_bias.item(), 4),
-        },
+        _facts(vision.hidden_size, mean, std, vision, 0, math.exp(model.logit_scale.item())),
         siglip_tokenizer(tokenizer, text.max_position_embeddings, pad, without_punctuation=not keeps),
     )  # fmt: skip
 

@@ -34,9 +34,8 @@ _STATISTICS = {
 }
 _FIRST_VOCABULARY = 32_000
 """Tokens of SigLIP; SigLIP 2 has more."""
-_SIGMOIDS = {"siglip": (117.3308, -12.9324), "siglip2": (112.6689, -16.7717)}
-_SOFTMAX = 100.0, None
-"""exp(logit_scale) and logit_bias in the weights of the published models of B/16 at 224 pixels; others of a family
+_SCALES = {"clip": 100.0, "siglip": 117.3308, "siglip2": 112.6689}
+"""exp(logit_scale) in the weights of the published models of B/16 at 224 pixels; others of a family
 differ by some percent. Graphs of single towers do not hold them, and config.json states what training began with.
 CLIP's training bounds the scale by 100, which all published models reach."""
 
@@ -114,11 +113,10 @@ def package_of_export(
     else:
         mean, std = [0.0] * 3, [1.0] * 3
     second = family == "siglip" and (config.text_config.vocab_size or _FIRST_VOCABULARY) > _FIRST_VOCABULARY
-    scale, bias = _SIGMOIDS["siglip2" if second else "siglip"] if family == "siglip" else _SOFTMAX
     manifest = {
         "name": target.name, "kind": kind, **facts, "input_size": side, "precision": precision,
         "mean": mean, "std": std,
-        "logit_scale": scale, "logit_bias": bias, "licence": stated_licence(folder), "source": source,
+        "logit_scale": _SCALES["siglip2" if second else family], "licence": stated_licence(folder), "source": source,
     }  # fmt: skip
     tokenizer = _tokenizer(folder, family, longest, fixed, second, config.text_config.pad_token_id)
     networks = {part: functools.partial(_save, network) for part, network in {**vision, "text": text}.items()}
