@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import re
 
+from .encoders import color
 from .purposes import find_purpose, find_uses
 from .synonyms import INCLUDES, find_narrower, find_synonyms, find_whole, find_wider, make_key, normalize_phrase
 from .typing_mistakes import correct_words
@@ -20,11 +21,11 @@ _PARTICIPLES = {
     "around", "opposite", "across", "upon", "where", "who", "is", "are", "has",
 }  # fmt: skip
 _AMOUNTS = re.compile(
-    r"^(?:.*\s)?(?:pair|pile|stack|set|row|bunch|group|lot|number|couple|piece|kind|type|sort|heap|collection)s?\s+of\s+",
+    r"^(?:.*\s)?(?:pair|pile|stack|set|row|bunch|group|lot|number|couple|piece|kind|type|sort|heap|collection|sheet|roll|bundle)s?\s+of\s+",
     re.I,
 )
-_COMPLEMENTS = {"of", "in", "for", "from"}
-"""Prepositions whose nouns say which thing is meant: "cupboards in the kitchen"."""
+_COMPLEMENTS = {"of", "in", "for", "from", "where"}
+"""Prepositions whose nouns say which thing is meant: "cupboards in the kitchen", "the table where we eat"."""
 _EMPTY = {"unit", "set", "system", "device", "machine", "item", "piece", "area"}
 """Last words of phrases that say nothing of the thing: "sofa set", "air conditioning unit"."""
 _HOLDERS = {
@@ -32,6 +33,23 @@ _HOLDERS = {
     "table",
 }  # fmt: skip
 """Furniture that is called by what it holds: a "spice rack" may be called a spice box, and is no shoe rack."""
+_NAMED_BY_CONTENT = {"rack", "box", "case", "holder", "stand", "bench"}
+"""Of these, the ones that are a thing of another kind with another word before them, whatever it is, unless it says how
+the thing looks: a wine rack is no shoe rack, a park bench no exercise bench, and a box of pills no spice box."""
+_LOOKS = {
+    "big", "small", "large", "little", "tiny", "huge", "tall", "high", "low", "long", "short", "wide", "narrow",
+    "thin", "thick", "flat", "round", "square", "rectangular", "oval", "old", "new", "modern", "antique",
+    "vintage", "dirty", "clean", "empty", "full", "open", "closed", "broken", "nice", "beautiful", "ugly",
+    "heavy", "light", "dark", "bright", "pale", "soft", "hard", "wood", "wooden", "metal", "metallic", "steel",
+    "iron", "plastic", "glass", "leather", "fabric", "cloth", "wicker", "bamboo", "oak", "pine", "marble",
+    "stone", "paper", "cardboard", "wire", "painted", "shiny", "patterned", "striped", "corner", "left", "right",
+    "middle", "first", "second", "third", "last", "top", "bottom", "upper", "lower", "other", "only", "single",
+    "double", "folding", "foldable", "portable", "adjustable", "freestanding", "storage", "wall", "floor",
+    "mounted", "standing", "hanging", "nearest", "closest", "largest", "smallest", "biggest", "highest", "lowest",
+    "tallest", "furniture", "home", "house", "room", "indoor", "kitchen", "bedroom", "hall", "hallway", "i", "we",
+    "you", "can", "it",
+}  # fmt: skip
+"""Words that say what a thing looks like or where it is, and not what kind of thing it is."""
 _LONGEST_PHRASE = 16
 _OTHER_THINGS = {
     "traffic light", "stop light", "water table", "multiplication table", "truck bed", "flower bed", "river bed",
@@ -39,6 +57,17 @@ _OTHER_THINGS = {
     "operating table", "bus stop", "hot dog", "chair lift", "phone box", "letter box", "post box", "juke box",
     "street lamp", "street light", "tail light", "head light", "ear phone", "sea floor", "ocean floor",
     "computer game", "board game", "picture book", "shopping cart", "police man", "snow man",
+    "periodic table", "time table", "truth table", "league table", "look up table", "price table",
+    "geiger counter", "step counter", "word counter", "bean counter", "sleeping bag", "tea bag",
+    "air bag", "punching bag", "wheel chair", "electric chair", "pin board", "brake light", "flash light",
+    "search light", "day light", "sun light", "moon light", "sky light", "traffic mirror", "wing mirror", "tool bar",
+    "browser window", "shop window", "car window", "car door", "trap door", "oven door", "fridge door", "space bar",
+    "fire wall", "sea wall", "city wall", "dance floor", "shop floor", "family tree", "bed rock", "oyster bed",
+    "nail bed", "lily pad", "launch pad", "prayer book", "check book", "face book", "pill box", "match box", "sand box",
+    "music box", "tool box", "juice box", "fuse box", "gear box", "black box", "drop box", "x box", "ballot box",
+    "bread box", "piggy bank", "world cup", "egg cup", "suction cup", "eye glass", "fish tank",
+    "towel dispenser", "soap dispenser", "paper plane", "sand paper", "wall paper",
+    "toilet brush", "heat sink", "motion picture",
 }  # fmt: skip
 """Words whose last part is the name of a thing that they are not a kind of."""
 
@@ -65,15 +94,16 @@ def match_exactly(phrase: str, names: list[str]) -> tuple[list[int], str]:
             return sorted({row for rows in found for row in rows}), normalize_phrase(phrase)
     parts = split_phrase(phrase)
     if any(make_key(other) == make_key(part) for part in parts for other in _OTHER_THINGS):
-        return known.named(frozenset((parts[0],))), parts[0]
+        rows = known.named(frozenset((parts[0],)))
+        return rows, parts[0] if rows else ""
     head, complement = _head_and_complement(phrase)
     for part in parts:
         said = [*head[: len(head) - len(part.split())], *complement]
         rows = known.find(part)
         if said and part in _HOLDERS and part == head[-1]:
-            if held := known.find_holders(said):
+            if held := known.find_holders(part, said):
                 return held, normalize_phrase(phrase)
-            rows = known.without_holders_of_others(rows, said)
+            rows = known.without_holders_of_others(rows, part, said)
         if rows:
             narrowed = known.narrow(rows, said)
             return narrowed, part if narrowed == rows else normalize_phrase(phrase)
@@ -101,18 +131,28 @@ class _Names:
         rows if there are none."""
         if len(rows) < 2 or not said:
             return rows
-        keys, used = _keys_of(said), self.named(frozenset(thing for word in said for thing in find_uses(word)))
+        keys, used = _keys_of(said), self._used(said)
         return [row for row in rows if row in used or keys & self._words[row]] or rows
 
-    def find_holders(self, said: list[str]) -> list[int]:
+    def _used(self, said: list[str]) -> list[int]:
+        """Rows of the things that are used for one of the words."""
+        return self.named(frozenset(thing for word in said for thing in find_uses(word)))
+
+    def find_holders(self, part: str, said: list[str]) -> list[int]:
         """Rows of furniture that is named after what a phrase says, or that is used to store it."""
         keys, same = _keys_of(said), {same for word in said for same in find_synonyms(word)}
         rows = [row for row in range(len(self._keys)) if self._holds(row) and keys & self._words[row]]
         stored = [thing for word in same for thing in find_uses(word) if thing in INCLUDES["storage"]]
-        return rows or self.named(frozenset(stored))
+        return rows or ([] if part in _NAMED_BY_CONTENT else self.named(frozenset(stored)))
 
-    def without_holders_of_others(self, rows: list[int], said: list[str]) -> list[int]:
-        """Rows that are not named after another thing than a phrase says: no shoe rack for a "towel rack"."""
+    def without_holders_of_others(self, rows: list[int], part: str, said: list[str]) -> list[int]:
+        """Rows that are not named after another thing than a phrase with this part says: no shoe rack for a "towel
+        rack"."""
+        if part in _NAMED_BY_CONTENT and any(map(_is_kind, said)):
+            used, same = self._used(said), {make_key(word) for word in find_synonyms(part)}
+            same_kind = [row for row in rows if self._keys[row] in same or self._named[row][-1] == part]
+            plain = [row for row in same_kind if not any(map(_is_kind, self._named[row][:-1]))]
+            rows = [row for row in rows if row in used or row in plain]
         if not any(_is_thing(word) for word in said):
             return rows
         return [row for row in rows if not (self._holds(row) and any(map(_is_thing, self._named[row][:-1])))]
@@ -163,6 +203,11 @@ def _ends_head(token: str) -> bool:
 def _keys_of(words: list[str]) -> frozenset[str]:
     """Keys of words and their synonyms."""
     return frozenset(make_key(same) for word in words for same in find_synonyms(word))
+
+
+def _is_kind(word: str) -> bool:
+    """Whether a word may say what kind of thing another is: it says neither how things look nor their color."""
+    return word not in _LOOKS and not color.parse_colors(word)
 
 
 @functools.lru_cache(maxsize=4096)

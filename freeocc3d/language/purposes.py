@@ -18,6 +18,10 @@ _ASKS = re.compile(
     re.IGNORECASE,
 )
 _LEAST_STEM = 3
+_PAST = {
+    "kept": "keep", "hung": "hang", "thrown": "throw", "threw": "throw", "slept": "sleep", "sat": "sit", "eaten": "eat",
+    "drunk": "drink", "written": "write", "worn": "wear", "hidden": "hide",
+}  # fmt: skip
 
 PURPOSES: dict[tuple[str, ...], tuple[str, ...]] = {
     ("sit", "sit down", "seat", "rest leg"): ("chair", "sofa", "armchair", "stool", "bench"),
@@ -31,7 +35,8 @@ PURPOSES: dict[tuple[str, ...], tuple[str, ...]] = {
     ("read",): ("book",),
     ("write", "draw", "note"): ("whiteboard", "desk"),
     ("work", "study", "homework", "write letter"): ("desk",),
-    ("throw", "throw away", "trash", "garbage", "rubbish", "waste", "litter", "dispose", "recycle"): ("trash can",),
+    ("throw", "throw away", "trash", "garbage", "rubbish", "waste", "litter", "dispose", "recycle",
+     "drop", "discard", "toss", "chuck", "get rid", "bin"): ("trash can",),
     ("clothes", "clothing", "shirt", "dress", "put clothes", "keep clothes", "store clothes"): (
         "wardrobe", "chest of drawers",
     ),
@@ -45,7 +50,8 @@ PURPOSES: dict[tuple[str, ...], tuple[str, ...]] = {
     ("warm", "warm room", "heat", "heat room", "warm up", "keep warm"): ("heater", "fireplace"),
     ("tell time", "time"): ("clock",),
     ("film", "movie", "watch", "show", "watch film", "watch tv"): ("television",),
-    ("look myself", "see myself", "reflection", "shave", "makeup", "look face"): ("mirror",),
+    ("look myself", "see myself", "reflection", "shave", "makeup", "look face", "check hair", "fix hair", "comb hair",
+     "check outfit", "see face"): ("mirror",),
     ("dry", "dry hand", "dry off", "dry myself", "dry hair"): ("towel",),
     ("charge", "plug", "electricity", "charge phone", "plug in"): ("power outlet",),
     ("fire", "extinguish", "put out fire", "put out"): ("fire extinguisher",),
@@ -92,7 +98,7 @@ def find_purpose(phrase: str) -> tuple[str, ...]:
     told = re.findall(r"[^\W_]+", phrase[match.end() :].lower())
     place: dict[str, int] = {}
     for at, word in enumerate((*(["way"] if "way" in match[0].lower() else []), *told)):
-        for form in (_stem(word), *find_synonyms(word)):
+        for form in (*_stems(word), *find_synonyms(word)):
             place.setdefault(form, at)
     best, found = (0, 0), dict[str, None]()
     for done, things in PURPOSES.items():
@@ -109,6 +115,14 @@ def find_purpose(phrase: str) -> tuple[str, ...]:
 def find_uses(word: str) -> tuple[str, ...]:
     """The words for the things that are used for one word alone: "dining table" for "dinner"."""
     return tuple(thing for done, things in PURPOSES.items() if _stem(word) in done for thing in things)
+
+
+def _stems(word: str) -> tuple[str, ...]:
+    """What a word may be a form of: "stored" of "store", "kept" of "keep"."""
+    if word.endswith("ed") and len(word) >= _LEAST_STEM + 2:
+        bare = word.removesuffix("ed")
+        return bare, word.removesuffix("d"), bare[:-1]
+    return (_PAST.get(word) or _stem(word),)
 
 
 def _stem(word: str) -> str:

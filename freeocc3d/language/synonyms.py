@@ -23,7 +23,10 @@ SYNONYMS: tuple[tuple[str, ...], ...] = (
     ("refrigerator", "fridge", "freezer", "icebox"),
     ("wardrobe", "closet", "armoire"),
     ("rug", "carpet", "mat", "floor mat", "doormat", "bath mat"),
-    ("plant", "potted plant", "house plant", "indoor plant", "pot plant", "ficus", "indoor tree", "cactus"),
+    (
+        "plant", "potted plant", "house plant", "indoor plant", "pot plant", "ficus", "indoor tree", "cactus", "fern",
+        "palm", "bonsai", "orchid", "succulent", "monstera", "ivy", "rubber tree", "tree",
+    ),
     ("lamp", "light", "light fixture"),
     ("floor lamp", "standing lamp", "standard lamp", "torchiere"),
     ("desk lamp", "table lamp", "reading lamp", "bedside lamp", "reading light"),
@@ -69,8 +72,12 @@ SYNONYMS: tuple[tuple[str, ...], ...] = (
     ("fan", "ventilator", "ceiling fan"),
     ("tv cabinet", "tv stand", "tv bench", "tv unit", "media console", "entertainment center"),
     ("tableware", "dishes", "crockery", "dishware"),
-    ("person", "human", "man", "woman", "child", "boy", "girl", "somebody"),
-    ("dumbbell", "barbell", "weights"),
+    (
+        "person", "human", "man", "woman", "child", "boy", "girl", "somebody", "someone", "anybody", "anyone", "adult",
+        "kid", "baby", "toddler", "lady", "guy", "colleague", "coworker", "friend", "guest", "visitor", "neighbor",
+        "pedestrian", "passer by",
+    ),
+    ("dumbbell", "barbell", "weights", "kettlebell"),
     ("exercise bench", "weight bench"),
     (
         "kitchen utensils", "utensils", "cutlery", "silverware", "flatware", "cooking utensils", "cooking tools",
@@ -79,7 +86,7 @@ SYNONYMS: tuple[tuple[str, ...], ...] = (
     ("heater", "radiator", "space heater"),
     ("shoe rack", "shoe shelf", "shoe cabinet"),
     ("shoe", "trainer", "sneaker", "boot", "slipper", "sandal", "footwear", "high heel", "heel", "loafer"),
-    ("clothes", "clothing", "garment", "apparel"),
+    ("clothes", "clothing", "garment", "apparel", "laundry", "outfit"),
     ("backpack", "rucksack", "knapsack", "schoolbag"),
     ("bag", "handbag", "purse", "tote", "shopping bag"),
     ("suitcase", "trunk", "baggage"),
@@ -92,7 +99,7 @@ SYNONYMS: tuple[tuple[str, ...], ...] = (
     ("speaker", "loudspeaker", "soundbar", "stereo"),
     ("stairs", "staircase", "stairway", "steps"),
     ("door handle", "doorknob"),
-    ("door", "doorway", "entrance", "entry"),
+    ("door", "doorway", "entrance", "entry", "exit"),
     ("whiteboard", "marker board", "dry erase board", "blackboard", "chalkboard"),
     ("toy", "teddy bear", "teddy", "doll", "stuffed animal", "plush toy", "plushie"),
     ("clock", "wall clock", "alarm clock"),
@@ -106,6 +113,7 @@ SYNONYMS: tuple[tuple[str, ...], ...] = (
     ("window", "windowpane"),
     ("towel", "bath towel", "hand towel"),
     ("chandelier",),
+    ("spice", "seasoning", "condiment"),
     ("fire extinguisher",),
 )  # fmt: skip
 """Words that people use for the same kind of thing indoors."""
@@ -116,7 +124,8 @@ INCLUDES: dict[str, tuple[str, ...]] = {
     "shelf": ("bookshelf",),
     "tableware": ("cup", "plate", "bowl", "glass", "wine glass", "saucer", "teapot"),
     "kitchen utensil": ("knife", "fork", "spoon", "spatula", "ladle"),
-    "clothes": ("jacket", "coat", "shirt", "sweater", "dress", "trousers", "pants", "jeans", "hat"),
+    "clothes": ("jacket", "coat", "shirt", "sweater", "dress", "trousers", "pants", "jeans", "hat",
+                "scarf", "skirt", "hoodie", "blouse", "suit", "pajamas", "sock", "glove", "cap"),
     "computer": ("laptop", "tablet", "monitor"),
     "electronic": (
         "television", "laptop", "monitor", "computer", "speaker", "printer", "telephone", "computer keyboard",
@@ -127,6 +136,8 @@ INCLUDES: dict[str, tuple[str, ...]] = {
         "cabinet", "shelf", "bookshelf", "wardrobe", "chest of drawers", "box", "basket", "shoe rack", "tv cabinet",
     ),
     "lighting": ("lamp", "chandelier"),
+    "light source": ("lamp", "chandelier"),
+    "ceiling light": ("chandelier",),
     "container": ("box", "basket", "bottle", "bag", "vase", "trash can"),
     "luggage": ("suitcase", "backpack", "bag"),
     "white good": ("refrigerator", "dishwasher", "washing machine", "stove"),
@@ -155,6 +166,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "chair": ("stool", "highchair"),
     "camera": ("webcam", "camcorder", "action camera"),
     "tablet": ("ipad", "e reader", "ereader"),
+    "bag": ("backpack",),
 }  # fmt: skip
 """A thing -> its parts, and special kinds of it, which mean the thing where the scan's classes have none of their own.
 The thing does not mean them: who asks for chairs does not ask for stools."""
