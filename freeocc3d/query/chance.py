@@ -48,6 +48,9 @@ _PATCH_M2 = 0.05
 _ABOVE = 1.96
 """Standard deviations above the mean of the random words' best evidence: 1 of 40 normally distributed ones is higher. A
 quantile of 200 words, of which some may be there, is less certain."""
+_ALIKE = 0.01
+"""Variance of the features, of unit length, below which a map shows one kind of thing: of two kinds it is 0.04 and
+more. Such a map's mean is that thing, so nothing is known of the model's share, and none is taken off."""
 _LEAST = 1e-3
 _ROWS = 16_384  # voxels in one step, and words: arrays of voxels x words stay small
 _WORDS = 16
@@ -77,7 +80,8 @@ class Chance:
         self._mean = self._random.mean(axis=0)
         self._known = mask_known(occupancy.features)
         stated = record.mean_feature if record else None
-        self._center = average_known(occupancy.features) if stated is None else stated
+        center = average_known(occupancy.features) if stated is None else stated
+        self._center = center if 1 - float(center @ center) >= _ALIKE else np.zeros_like(center)
         self.record = record or self._measure()
 
     def score(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:

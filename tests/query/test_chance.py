@@ -150,6 +150,23 @@ def test_a_part_of_a_map_is_compared_with_the_whole() -> None:
     assert found[0] >= 160 > found[1], found
 
 
+@pytest.mark.parametrize("thing", PRESENT)
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_a_map_of_one_thing_alone_finds_it(thing: str, noise: float) -> None:
+    """Though its mean is the thing's own."""
+    model, rng = Model(), np.random.default_rng(4)
+    corners = np.argwhere(np.ones((10, 10, 2), bool))
+    gap = _unit(rng.standard_normal(SIZE) * (np.arange(SIZE) > 0))
+    own = 0.21 * np.eye(SIZE)[0] + 0.7 * gap + 0.16 * _unit(model.embed(thing) * (np.arange(SIZE) > 0))
+    drawn = _unit(own) + noise * rng.standard_normal((len(corners), SIZE)) / np.sqrt(SIZE)
+    features = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+    room = _voxels(corners, features.astype(np.float16))
+    record = Chance(room, model).record
+    found = query(room, model, [thing, *ABSENT], chance=lambda: record)
+    assert [result.word for result in found if result.matched] == [thing]
+    assert sum(region.voxels for region in found[0].regions) > 0.9 * len(corners)
+
+
 def test_a_threshold_that_is_given_counts_instead() -> None:
     model, room, *_ = _asked(0.3)
     assert not query(room, model, ["sofa"], Options(threshold=0.9))[0].matched
