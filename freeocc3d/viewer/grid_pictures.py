@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..occupancy.surface_faces import build_faces
-from .scene_rendering import VIEWS, DrawnScene, choose_cut_height, render_scene, shade_faces, turn_upright
+from .scene_rendering import DrawnScene, choose_cut_height, render_scene, shade_faces, turn_upright
+from .view_cameras import VIEWS, aim
 
 SIZE = 880, 600
 """Width and height of one view, pixels; a picture has two views, one above the other."""
@@ -56,6 +57,6 @@ def draw_grids(
         vertices = (origin + corners * voxel_size) @ R.T
         colors = grid.colors[grid.labels[tuple(voxels[rows].T)]]
         scene = DrawnScene(vertices, quads, shade_faces(vertices, colors), grid.path @ R.T)
-        views = np.vstack([render_scene(scene, view, SIZE, framed) for view in VIEWS])
+        views = np.vstack([render_scene(scene, aim(framed, view, SIZE)) for view in VIEWS])
         pictures[name] = cv2.imencode(".png", views[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
     return pictures

@@ -1,4 +1,4 @@
-"""Draws pictures of a map, from above and from a corner, off-screen with PyVista."""
+"""Draws pictures of a map, from above and from a corner or from any place, off-screen with PyVista."""
 
 from __future__ import annotations
 
@@ -7,34 +7,23 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..core.atomic_files import write_whole
 from ..core.errors import ExportError
-from ..core.transforms import transform
-from ..occupancy.surface_faces import find_exposed_faces
-from ..query.oriented_boxes import OrientedBox
-from ..query.regions import Region
 from ..query.scan_map import Map
 from ..query.word_query import QueryResult
-from .distinct_colors import distinct_colors
 from .lettering import HEADING, LEGEND, measure_text, write_text
-from .palette import assign_class_colors, color_by_height, highlight_regions
-from .scene_rendering import (
-    BACKGROUND,
-    CUT,
-    VIEWS,
-    DrawnScene,
-    choose_cut_height,
-    render_scene,
-    shade_faces,
-    turn_lengthwise,
-)
+from .map_colorings import Color, MapColoring, color_answers, color_map
+from .map_scenes import build_scene, open_panels
+from .scene_rendering import BACKGROUND, CUT
+from .view_cameras import VIEWS, aim, aim_from, pixels_of
 
 SIZE = 1600, 900
-_BAR = 56  # pixels above and below the views
+BAR = 56
+"""Pixels above and below the views."""
+_CUT_AWAY = f"; above {CUT:.0%} of the height is cut away"
 _LEGEND_ROWS = 2
-_LONGEST_NAME = 48  # characters of a word in the legend
 _MARGIN, _SWATCH, _GAP, _MORE = 16, 22, 20, 130  # pixels: left edge, box before a name, after it, room for "and N more"
 
 
@@ -43,23 +32,7 @@ def write_map_picture(scan_map: Map, path: str | Path, by: str = "rgb", overwrit
 
     Raises ExportError (empty map, unwritable target, unknown coloring), DependencyError (no off-screen rendering).
     """
-    _refuse_empty(scan_map)
-    occupancy = scan_map.occupancy
-    legend: list[tuple[str, tuple[int, int, int]]] = []
-    if by == "rgb":
-        colors = occupancy.colors
-    elif by == "class":
-        palette, labels = assign_class_colors(scan_map.vocabulary), scan_map.labels()
-        colors = palette[labels]
-        present = np.bincount(labels, minlength=len(palette))
-        common = [int(k) for k in np.argsort(-present, kind="stable") if present[k]]
-        names = ["nothing known", *scan_map.vocabulary]
-        legend = [(names[k], tuple(palette[k].tolist())) for k in common]
-    elif by == "height":
-        colors = color_by_height(occupancy, scan_map.up)
-    else:
-        raise ExportError(f"A map can be colored by rgb, class or height, not by '{by}'.")
-    _write(_drawn(scan_map, colors, [], _title(scan_map), legend), Path(path), overwrite)
+    _write(draw_coloring(scan_map, color_map(scan_map, by)), Path(path), overwrite)
 
 
 def write_query_picture(
@@ -70,31 +43,70 @@ def write_query_picture(
     _write(draw_query(scan_map, results), Path(path), overwrite)
 
 
+def write_both_picture(scan_map: Map, coloring: MapColoring, path: Path, overwrite: bool = False) -> None:
+    """Draws the voxels and, to their right, the Gaussians, as PNG. Raises as ``write_map_picture`` does."""
+    _write(draw_coloring(scan_map, coloring, has_gaussians(scan_map)), path, overwrite)
+
+
+def write_place_picture(
+    scan_map: Map, coloring: MapColoring, place: ArrayLike, target: ArrayLike, path: Path, overwrite: bool = False
+) -> None:
+    """Draws what one sees from a place towards another, (3,) in the map's frame, as voxels and as Gaussians. The
+    ceiling is there if the place is below it. Raises as ``write_map_picture`` does, and ExportError for a place in an
+    occupied voxel, or from which nothing is in view."""
+    here, there = np.asarray(place, np.float64), np.asarray(target, np.float64)
+    _refuse_place(scan_map, here, there)
+    scene = build_scene(scan_map, coloring, here)
+    both = has_gaussians(scan_map)
+    size = SIZE[0] // (1 + both), SIZE[1] - 2 * BAR
+    camera = aim_from(scene.R_scene_map @ here, scene.R_scene_map @ there, size)
+    pixels, depth = pixels_of(scene.drawn.vertices, camera)
+    seen = pixels[(depth > 0) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)]
+    if not len(seen) or np.ptp(seen, axis=0).max() < 1:
+        raise ExportError(f"Nothing of the map is in view from {_told(here)} towards {_told(there)}: choose others.")
+    with open_panels(scan_map, scene, size, both) as draw:
+        view = draw(camera)
+    unit = "m" if scan_map.metric else "units"
+    cut = _CUT_AWAY if np.isfinite(scene.cut) else ""
+    title = f"{_name(scan_map)}, seen from {_told(here)} towards {_told(there)}, {unit} in the map's frame{cut}"
+    _write(_encoded(frame_views(view, title, coloring.legend)), path, overwrite)
+
+
 def draw_query(scan_map: Map, results: Sequence[QueryResult]) -> bytes:
     """Returns the PNG that ``write_query_picture`` writes."""
-    _refuse_empty(scan_map)
-    colors = highlight_regions(scan_map.occupancy.colors, [result.regions for result in results])
-    legend = []
-    boxes: list[tuple[Region, tuple[int, int, int]]] = []
-    for result, chosen in zip(results, distinct_colors(len(results)), strict=True):
-        color = tuple(chosen.tolist())
-        legend.append((_found(result), color))
-        boxes += [(region, color) for region in result.regions]
-    return _drawn(scan_map, colors, boxes, _title(scan_map), legend)
+    return draw_coloring(scan_map, color_answers(scan_map, results))
 
 
-def _found(result: QueryResult) -> str:
-    """Returns the legend's text for a word: the number of regions, and the best score."""
-    word = result.word if len(result.word) <= _LONGEST_NAME else result.word[: _LONGEST_NAME - 3] + "..."
-    if not result.regions:
-        return f"{word}: no match"
-    count, best = len(result.regions), f"{result.regions[0].score:.2f}"
-    return f"{word}: {count} regions, best {best}" if count > 1 else f"{word}: 1 region, {best}"
+def draw_coloring(scan_map: Map, coloring: MapColoring, with_gaussians: bool = False) -> bytes:
+    """Returns a PNG of the two ``VIEWS`` beside each other; with Gaussians, below each other, and these to the
+    right."""
+    scene = build_scene(scan_map, coloring)
+    size = SIZE[0] // 2, 620 if with_gaussians else SIZE[1] - 2 * BAR
+    with open_panels(scan_map, scene, size, with_gaussians) as draw:
+        views = [draw(aim(scene.drawn, view, size)) for view in VIEWS]
+    stacked = np.vstack(views) if with_gaussians else np.hstack(views)
+    return _encoded(frame_views(stacked, map_title(scan_map), coloring.legend))
 
 
-def _refuse_empty(scan_map: Map) -> None:
-    if len(scan_map.occupancy.colors) == 0:
-        raise ExportError(f"The map {scan_map.path} has no occupied voxels to draw.")
+def has_gaussians(scan_map: Map) -> bool:
+    """Whether there are Gaussians to draw."""
+    return scan_map.manifest.counts.gaussians > 0
+
+
+def _refuse_place(scan_map: Map, place: NDArray[np.float64], target: NDArray[np.float64]) -> None:
+    """Raises ExportError."""
+    if not np.isfinite((place, target)).all():
+        raise ExportError("A place is three finite numbers, x, y and z in the map's frame.")
+    if np.linalg.norm(target - place) < 1e-6:
+        raise ExportError(f"One cannot look from {_told(place)} towards the same place: choose another one to look at.")
+    occupancy = scan_map.occupancy
+    corner = (place - occupancy.origin) / occupancy.finest - occupancy.occupied_voxels()
+    if ((corner >= 0) & (corner < occupancy.occupied_edges()[:, None])).all(axis=1).any():
+        raise ExportError(f"The place {_told(place)} is inside an occupied voxel: choose one in free space.")
+
+
+def _told(place: NDArray[np.float64]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in place) + ")"
 
 
 def _write(png: bytes, path: Path, overwrite: bool) -> None:
@@ -103,18 +115,7 @@ def _write(png: bytes, path: Path, overwrite: bool) -> None:
     write_whole(path, lambda target: _write_bytes(target, png), overwrite)
 
 
-def _drawn(
-    scan_map: Map,
-    colors: NDArray[np.uint8],
-    regions: list[tuple[Region, tuple[int, int, int]]],
-    title: str,
-    legend: list[tuple[str, tuple[int, int, int]]],
-) -> bytes:
-    """Returns the picture as PNG."""
-    scene = _scene(scan_map, colors, regions)
-    width, height = SIZE[0] // 2, SIZE[1] - 2 * _BAR
-    views = np.hstack([render_scene(scene, view, (width, height)) for view in VIEWS])
-    picture = _framed(views, title, legend)
+def _encoded(picture: NDArray[np.uint8]) -> bytes:
     return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
 
 
@@ -122,57 +123,30 @@ def _write_bytes(path: Path, data: bytes) -> None:
     path.write_bytes(data)
 
 
-def _scene(scan_map: Map, colors: NDArray[np.uint8], regions: list[tuple[Region, tuple[int, int, int]]]) -> DrawnScene:
-    """Returns the exposed faces of the voxels below the cut, and of the regions that lie mostly above it, turned so
-    that z is up and the walls lie along x and y."""
-    occupancy = scan_map.occupancy
-    centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
-    R = turn_lengthwise(scan_map.T_gravity_map[:3, :3], centers)
-    height = centers @ R[2]
-    kept = height <= choose_cut_height(height, occupancy.voxel_size)
-    for (
-        region,
-        _,
-    ) in regions:  # draws a lamp that a word asks for; such a wall must not hide the room
-        if 2 * np.count_nonzero(kept[region.rows]) < len(region.rows):
-            kept[region.rows] = True
-    vertices, quads, rows = find_exposed_faces(occupancy, kept)
-    turned = vertices.astype(np.float64) @ R.T
-    trajectory = scan_map.trajectory
-    way = trajectory.T_world_cam[trajectory.has_pose][:, :3, 3] @ R.T
-    upright = scan_map.boxes_of([region for region, _ in regions])
-    boxes = tuple((_corners(box) @ R.T, color) for box, (_, color) in zip(upright, regions, strict=True))
-    return DrawnScene(turned, quads, shade_faces(turned, colors[rows]), way, boxes)
-
-
-def _corners(box: OrientedBox) -> NDArray[np.float64]:
-    """Returns the (8, 3) corners, map frame."""
-    return transform(box.T_map_box, (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * box.extent)
-
-
-def _framed(views: NDArray[np.uint8], title: str, legend: list[tuple[str, tuple[int, int, int]]]) -> NDArray[np.uint8]:
+def frame_views(views: NDArray[np.uint8], title: str, legend: Sequence[tuple[str, Color]]) -> NDArray[np.uint8]:
     """Returns the views with the title above and the legend below."""
-    picture = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
-    picture[_BAR : _BAR + views.shape[0], : views.shape[1]] = views
+    height, width = views.shape[0] + 2 * BAR, views.shape[1]
+    picture = np.full((height, width, 3), BACKGROUND, np.uint8)
+    picture[BAR:-BAR] = views
     write_text(picture, title, (16, 36), HEADING)
     widths = [_SWATCH + measure_text(text, LEGEND) for text, _ in legend]
-    places = _placed(widths)
-    baselines = (SIZE[1] - 20,) if not places or places[-1][0] == 0 else (SIZE[1] - 36, SIZE[1] - 12)
+    places = _placed(widths, width)
+    baselines = (height - 20,) if not places or places[-1][0] == 0 else (height - 36, height - 12)
     for (text, color), (row, x) in zip(legend, places, strict=False):
         y = baselines[row]
         cv2.rectangle(picture, (x, y - 14), (x + 16, y + 2), color, -1, cv2.LINE_AA)
         write_text(picture, text, (x + _SWATCH, y), LEGEND)
     if left_out := len(legend) - len(places):
-        write_text(picture, f"and {left_out} more", (SIZE[0] - _MORE, baselines[-1]), LEGEND)
+        write_text(picture, f"and {left_out} more", (width - _MORE, baselines[-1]), LEGEND)
     return picture
 
 
-def _placed(widths: list[int]) -> list[tuple[int, int]]:
+def _placed(widths: list[int], room: int = SIZE[0]) -> list[tuple[int, int]]:
     """Returns (row, x) of the legend's entries that fit. The last row keeps room for "and N more"."""
     places: list[tuple[int, int]] = []
     row, x = 0, _MARGIN
     for width in widths:
-        while row < _LEGEND_ROWS and x + width > SIZE[0] - (_MORE if row == _LEGEND_ROWS - 1 else _MARGIN):
+        while row < _LEGEND_ROWS and x + width > room - (_MORE if row == _LEGEND_ROWS - 1 else _MARGIN):
             row, x = row + 1, _MARGIN
         if row == _LEGEND_ROWS:
             break
@@ -188,10 +162,14 @@ def _size(scan_map: Map) -> str:
     return f"{largest:.3g} {unit}" if largest == smallest else f"{largest:.3g} to {smallest:.3g} {unit}"
 
 
-def _title(scan_map: Map) -> str:
+def _name(scan_map: Map) -> str:
+    return Path(scan_map.manifest.capture.path).name
+
+
+def map_title(scan_map: Map) -> str:
+    """Returns the heading of a picture that is cut below the ceiling."""
     counts = scan_map.manifest.counts
-    name = Path(scan_map.manifest.capture.path).name
     return (
-        f"{name}: {counts.voxels.occupied:,} occupied voxels of {_size(scan_map)}, "
-        f"{counts.frames_with_pose} of {counts.frames} frames; above {CUT:.0%} of the height is cut away"
+        f"{_name(scan_map)}: {counts.voxels.occupied:,} occupied voxels of {_size(scan_map)}, "
+        f"{counts.frames_with_pose} of {counts.frames} frames{_CUT_AWAY}"
     )

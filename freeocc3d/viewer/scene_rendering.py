@@ -1,22 +1,35 @@
-"""Renders colored faces, a camera path and boxes off-screen from two sides with PyVista."""
+"""Renders colored faces, a camera path and boxes off-screen with PyVista."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import DependencyError
+from ..core.transforms import invert
+from ..core.types import Intrinsics
 
 CUT = 0.8
 """Share of the height that is drawn. What is higher is left out, so that the rooms are open from above."""
 
 BACKGROUND = (250, 250, 250)
-VIEWS = ("above", "corner")
+NEAR_M = 0.02
+"""What is nearer to a camera is not drawn."""
 
-_BOX_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)]
+BOX_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)]
+
+
+class DrawnBox(NamedTuple):
+    """A box to draw: (8, 3) corners, the last axis running fastest; RGB; the name to write beside it, or ""."""
+
+    corners: NDArray[np.float64]
+    color: tuple[int, int, int]
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -27,7 +40,22 @@ class DrawnScene:
     quads: NDArray[np.int32]
     colors: NDArray[np.uint8]  # (F, 3)
     path: NDArray[np.float64]  # (P, 3) camera path
-    boxes: tuple[tuple[NDArray[np.float64], tuple[int, int, int]], ...] = ()  # (8, 3) corners and a color
+    boxes: tuple[DrawnBox, ...] = ()
+    path_color: tuple[int, int, int] = (26, 77, 230)
+
+
+@dataclass(frozen=True)
+class ViewCamera:
+    """Where a picture is seen from.
+
+    T_cam_scene: (4, 4), the camera's x is right, y down, z forward.  intrinsics: focal length and center, pixels.
+    distance: None for a perspective. For a parallel projection, of the place whose scale the picture has: it is so far
+    away that the pinhole shows almost the same.
+    """
+
+    T_cam_scene: NDArray[np.float64]
+    intrinsics: Intrinsics
+    distance: float | None = None
 
 
 def turn_upright(up: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -70,14 +98,10 @@ def shade_faces(vertices: NDArray[np.float64], colors: NDArray[np.uint8]) -> NDA
     return np.clip(colors * light[:, None], 0, 255).astype(np.uint8)
 
 
-def render_scene(
-    scene: DrawnScene, view: str, size: tuple[int, int], framed: DrawnScene | None = None
-) -> NDArray[np.uint8]:
-    """Returns the (H, W, 3) RGB of one of ``VIEWS``. size: (W, H) pixels.
-
-    framed: the scene that fills the view, by default the drawn one; pictures to compare share it. Raises
-    DependencyError (no off-screen rendering).
-    """
+@contextmanager
+def open_renderer(scene: DrawnScene, size: tuple[int, int]) -> Iterator[Callable[[ViewCamera], NDArray[np.uint8]]]:
+    """Gives a function that renders the scene as cameras with images of one size see it: (H, W, 3) RGB. size: (W, H)
+    pixels. Raises DependencyError (no off-screen rendering), as the function does."""
     try:
         import pyvista
         import vtkmodules.vtkCommonCore as vtk
@@ -88,63 +112,65 @@ def render_scene(
             f"Pictures need pyvista with EGL and GL: run apt-get install libegl1 libgl1 ({error})."
         ) from None
 
-    try:
+    with _rendering():
         plotter = pyvista.Plotter(off_screen=True, window_size=list(size), lighting="none")
-        plotter.set_background([c / 255 for c in BACKGROUND])
-        if len(scene.quads):
-            faces = np.concatenate((np.full((len(scene.quads), 1), 4, np.int64), scene.quads), axis=1).ravel()
-            mesh = pyvista.PolyData(scene.vertices, faces)
-            mesh.cell_data["rgb"] = scene.colors
-            plotter.add_mesh(mesh, scalars="rgb", rgb=True, lighting=False)
-        if len(scene.path) > 1:
-            plotter.add_mesh(pyvista.lines_from_points(scene.path), color=(0.1, 0.3, 0.9), line_width=2)
-        for corners, color in scene.boxes:
-            edges = np.array([(2, a, b) for a, b in _BOX_EDGES]).ravel()
-            box = pyvista.PolyData(corners, lines=edges)
-            plotter.add_mesh(box, color=[c / 255 for c in color], line_width=2)
-        _aim(plotter, framed or scene, view, size)
-        image = plotter.screenshot(return_img=True)
+        _fill(plotter, scene)
+
+    def render(camera: ViewCamera) -> NDArray[np.uint8]:
+        with _rendering():
+            _aim(plotter, camera)
+            plotter.render()
+            return np.array(plotter.screenshot(return_img=True), np.uint8)[..., :3]
+
+    try:
+        yield render
+    finally:
         plotter.close()
+
+
+def render_scene(scene: DrawnScene, camera: ViewCamera) -> NDArray[np.uint8]:
+    """Returns the (H, W, 3) RGB of one view, as ``open_renderer`` does."""
+    with open_renderer(scene, (camera.intrinsics.width, camera.intrinsics.height)) as render:
+        return render(camera)
+
+
+@contextmanager
+def _rendering() -> Iterator[None]:
+    try:
+        yield
     except Exception as error:
         raise DependencyError(f"Off-screen rendering failed: run apt-get install libegl1 libgl1 ({error}).") from error
-    return np.asarray(image, np.uint8)[..., :3]
 
 
-def _aim(plotter: Any, scene: DrawnScene, view: str, size: tuple[int, int]) -> None:
-    """Aims the camera from straight above, or down into the scene from the corner nearest to the camera path. All boxes
-    and all but a few stray voxels fill the view. Both views are parallel projections: equal lengths look equal."""
-    points, path = scene.vertices, scene.path
-    middle = 0.5 * (np.percentile(points, 1, axis=0) + np.percentile(points, 99, axis=0))
-    if view == "above":
-        back, up = np.array((0.0, 0.0, 1.0)), np.array((0.0, 1.0, 0.0))
-    else:
-        towards = (path.mean(axis=0) - middle)[:2] if len(path) else np.array((-1.0, -1.0))
-        back, up = np.array((*np.where(towards >= 0, 0.6, -0.6), 1.0)), np.array((0.0, 0.0, 1.0))
-    right = np.cross(up, back)
-    axes = np.stack((right / np.linalg.norm(right), np.cross(back, right) / np.linalg.norm(np.cross(back, right))))
-    spread = (points - middle) @ axes.T
-    low, high = _bounds(spread, scene)
-    for corners, _ in scene.boxes:  # the view holds what a word asks for, however far away it is
-        at = (corners - middle) @ axes.T
-        low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
-    half = 0.5 * (high - low)
-    focus = middle + 0.5 * (low + high) @ axes
-    plotter.camera.focal_point = focus
-    plotter.camera.position = focus + back / np.linalg.norm(back) * (100.0 + np.linalg.norm(np.ptp(points, axis=0)))
-    plotter.camera.up = up
-    plotter.camera.parallel_projection = True
-    plotter.camera.parallel_scale = 1.06 * max(half[1], half[0] * size[1] / size[0], 1e-3)
-    plotter.reset_camera_clipping_range()
+def _fill(plotter: Any, scene: DrawnScene) -> None:
+    import pyvista
 
-
-def _bounds(spread: NDArray[np.float64], scene: DrawnScene) -> tuple[NDArray[np.float64], ...]:
-    """Returns the (2,) lower and (2,) upper bounds of the scene's faces in the view, without 0.3 % of their area on
-    each side; the bounds of its points if it has no faces. spread: the vertices in the view."""
-    weights = np.ones(len(spread))
+    plotter.set_background([c / 255 for c in BACKGROUND])
     if len(scene.quads):
-        corners = scene.vertices.reshape(-1, 4, 3)
-        weights = np.repeat(((corners[:, 2] - corners[:, 0]) ** 2).sum(axis=1), 4)
-    order = np.argsort(spread, axis=0)
-    up_to = np.cumsum(weights[order], axis=0)
-    ends = (np.count_nonzero(up_to < share * up_to[-1], axis=0) for share in (0.003, 0.997))
-    return tuple(np.take_along_axis(spread, np.take_along_axis(order, end[None], 0), 0)[0] for end in ends)
+        faces = np.concatenate((np.full((len(scene.quads), 1), 4, np.int64), scene.quads), axis=1).ravel()
+        mesh = pyvista.PolyData(scene.vertices, faces)
+        mesh.cell_data["rgb"] = scene.colors
+        plotter.add_mesh(mesh, scalars="rgb", rgb=True, lighting=False)
+    if len(scene.path) > 1:
+        color = [c / 255 for c in scene.path_color]
+        plotter.add_mesh(pyvista.lines_from_points(scene.path), color=color, line_width=2)
+    for box in scene.boxes:
+        edges = np.array([(2, a, b) for a, b in BOX_EDGES]).ravel()
+        plotter.add_mesh(pyvista.PolyData(box.corners, lines=edges), color=[c / 255 for c in box.color], line_width=2)
+
+
+def _aim(plotter: Any, camera: ViewCamera) -> None:
+    T_scene_cam = invert(camera.T_cam_scene)
+    _, y, forward, position = T_scene_cam[:3].T
+    plotter.camera.position = position
+    plotter.camera.focal_point = position + forward * (camera.distance or 1.0)
+    plotter.camera.up = -y
+    half, focal = 0.5 * camera.intrinsics.height, camera.intrinsics.fy
+    if camera.distance is not None:
+        plotter.camera.parallel_projection = True
+        plotter.camera.parallel_scale = half * camera.distance / focal
+    else:
+        plotter.camera.view_angle = 2 * np.degrees(np.arctan(half / focal))
+    plotter.reset_camera_clipping_range()
+    if camera.distance is None:
+        plotter.camera.clipping_range = NEAR_M, max(plotter.camera.clipping_range[1], 1.0)

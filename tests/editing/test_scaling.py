@@ -335,8 +335,8 @@ def test_the_commands_say_what_the_unit_is(room: Map, half: Map, tmp_path: Path)
     np.testing.assert_allclose(8 * np.array(volumes[0]), volumes[1])
     assert float(row.split()[-2]) == pytest.approx(answers(half)[0]["volume_m3"], rel=0.02)
     assert float(row_l.split()[-2]) == pytest.approx(1000 * answers(room)[0]["volume_m3"], rel=0.02)
-    assert "voxels of 0.04 units," in map_pictures._title(half)
-    assert "voxels of 8 cm," in map_pictures._title(room)
+    assert "voxels of 0.04 units," in map_pictures.map_title(half)
+    assert "voxels of 8 cm," in map_pictures.map_title(room)
     assert json.loads(run("query", half.path, "red cup", "--json").stdout)["metric"] is False
     exported = run("export", half.path, "--format", "octomap", "-o", tmp_path / "half.bt")
     assert "lengths are not meters" in exported.stderr

@@ -12,7 +12,7 @@ from freeocc3d.core.errors import ExportError
 from freeocc3d.core.types import Trajectory
 from freeocc3d.query.oriented_boxes import oriented_boxes
 from freeocc3d.query.regions import Region
-from freeocc3d.viewer import map_pictures
+from freeocc3d.viewer import map_colorings, map_pictures, map_scenes
 from freeocc3d.viewer.distinct_colors import distinct_colors
 from freeocc3d.viewer.palette import assign_class_colors
 from freeocc3d.viewer.scene_rendering import choose_cut_height, turn_lengthwise
@@ -127,7 +127,7 @@ def test_a_match_above_the_cut_is_drawn(tmp_path, monkeypatch) -> None:
     height = room.occupancy.centers(room.occupancy.occupied_voxels()) @ room.up
     below = height <= choose_cut_height(height, room.occupancy.voxel_size)
     above = np.flatnonzero(~below)[:40]
-    monkeypatch.setattr(map_pictures, "_corners", lambda box: np.zeros((8, 3)))
+    monkeypatch.setattr(map_scenes, "_corners", lambda box: np.zeros((8, 3)))
 
     def strong(rows) -> int:
         """Pixels of the voxels: boxes are drawn as points."""
@@ -153,10 +153,10 @@ def test_the_legend_holds_two_rows_and_counts_what_it_leaves_out() -> None:
 
 def test_the_legend_tells_regions_and_scores() -> None:
     regions = [SimpleNamespace(score=0.914), SimpleNamespace(score=0.3)]
-    assert map_pictures._found(SimpleNamespace(word="cup", regions=regions)) == "cup: 2 regions, best 0.91"
-    assert map_pictures._found(SimpleNamespace(word="cup", regions=regions[:1])) == "cup: 1 region, 0.91"
-    assert map_pictures._found(SimpleNamespace(word="cup", regions=[])) == "cup: no match"
-    assert len(map_pictures._found(SimpleNamespace(word="x" * 200, regions=[]))) < 70
+    assert map_colorings._found(SimpleNamespace(word="cup", regions=regions)) == "cup: 2 regions, best 0.91"
+    assert map_colorings._found(SimpleNamespace(word="cup", regions=regions[:1])) == "cup: 1 region, 0.91"
+    assert map_colorings._found(SimpleNamespace(word="cup", regions=[])) == "cup: no match"
+    assert len(map_colorings._found(SimpleNamespace(word="x" * 200, regions=[]))) < 70
 
 
 @pytest.mark.parametrize("by", ["rgb", "class", "height"])
