@@ -50,6 +50,20 @@ _LOOKS = {
     "you", "can", "it",
 }  # fmt: skip
 """Words that say what a thing looks like or where it is, and not what kind of thing it is."""
+_ROOMS = {
+    "kitchen",
+    "bathroom",
+    "bedroom",
+    "living",
+    "office",
+    "hall",
+    "hallway",
+    "garage",
+    "cellar",
+    "garden",
+    "toilet",
+}
+"""A bathroom cabinet is no kitchen cabinet."""
 _LONGEST_PHRASE = 16
 _OTHER_THINGS = {
     "traffic light", "stop light", "water table", "multiplication table", "truck bed", "flower bed", "river bed",
@@ -153,7 +167,9 @@ class _Names:
             same_kind = [row for row in rows if self._keys[row] in same or self._named[row][-1] == part]
             plain = [row for row in same_kind if not any(map(_is_kind, self._named[row][:-1]))]
             rows = [row for row in rows if row in used or row in plain]
-        if not any(_is_thing(word) for word in said):
+        rooms = frozenset() if part in _NAMED_BY_CONTENT else _ROOMS.intersection(said)
+        rows = [row for row in rows if not (rooms and _ROOMS.intersection(self._named[row][:-1]) - rooms)]
+        if not rooms and not any(_is_thing(word) for word in said):
             return rows
         return [row for row in rows if not (self._holds(row) and any(map(_is_thing, self._named[row][:-1])))]
 
