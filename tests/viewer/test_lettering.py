@@ -63,6 +63,16 @@ def test_what_no_font_has_is_told_in_ascii(text: str, told: str) -> None:
     assert np.array_equal(drawn(text), drawn(told))
 
 
+def test_what_the_main_font_lacks_is_written_with_another_of_the_computer(
+    no_fonts: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    other, broken = lettering._find_main(), tmp_path / "broken.ttf"
+    broken.write_text("no font")
+    monkeypatch.setattr(lettering, "_font_files", lambda: ("", str(broken), other))
+    runs = [(font.getname()[0], run) for font, run in lettering._runs("bed кровать 椅", LEGEND)]
+    assert runs == [("Aileron", "bed "), ("DejaVu Sans", "кровать"), ("Aileron", " \\u6905")]
+
+
 def test_control_characters_are_told_as_escapes() -> None:
     assert written("bed\x1b[2J\nwall\u202e") == "bed\\x1b[2J\\nwall\\u202e"
 
