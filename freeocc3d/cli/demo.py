@@ -43,14 +43,14 @@ def demo(
     """Map the built-in room, ask some words, and draw pictures."""
     from ..pipeline import run
     from ..settings import config
-    from ..viewer import map_pictures
+    from ..viewer import map_colorings, map_pictures
 
     settings = config.load(None, [f"capture.synthetic.frames={frames}", "language.encoder=labels"])
     with ConsoleProgress() as progress:
         made = run.reconstruct("builtin:room", output / "map", settings, overwrite=overwrite, progress=progress)
     show(*summary_lines(made))
     written = [output / "map.png"]
-    map_pictures.write_map_picture(made, written[0], overwrite=overwrite)
+    map_pictures.write_both_picture(made, map_colorings.color_map(made), written[0], overwrite)
     results = made.query_words(list(WORDS), top_k=4)
     show("", *STAND_IN.splitlines(), "", *answers_lines(results))
     for result in results:

@@ -14,7 +14,7 @@ from ..occupancy.surface_faces import find_exposed_faces
 from ..query.oriented_boxes import OrientedBox
 from ..query.scan_map import Map
 from .map_colorings import MapColoring
-from .names_on_things import NamePlaces, write_label
+from .names_on_things import NamePlaces, draw_edges, write_label
 from .scene_rendering import (
     DrawnBox,
     DrawnScene,
@@ -81,9 +81,11 @@ def open_panels(
         def draw(camera: ViewCamera) -> NDArray[np.uint8]:
             panels = {"voxels": render(camera)}
             if painter is not None:
-                panels["Gaussians"] = painter.draw(camera, scene.drawn.boxes)
+                panels["Gaussians"] = painter.draw(camera)
             names.choose(camera)
             for title, panel in panels.items():
+                for box in scene.drawn.boxes:
+                    draw_edges(panel, box, camera, 1 if title == "voxels" else 2)
                 names.write(panel)
                 if len(panels) > 1:
                     write_label(panel, title, (10, 8))

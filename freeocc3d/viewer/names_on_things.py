@@ -1,4 +1,4 @@
-"""Writes names beside the things of a picture, so that none covers another."""
+"""Draws boxes around the things of a picture, and writes their names beside them, so that none covers another."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ _COVERS = 1.5  # cost of covering another thing, in rings of distance
 _INSIDE = 1.2  # the same of a label on its own thing
 _STAYS = 0.4  # by how much another place must be better than the last one
 _OPAQUE = 0.85
+
+_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)]
+_MOST_PX = 30_000.0  # OpenCV's lines have 16 bits before the point
 
 _SIDES = np.array([(0, -1), (0, 1), (1, 0), (-1, 0), (1, -1), (-1, -1), (1, 1), (-1, 1)])
 
@@ -79,6 +82,25 @@ def write_label(
     ground[:] = np.rint((1 - _OPAQUE) * ground + _OPAQUE * np.array(BACKGROUND)).astype(np.uint8)
     cv2.rectangle(picture, (x, y), (x + width - 1, y + _HEIGHT - 1), color, 2)
     write_text(picture, text, (x + _PADDING, y + _HEIGHT - 7), SMALL)
+
+
+def draw_edges(image: NDArray[np.uint8], box: DrawnBox, camera: ViewCamera, width_px: int) -> None:
+    """Draws the edges of a box over the (H, W, 3) view, those of a hidden thing, too."""
+    height, width = image.shape[:2]
+    _, depth = pixels_of(box.corners, camera)
+    for a, b in _EDGES:
+        ends = box.corners[[a, b]]
+        if depth[[a, b]].max() <= NEAR_M:
+            continue
+        if depth[[a, b]].min() < NEAR_M:  # moves the end that is behind the camera to just before it
+            share = (NEAR_M - depth[a]) / (depth[b] - depth[a])
+            ends[int(depth[a] > depth[b])] = ends[0] + share * (ends[1] - ends[0])
+        places = pixels_of(ends, camera)[0]
+        if np.abs(places).max() > _MOST_PX:
+            continue
+        inside, start, end = cv2.clipLine((0, 0, width, height), *np.rint(places).astype(int).tolist())
+        if inside:
+            cv2.line(image, start, end, box.color, width_px, cv2.LINE_AA)
 
 
 def _shortened(name: str) -> str:

@@ -21,7 +21,7 @@ _KNOWN = {
 
 
 _UNKNOWN = (90, 90, 90)
-_APART = 0.03
+_APART = 0.06
 """Least distance of the colors of two classes, as ``distinct_colors.measure_distances`` has it, while there is room."""
 
 
@@ -46,11 +46,13 @@ def assign_class_colors(names: list[str]) -> NDArray[np.uint8]:
 
 
 def highlight_regions(colors: NDArray[np.uint8], words: list[list[Region]]) -> NDArray[np.uint8]:
-    """Returns (V, 3) voxel colors: regions in their word's color of ``distinct_colors``, everything else pale."""
+    """Returns (V, 3) voxel colors: regions in their word's color of ``distinct_colors``, everything else pale. A voxel
+    of several regions has the color of the smallest one, of equal ones that of the first word."""
     out = pale_colors(colors)
-    for color, regions in zip(distinct_colors(len(words)), words, strict=True):
-        for region in regions:
-            out[region.rows] = color
+    chosen = distinct_colors(len(words))
+    found = [(len(region.rows), -number, region.rows) for number, regions in enumerate(words) for region in regions]
+    for _, number, rows in sorted(found, key=lambda one: (-one[0], one[1])):
+        out[rows] = chosen[-number]
     return out
 
 

@@ -1,4 +1,4 @@
-"""Renders colored faces, a camera path and boxes off-screen with PyVista."""
+"""Renders colored faces and a camera path off-screen with PyVista."""
 
 from __future__ import annotations
 
@@ -20,8 +20,6 @@ CUT = 0.8
 BACKGROUND = (250, 250, 250)
 NEAR_M = 0.02
 """What is nearer to a camera is not drawn."""
-
-BOX_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)]
 
 
 class DrawnBox(NamedTuple):
@@ -154,9 +152,6 @@ def _fill(plotter: Any, scene: DrawnScene) -> None:
     if len(scene.path) > 1:
         color = [c / 255 for c in scene.path_color]
         plotter.add_mesh(pyvista.lines_from_points(scene.path), color=color, line_width=2)
-    for box in scene.boxes:
-        edges = np.array([(2, a, b) for a, b in BOX_EDGES]).ravel()
-        plotter.add_mesh(pyvista.PolyData(box.corners, lines=edges), color=[c / 255 for c in box.color], line_width=2)
 
 
 def _aim(plotter: Any, camera: ViewCamera) -> None:

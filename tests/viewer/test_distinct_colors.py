@@ -1,11 +1,13 @@
 """Distinct colors: far from each other and from a pale map, for every kind of color vision that is common."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from freeocc3d.viewer import distinct_colors as module
 from freeocc3d.viewer.distinct_colors import GENERATED, distinct_colors, every_color, measure_distances, pale_colors
-from freeocc3d.viewer.palette import assign_class_colors
+from freeocc3d.viewer.palette import assign_class_colors, highlight_regions
 
 
 def least_distance(colors) -> float:
@@ -54,8 +56,20 @@ def test_a_class_keeps_its_color_where_none_looks_alike() -> None:
     for row, name in enumerate(names, 1):
         alone = assign_class_colors([name])[1]
         kept.append(bool((together[row] == alone).all()))
-        assert kept[-1] == (measure_distances(alone[None], together[:row]).min() >= 0.03)
+        assert kept[-1] == (measure_distances(alone[None], together[:row]).min() >= 0.06)
     assert set(kept) == {True, False}
     np.testing.assert_array_equal(
         assign_class_colors(["wall", "x", "wall"])[[1, 3]], [assign_class_colors(["wall"])[1]] * 2
     )
+
+
+def test_of_two_regions_in_one_place_the_smaller_one_is_seen() -> None:
+    def region(*rows):
+        return SimpleNamespace(rows=np.array(rows))
+
+    gray = np.full((6, 3), 128, np.uint8)
+    first, second, third = distinct_colors(3)
+    words = [[region(0, 1, 2, 3)], [region(1)], [region(0, 1, 2, 3), region(4)]]
+    colors = highlight_regions(gray, words)
+    np.testing.assert_array_equal(colors[:5], [first, second, first, first, third])
+    np.testing.assert_array_equal(colors[5:], pale_colors(gray[:1]))

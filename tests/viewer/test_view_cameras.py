@@ -5,6 +5,7 @@ import pytest
 
 from freeocc3d.core.types import Gaussians
 from freeocc3d.viewer.gaussian_views import GaussianPainter
+from freeocc3d.viewer.names_on_things import draw_edges
 from freeocc3d.viewer.scene_rendering import DrawnBox, DrawnScene, render_scene
 from freeocc3d.viewer.view_cameras import aim, aim_around, aim_from, pixels_of
 
@@ -93,15 +94,10 @@ def test_a_way_around_shows_all_of_the_scene_and_ends_where_it_began() -> None:
     assert max(steps) < 1.2 * min(steps)
 
 
-def test_edges_of_boxes_are_drawn_over_gaussians_also_around_the_camera() -> None:
-    nothing = Gaussians(
-        *(np.zeros((0, n), np.float32) for n in (3, 3, 4)), np.zeros(0, np.float32), np.zeros((0, 3), np.uint8),
-        np.zeros(0, np.int32), np.zeros((0, 3), np.float32),
-    )  # fmt: skip
+def test_edges_of_boxes_are_drawn_also_around_the_camera() -> None:
     cube = np.indices((2, 2, 2)).reshape(3, -1).T - 0.5
     camera = aim_from(np.zeros(3), np.array((0.0, 1.0, 0.0)), SIZE)
-    painter = GaussianPainter(nothing, np.eye(3))
-    for edge, middle in ((1.0, (0, 3, 0)), (2.0, (0, 0.5, 0))):
-        image = painter.draw(camera, [DrawnBox(edge * cube + middle, (200, 0, 0), "")])
-        assert (image == (200, 0, 0)).all(axis=2).sum() > 100
-    assert (painter.draw(camera, [DrawnBox(cube - (0, 3, 0), (200, 0, 0), "")]) == 250).all()
+    for edge, middle, seen in ((1.0, (0, 3, 0), True), (2.0, (0, 0.5, 0), True), (1.0, (0, -3, 0), False)):
+        image = np.full((*SIZE[::-1], 3), 250, np.uint8)
+        draw_edges(image, DrawnBox(edge * cube + middle, (200, 0, 0), ""), camera, 2)
+        assert ((image == (200, 0, 0)).all(axis=2).sum() > 100) == seen
