@@ -21,8 +21,9 @@ _KNOWN = {
 
 
 _UNKNOWN = (90, 90, 90)
-_APART = 0.06
-"""Least distance of the colors of two classes, as ``distinct_colors.measure_distances`` has it, while there is room."""
+_APART, _ROOM = 0.06, 3.0
+"""Least distance of the colors of two classes, as ``distinct_colors.measure_distances`` has it; with more classes than
+there is room for, ``_ROOM`` over their number."""
 
 
 def assign_class_colors(names: list[str]) -> NDArray[np.uint8]:
@@ -31,13 +32,14 @@ def assign_class_colors(names: list[str]) -> NDArray[np.uint8]:
     fixed = {name: _KNOWN[name] for name in names if name in _KNOWN}
     taken = np.array([_UNKNOWN, *fixed.values()], np.uint8)
     every = every_color()
+    least = min(_APART, _ROOM / max(len(names), 1))
     room = measure_distances(every, taken).min(axis=1)
     for name in dict.fromkeys(names):
         if name in fixed:
             continue
         color = np.array([_hashed(name)], np.uint8)
-        if measure_distances(color, taken).min() < _APART:
-            apart = every[room >= _APART] if room.max() >= _APART else every[[np.argmax(room)]]
+        if measure_distances(color, taken).min() < least:
+            apart = every[room >= least] if room.max() >= least else every[[np.argmax(room)]]
             color = apart[[np.argmin(measure_distances(color, apart))]]
         fixed[name] = tuple(color[0].tolist())
         taken = np.concatenate((taken, color))
