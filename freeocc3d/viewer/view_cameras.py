@@ -40,7 +40,7 @@ def aim(scene: DrawnScene, view: str, size: tuple[int, int]) -> ViewCamera:
         low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
     half = 0.5 * (high - low)
     focus = middle + 0.5 * (low + high) @ axes[:2]
-    half_height = 1.06 * max(half[1], half[0] * size[1] / size[0], 1e-3)
+    half_height = 1.1 * max(half[1], half[0] * size[1] / size[0], 1e-3)
     distance = _FAR * max(float(np.linalg.norm(np.ptp(points, axis=0))), half_height)
     focal = 0.5 * size[1] * distance / half_height
     return _camera(focus - distance * axes[2], axes[2], up, size, focal, distance)
