@@ -21,7 +21,8 @@ app = typer.Typer(help="Fetch, export, list, verify and remove the networks that
 @app.command("pull")
 def models_pull(
     name: Annotated[
-        str, typer.Argument(metavar="words|NAME|REPO", help="A short name, or OWNER/NAME on the Hugging Face hub.")
+        str,
+        typer.Argument(metavar="words|masks|NAME|REPO", help="A short name, or OWNER/NAME on the Hugging Face hub."),
     ],
     revision: Annotated[str, typer.Option("--revision", metavar="NAME", help="Branch, tag or commit.")] = "main",
     precision: Annotated[
@@ -30,7 +31,7 @@ def models_pull(
     ] = None,
 ) -> None:
     """Fetch a model from the Hugging Face hub: "words" is the recommended
-    one for any words.
+    one for any words, "masks" the one that tells things apart for objects.
 
     A ready-made ONNX export becomes a model package, without torch; so do
     clip-b16, clip-b32, siglip-b16 and siglip2-b16. A repository with a

@@ -28,6 +28,10 @@ def objects(
         list[str] | None,
         typer.Option("--class", metavar="NAME", help="Only objects with this name, or a kind of it; repeatable."),
     ] = None,
+    masks: Annotated[
+        str | None,
+        typer.Option("--masks", metavar="NAME", help="Model whose masks of keyframes tell things apart; see models."),
+    ] = None,
     as_json: Json = False,
     html: Annotated[
         Path | None,
@@ -51,7 +55,7 @@ def objects(
     for target in files:
         refuse_existing(target, overwrite)
     loaded = load_map(map_path)
-    found = loaded.objects()
+    found = loaded.objects(masks=masks) if masks is not None else loaded.objects()
     relations = loaded.relations_of(found)
     shown = _chosen(found, class_names or [])
     if picture is not None:

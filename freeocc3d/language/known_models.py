@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 from .model_packages import Precision
 
-WORDS, RECOMMENDED = "words", "clip-b16"
-"""A name for the recommended model, and that model: with it the papers of training-free dense features report."""
+WORDS, MASKS = "words", "masks"
+RECOMMENDED = {WORDS: "clip-b16", MASKS: "slimsam"}
+"""What a model is for -> the recommended one: that with which the papers of training-free dense features report, and
+the smallest SAM."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ KNOWN = {
     "clip-b16-laion": KnownModel("laion/CLIP-ViT-B-16-laion2B-s34B-b88K", False, 599, "mit", 512, 211, "fp32"),
     "siglip-b16-google": KnownModel("google/siglip-base-patch16-224", False, 813, "apache-2.0", 768, 210, "fp32"),
     "siglip2-b16-naflex": KnownModel("google/siglip2-base-patch16-naflex", False, 1500, "apache-2.0", 768, 278, "fp32"),
+    "slimsam": KnownModel("Xenova/slimsam-77-uniform", True, 40, "apache-2.0", 256, 75, "fp32"),
+    "sam2-tiny": KnownModel("onnx-community/sam2.1-hiera-tiny-ONNX", True, 156, "apache-2.0", 256, 75, "fp32"),
     "dino-b16": KnownModel("facebook/dino-vitb16", False, 343, "apache-2.0", 768, 211, "fp32"),
     "dinov2-b14": KnownModel("facebook/dinov2-base", False, 346, "apache-2.0", 768, 306, "fp32"),
     "sam-b": KnownModel("facebook/sam-vit-base", False, 375, "apache-2.0", 256, 742, "fp32"),

@@ -28,7 +28,7 @@ from ..core.errors import ModelError
 from ..core.progress import Progress
 from ..core.regular_files import check_regular
 from . import model_packages
-from .known_models import KNOWN, NAMES, RECOMMENDED, WORDS
+from .known_models import KNOWN, NAMES, RECOMMENDED
 from .ready_made import export_layout
 from .timed_requests import Answer, NoAnswer, fetch
 from .vision_server import shorten_to_line
@@ -84,16 +84,16 @@ def pull_package(
     progress: Progress | None = None,
     precision: model_packages.Precision | None = None,
 ) -> Path:
-    """Fetches the repository OWNER/NAME, or one of NAMES ("words" is the recommended one), and returns its folder: for
-    a package, the one with its name in the models folder; for a checkpoint, one in the subfolder CHECKPOINTS. Complete
-    files are not fetched again. precision: of a ready-made export; None = the one that suits a known model, and else
-    int8, or the first that exists.
+    """Fetches the repository OWNER/NAME, or one of NAMES ("words" and "masks" are the recommended ones), and returns
+    its folder: for a package, the one with its name in the models folder; for a checkpoint, one in the subfolder
+    CHECKPOINTS. Complete files are not fetched again. precision: of a ready-made export; None = the one that suits a
+    known model, and else int8, or the first that exists.
 
     Raises ModelError if the network fails, the repository does not exist or has no usable files, or a hash differs;
     DependencyError if a package is missing that reads an export.
     """
     progress = progress or Progress()
-    name = RECOMMENDED if name == WORDS else name
+    name = RECOMMENDED.get(name, name)
     repository = NAMES.get(name, name)
     if not is_repository(name):
         raise unknown_name(name)
@@ -145,20 +145,20 @@ def pull_package(
 
 def is_repository(name: str) -> bool:
     """Whether a name stands for a repository of the hub: a short one, or OWNER/NAME."""
-    return name == WORDS or name in NAMES or re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", name) is not None
+    return name in RECOMMENDED or name in NAMES or re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", name) is not None
 
 
 def unknown_name(name: str) -> ModelError:
     """The error for a name that is no repository."""
     return ModelError(
         f"'{name}' is neither an installed model nor a repository OWNER/NAME of the hub"
-        f"{model_packages.nearest(name, (WORDS, *NAMES))}. Short names are {WORDS}, {', '.join(NAMES)}."
+        f"{model_packages.nearest(name, (*RECOMMENDED, *NAMES))}. Short names are {', '.join((*RECOMMENDED, *NAMES))}."
     )
 
 
 def local_name(name: str) -> str:
     """The name of a repository's folder in the models folder."""
-    name = RECOMMENDED if name == WORDS else name
+    name = RECOMMENDED.get(name, name)
     return name.split("/")[1] if name not in NAMES and is_repository(name) else name
 
 
@@ -180,12 +180,18 @@ def _make_package(
     fetched: Path, target: Path, repository: str, precision: model_packages.Precision, progress: Progress
 ) -> None:
     """Makes the package of a fetched export, and removes what was fetched."""
-    from .ready_made.export_packages import package_of_export
+    if (fetched / export_layout.graph_names(export_layout.MASK_GRAPHS, precision)[0]).exists():
+        from .ready_made.mask_packages import package_of_mask_export
 
-    progress.stage("cutting the vision graph before its last attention")
-    _, lacks = package_of_export(fetched, target, repository, precision)
-    if lacks:
-        progress.warn(lacks)
+        progress.stage("joining points to the graph of masks")
+        package_of_mask_export(fetched, target, repository, precision)
+    else:
+        from .ready_made.export_packages import package_of_export
+
+        progress.stage("cutting the vision graph before its last attention")
+        _, lacks = package_of_export(fetched, target, repository, precision)
+        if lacks:
+            progress.warn(lacks)
     shutil.rmtree(fetched)
 
 

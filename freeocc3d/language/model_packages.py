@@ -67,6 +67,10 @@ KINDS: dict[str, dict[str, Graph]] = {
         "image": Graph(("image",), ("features", "attention")),
         "masks": Graph(("features", "points"), ("masks", "scores")),
     },
+    "prompts": {
+        "image": Graph(("image",), ("features",)),
+        "masks": Graph(("features", "points"), ("masks", "scores")),
+    },
 }
 """Kind of package -> its networks. B images of H x W pixels; N = prefix tokens + h w patches, row by row.
 
@@ -82,6 +86,7 @@ backbone: patch ``features`` (B, h, w, C) in their own space.
 sam: ``features`` (B, C, h, w) and the last block's ``attention`` (B, h w, h w), mean over heads; ``masks`` takes
 ``points`` (B, P, 2), x and y in the pixels of the input, and gives for each ``masks`` (B, P, 3, 4 h, 4 w) logits and
 ``scores`` (B, P, 3), the network's own estimates of their IoU.
+prompts: the same for one image, without attention and with ``features`` (1, n) that only ``masks`` reads.
 """
 
 
@@ -92,7 +97,8 @@ class Package:
     parts: part ("image", "text", "tokenizer"…) -> file name.  files: file name -> sha256.  dimension: D of features.
     mean, std: (3,) of RGB in 0…1.  patch: edge of a patch in pixels.  input_size: edge of the training images in
     pixels.  prefix_tokens: number of tokens before those of the patches.  logit_scale: factor of the cosines in
-    training, one over the softmax temperature.
+    training, one over the softmax temperature.  stretched: whether a square input shows the whole image stretched, as
+    SAM 2 expects it; otherwise the image is at the upper left.
     """
 
     folder: Path
@@ -110,6 +116,7 @@ class Package:
     logit_scale: float
     parts: Mapping[str, str]
     files: Mapping[str, str]
+    stretched: bool = False
 
     @property
     def bytes(self) -> int:
@@ -274,6 +281,7 @@ class _Manifest(msgspec.Struct):
     files: dict[str, str]
     prefix_tokens: Annotated[int, Meta(ge=0, le=1024)] = 0
     logit_scale: Annotated[float, Meta(ge=1e-3, le=1e6)] = 100.0
+    stretched: bool = False
 
 
 def parse_manifest(manifest: Any, folder: Path, path: Path) -> Package:

@@ -50,7 +50,7 @@ def find_best() -> Package | None:
     usable = [own for own in model_packages.list_installed().values() if isinstance(own, Package) and own.kind in kinds]
 
     def rank(own: Package) -> tuple[object, ...]:
-        recommended = own.folder.name == known_models.RECOMMENDED
+        recommended = own.folder.name == known_models.RECOMMENDED[known_models.WORDS]
         return not recommended, kinds.index(own.kind), own.patch, -own.dimension, own.folder.name
 
     return min(usable, key=rank, default=None)

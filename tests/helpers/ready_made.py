@@ -73,7 +73,7 @@ def write_export(folder: Path, kind: str, precision: str = "fp32", attention: st
                 own.eval(), (given,), str(path), input_names=[name], output_names=outputs, opset_version=14,
                 dynamic_axes={name: axes, **{output: {0: "batch"} for output in outputs}}, dynamo=False,
             )  # fmt: skip
-        _convert(path, precision)
+        convert(path, precision)
     side = {"height": 32, "width": 32}
     text = {"max_position_embeddings": LENGTH[kind], "pad_token_id": 1}
     (folder / "config.json").write_text(json.dumps({"model_type": kind, "text_config": text}))
@@ -84,7 +84,8 @@ def write_export(folder: Path, kind: str, precision: str = "fp32", attention: st
     return folder
 
 
-def _convert(path: Path, precision: str) -> None:
+def convert(path: Path, precision: str) -> None:
+    """Replaces a graph in fp32 by one of the precision, with its suffix."""
     target = path.with_name(f"{path.stem}{SUFFIX[precision]}.onnx")
     if precision == "fp16":
         from onnxruntime.transformers.float16 import convert_float_to_float16

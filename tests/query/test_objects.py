@@ -54,7 +54,7 @@ def test_an_object_has_the_mean_feature_of_its_voxels_and_its_nearest_name() -> 
 
 
 def test_classes_divide_a_map_only_where_its_views_agree_about_them(monkeypatch) -> None:
-    monkeypatch.setattr(surface_instances, "divide_surface", lambda scan_map: np.array([7, 5, -1]))
+    monkeypatch.setattr(surface_instances, "divide_surface", lambda scan_map, *_: np.array([7, 5, -1]))
     coffee, wall = cells.feature(COFFEE=1), cells.feature(WALL=1)
     table, behind = cells.box((0, 0, 0), (4, 4, 1), coffee), cells.box((0, 5, 0), (4, 6, 4), wall)
     for cup in (cells.feature(CUP=1), cells.feature(CUP=1, COFFEE=1)):

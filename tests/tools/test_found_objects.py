@@ -7,6 +7,17 @@ from benchmark import objects
 from freeocc3d.evaluation.true_occupancy import GroundTruth
 
 
+def test_masks_are_split_joined_and_missing_at_random() -> None:
+    classes = np.repeat(np.repeat(np.arange(16, dtype=np.uint8).reshape(4, 4) + 1, 8, axis=0), 8, axis=1)
+    whole = objects.disturb_masks(classes, 0.0, np.random.default_rng(0))
+    assert len(np.unique(np.stack((whole, classes)).reshape(2, -1), axis=1).T) == 16
+    wrong = objects.disturb_masks(classes, 0.3, np.random.default_rng(0))
+    both = np.unique(np.stack((wrong, classes)).reshape(2, -1), axis=1)
+    assert (wrong == 0).any()
+    assert np.bincount(both[0][both[0] > 0]).max() > 1  # a mask of several things
+    assert np.bincount(both[1]).max() > 1  # a thing of several masks
+
+
 def test_found_things_and_wrong_objects_are_counted_and_stuff_is_left_out() -> None:
     labels = np.zeros((40, 10, 10), np.uint8)
     instance = np.full(labels.shape, -1)

@@ -42,7 +42,7 @@ def write_package(folder: str) -> Figures:
     from transformers import CLIPConfig, CLIPModel
 
     from freeocc3d.language.model_export.tokenizer_files import clip_tokenizer_from
-    from freeocc3d.language.ready_made.export_layout import graph_names
+    from freeocc3d.language.ready_made.export_layout import WORD_GRAPHS, graph_names
     from freeocc3d.language.ready_made.export_packages import package_of_export
 
     logging.disable()
@@ -71,7 +71,7 @@ def write_package(folder: str) -> Figures:
         (Tower(model.vision_model, model.visual_projection), images, "pixel_values", "image_embeds"),
         (Tower(model.text_model, model.text_projection), texts, "input_ids", "text_embeds"),
     )
-    for path, (tower, given, name, output) in zip(graph_names("int8"), towers, strict=True):
+    for path, (tower, given, name, output) in zip(graph_names(WORD_GRAPHS, "int8"), towers, strict=True):
         whole = root / "whole.onnx"
         axes = {name: {0: "batch"} | ({1: "length"} if name == "input_ids" else {}), output: {0: "batch"}}
         with torch.no_grad():

@@ -36,6 +36,11 @@ WAYS = {
     "colors, own poses": {"language": {"encoder": "color"}},
     "colors, given poses": {"language": {"encoder": "color"}, "tracking": {"backend": "known"}},
 }
+MASKED = "colors, own poses"
+MISTAKES = {"true masks": 0.0, "masks, a fifth wrong": 0.2, "masks, two fifths wrong": 0.4}
+"""The same map divided by masks -> the share of masks that is split, the share joined to a neighbor, and the share
+missing: each at random, anew in each keyframe. The masks are the connected components of the capture's class images,
+without their names. A network's mistakes are not random: parts that all views separate are not simulated."""
 COUNTS: dict[str, tuple[tuple[str, ...], bool]] = {
     "things": (STUFF, True),
     "all_classes": ((), True),
@@ -53,17 +58,58 @@ def measure_objects(capture: str) -> Figures:
     for name, settings in WAYS.items():
         with tempfile.TemporaryDirectory() as folder:
             made = reconstruct(capture, Path(folder) / "map", settings, progress=Progress())
-            rows[name] = score_objects(made, Path(capture) / "ground_truth.npz")
+            truth = Path(capture) / "ground_truth.npz"
+            rows[name] = score_objects(made, truth)
+            if name == MASKED:
+                for masked, share in MISTAKES.items():
+                    rows[f"{name}, {masked}"] = score_objects(made, truth, _simulate_masks(capture, share))
     return rows
 
 
-def score_objects(scan_map: Any, truth_path: Path) -> Figures:
+def _simulate_masks(capture: str, share: float) -> Any:
+    """Gives the masks of a frame, with that share of each mistake."""
+    from freeocc3d.capture.opening import open_capture
+    from freeocc3d.language.encoders import labels
+
+    images, rng = labels.load(labels.Options(), open_capture(capture)).images, np.random.default_rng(0)
+    return lambda frame: disturb_masks(images(frame.index), share, rng)
+
+
+def disturb_masks(classes: Any, share: float, rng: Any) -> Any:
+    """(H, W) masks: the components of a class image, of which that share is joined, split, and missing."""
+    from scipy import ndimage
+
+    masks = np.zeros(classes.shape, np.int32)
+    for k in np.unique(classes[classes > 0]):
+        component, _ = ndimage.label(classes == k, np.ones((3, 3)))
+        masks[component > 0] = component[component > 0] + masks.max()
+    count = int(masks.max())
+    pairs = np.concatenate([np.stack((a.ravel(), b.ravel()), axis=1) for a, b in
+                            ((masks[:, :-1], masks[:, 1:]), (masks[:-1], masks[1:]))])  # fmt: skip
+    pairs = np.unique(pairs[(pairs[:, 0] != pairs[:, 1]) & pairs.all(axis=1)], axis=0)
+    becomes = np.arange(count + 1)
+    for a, b in pairs[rng.permutation(len(pairs))]:
+        if becomes[a] == a and rng.random() < share:
+            becomes[becomes == a] = becomes[b]
+    masks = becomes[masks].astype(np.int32)
+    for k in np.flatnonzero(rng.random(count + 1) < share):
+        rows, columns = np.nonzero(masks == k)
+        if k and len(rows):
+            angle, at = rng.random() * np.pi, rng.integers(len(rows))
+            far = (rows - rows[at]) * np.sin(angle) + (columns - columns[at]) * np.cos(angle) > 0
+            masks[rows[far], columns[far]] = masks.max() + 1
+    masks[np.isin(masks, np.flatnonzero(rng.random(masks.max() + 1) < share))] = 0
+    return masks
+
+
+def score_objects(scan_map: Any, truth_path: Path, segment: Any = None) -> Figures:
     """Recall and precision of a map's objects; ``missed`` and ``wrong`` name the mistakes, with the best IoU."""
     from freeocc3d.evaluation.ground_truth import load_ground_truth
+    from freeocc3d.query.objects.finding import find_objects
 
     truth = load_ground_truth(truth_path)
     start = time.perf_counter()
-    objects = scan_map.objects()
+    objects = scan_map.objects() if segment is None else find_objects(scan_map, segment=segment)
     seconds = time.perf_counter() - start
     occupied, instance = _on_lattice(scan_map, truth, objects)
     figures: Figures = {"seconds": seconds, "objects": len(objects)}
@@ -167,6 +213,6 @@ def tabulate_objects(rows: Sequence[Figures]) -> list[str]:
             )
             for row in rows
             for name, found in row.items()
-            if name in WAYS
+            if name.startswith(tuple(WAYS))
         ],
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -12,19 +12,17 @@ import onnx
 from msgspec import Meta
 
 from ...core.errors import ModelError
-from ...core.onnx_files import find_external_files
 from ...core.regular_files import read_text
-from ...core.typed_documents import InvalidDocument, as_type, parse_json
 from .. import model_packages
 from ..model_export.tokenizer_files import clip_tokenizer, siglip_tokenizer
 from ..package_files import stated_licence, write_files
-from .export_layout import LARGEST_TOKENIZER, graph_names
-from .onnx_graphs import FLOAT, Additions, CutError, OnnxGraph, join, run_model, sign_weights
+from .export_files import Side, Size, load_graph, read_document, save_graph
+from .export_layout import LARGEST_TOKENIZER, WORD_GRAPHS, graph_names
+from .onnx_graphs import FLOAT, Additions, CutError, OnnxGraph, join, run_model
 from .pooling_cut import cut_pooling
 from .text_cut import cut_text
 from .vision_cut import cut_vision
 
-_LARGEST_CONFIG = 1 << 20
 _OUTPUTS = {"clip": ("image_embeds", "text_embeds"), "siglip": ("pooler_output", "pooler_output")}
 _TOKENS = {"clip": 77, "siglip": 64}
 _SIDE = 224
@@ -39,13 +37,7 @@ _SCALES = {"clip": 100.0, "siglip": 117.3308, "siglip2": 112.6689}
 differ by some percent. Graphs of single towers do not hold them, and config.json states what training began with.
 CLIP's training bounds the scale by 100, which all published models reach."""
 
-_Side = Annotated[int, Meta(ge=16, le=4096)]
 _Length = Annotated[int, Meta(ge=8, le=4096)]
-
-
-class _Size(msgspec.Struct):
-    height: _Side | None = None
-    shortest_edge: _Side | None = None
 
 
 class _TextConfig(msgspec.Struct):
@@ -55,7 +47,7 @@ class _TextConfig(msgspec.Struct):
 
 
 class _VisionConfig(msgspec.Struct):
-    image_size: _Side | None = None
+    image_size: Side | None = None
 
 
 class _Config(msgspec.Struct):
@@ -72,8 +64,8 @@ class _Preprocessing(msgspec.Struct):
     do_normalize: bool = True
     image_mean: tuple[float, float, float] | None = None
     image_std: tuple[float, float, float] | None = None
-    crop_size: _Size | _Side | None = None
-    size: _Size | _Side | None = None
+    crop_size: Size | Side | None = None
+    size: Size | Side | None = None
 
 
 def package_of_export(
@@ -83,15 +75,15 @@ def package_of_export(
 
     Where the vision graph cannot be cut, the package is of kind "windows". Raises ModelError.
     """
-    config = _read(folder / "config.json", _Config)
-    preprocessing = _read(folder / "preprocessor_config.json", _Preprocessing)
+    config = read_document(folder / "config.json", _Config)
+    preprocessing = read_document(folder / "preprocessor_config.json", _Preprocessing)
     family = "siglip" if config.model_type.startswith("siglip") else config.model_type.split("_")[0]
     if family not in _OUTPUTS:
         raise ModelError(f"{source} is a model of type '{config.model_type[:40]}': clip and siglip can be used.")
     side = _side(preprocessing.crop_size) or _side(preprocessing.size) or config.vision_config.image_size or _SIDE
     longest = config.text_config.max_position_embeddings or _TOKENS[family]
-    graphs = [_load(folder, name, source) for name in graph_names(precision)]
-    for graph, name, output in zip(graphs, graph_names(precision), _OUTPUTS[family], strict=True):
+    graphs = [load_graph(folder, name, source) for name in graph_names(WORD_GRAPHS, precision)]
+    for graph, name, output in zip(graphs, graph_names(WORD_GRAPHS, precision), _OUTPUTS[family], strict=True):
         if output not in (found := [own.name for own in graph.graph.output]):
             raise ModelError(
                 f"{name} of {source} gives {', '.join(found)[:80]} instead of {output}: it is no {family}."
@@ -106,7 +98,7 @@ def package_of_export(
     try:
         text, fixed = cut_text(graphs[1], _OUTPUTS[family][1], facts["dimension"], longest, side)
     except CutError as error:
-        raise ModelError(f"{graph_names(precision)[1]} of {source} cannot be used: {error}.") from error
+        raise ModelError(f"{graph_names(WORD_GRAPHS, precision)[1]} of {source} cannot be used: {error}.") from error
     mean, std = _STATISTICS[family]
     if preprocessing.do_normalize:
         mean, std = list(preprocessing.image_mean or mean), list(preprocessing.image_std or std)
@@ -119,48 +111,12 @@ def package_of_export(
         "logit_scale": _SCALES["siglip2" if second else family], "licence": stated_licence(folder), "source": source,
     }  # fmt: skip
     tokenizer = _tokenizer(folder, family, longest, fixed, second, config.text_config.pad_token_id)
-    networks = {part: functools.partial(_save, network) for part, network in {**vision, "text": text}.items()}
+    networks = {part: functools.partial(save_graph, network) for part, network in {**vision, "text": text}.items()}
     return write_files(target, manifest, networks, tokenizer), lacks
 
 
-def _read(path: Path, kind: Any) -> Any:
-    """A JSON file as a typed document. Raises ModelError."""
-    try:
-        return as_type(parse_json(read_text(path, _LARGEST_CONFIG)), kind)
-    except OSError as error:
-        raise ModelError(f"Cannot read {path}: {error.strerror}.") from error
-    except (ValueError, InvalidDocument) as error:
-        raise ModelError(
-            f"{path} is not the configuration of a CLIP or SigLIP: {' '.join(str(error).split())}."
-        ) from error
-
-
-def _side(size: _Size | int | None) -> int | None:
-    return (size.height or size.shortest_edge) if isinstance(size, _Size) else size
-
-
-def _load(folder: Path, name: str, source: str) -> onnx.ModelProto:
-    """A graph of the export, with weights that it keeps beside it. Raises ModelError."""
-    path = folder / name
-    try:
-        for outside in find_external_files(path):
-            if not model_packages.is_plain_name(outside) or not (path.parent / outside).is_file():
-                raise ModelError(
-                    f"{name} of {source} keeps weights in '{outside[:80]}', which is no file beside it: it is refused."
-                )
-        model = onnx.load(path)
-        sign_weights(model)
-        return model
-    except OSError as error:
-        raise ModelError(f"Cannot read {path}: {error.strerror}.") from error
-    except ModelError:
-        raise
-    except Exception as error:  # protobuf's errors share no base class
-        raise ModelError(f"{name} of {source} is not an ONNX network that can be read.") from error
-
-
-def _save(model: onnx.ModelProto, path: Path) -> None:
-    onnx.save(model, path)
+def _side(size: Size | int | None) -> int | None:
+    return (size.height or size.shortest_edge) if isinstance(size, Size) else size
 
 
 def _without_attention(
@@ -168,7 +124,7 @@ def _without_attention(
 ) -> tuple[str, dict[str, onnx.ModelProto], dict[str, int], str]:
     """Kind, networks and facts of a graph whose last attention cannot be replaced, and what it lacks. Raises
     ModelError."""
-    name = graph_names(precision)[0]
+    name = graph_names(WORD_GRAPHS, precision)[0]
     try:
         cut = cut_pooling(model, output, side)
     except CutError:

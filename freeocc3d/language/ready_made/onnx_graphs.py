@@ -132,10 +132,12 @@ def _int8_is_exact() -> bool:
 
 
 def taken_by(node: onnx.NodeProto) -> list[str]:
-    """The tensors that a node takes, also inside its branches."""
-    inside = (
-        name for own in node.attribute for part in (own.g, *own.graphs) for n in part.node for name in taken_by(n)
-    )
+    """The tensors that a node takes, also inside its branches, without those that are made there."""
+    inside: list[str] = []
+    for part in (part for own in node.attribute for part in (own.g, *own.graphs)):
+        made = {name for n in part.node for name in n.output} | {own.name for own in (*part.input, *part.initializer)}
+        inside += (name for n in part.node for name in taken_by(n) if name not in made)
+        inside += (own.name for own in part.output if own.name not in made)
     return [*(name for name in node.input if name), *inside]
 
 

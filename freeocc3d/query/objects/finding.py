@@ -13,21 +13,22 @@ from ...storage.saved_map import SavedMap
 from ..oriented_boxes import oriented_boxes
 from ..regions import best_regions
 from .instances import divide_into_instances
-from .object import Object, Options
+from .object import Object, Options, Segment
 
 _MOST_REGIONS = 1 << 31
 
 
-def find_objects(scan_map: SavedMap, options: Options | None = None) -> list[Object]:
+def find_objects(scan_map: SavedMap, options: Options | None = None, segment: Segment | None = None) -> list[Object]:
     """Returns the objects of a map, highest confidence first. Walls, floors and ceilings are no objects.
 
-    Raises MapError for a damaged map.
+    segment: gives the masks of a keyframe, instead of the model that the options name. Raises MapError for a damaged
+    map, ModelError for a model of masks that does not exist or fails.
     """
     from ..best_views import best_views
     from .view_features import embed_views
 
     options = options or Options()
-    instance = divide_into_instances(scan_map)
+    instance = divide_into_instances(scan_map, segment or _load_masks(options), options.mask_keyframes)
     rows = np.flatnonzero(instance >= 0)
     instance = instance[rows]
     large = np.bincount(instance, minlength=1) >= options.min_voxels
@@ -48,6 +49,16 @@ def find_objects(scan_map: SavedMap, options: Options | None = None) -> list[Obj
         Object(np.sort(region.rows), own, names, box, region.volume_m3, region.centroid, tuple(seen), region.score)
         for region, own, names, box, seen in zip(regions, feature, named, boxes, views, strict=True)
     ]
+
+
+def _load_masks(options: Options) -> Segment | None:
+    """What gives the masks of a keyframe, if the options name a model."""
+    if not options.masks:
+        return None
+    from ...language.mask_networks import load_mask_network
+
+    network = load_mask_network(options.masks, "masks", options.mask_points)
+    return lambda frame: network.segment(frame.color)
 
 
 def name_objects(scan_map: SavedMap, feature: NDArray[np.float32], most: int) -> list[tuple[tuple[str, float], ...]]:

@@ -12,6 +12,7 @@ from ...occupancy.connected_components import label_components
 from ...storage.saved_map import SavedMap
 from ..region_splitting import cut_necks
 from ..word_query import Options, nearest_word
+from .object import Segment
 
 STRUCTURE = ("wall", "floor", "ceiling")
 """The surfaces that bound a room. They, and classes that are kinds of them, are no objects."""
@@ -23,18 +24,21 @@ images tell things apart. Class images made by hand or drawn agree nearly everyw
 view at a third of the voxels or more, and cut things into pieces."""
 
 
-def divide_into_instances(scan_map: SavedMap) -> NDArray[np.int64]:
+def divide_into_instances(scan_map: SavedMap, segment: Segment | None = None, most: int = 1) -> NDArray[np.int64]:
     """Returns the (V,) instance of each occupied voxel, 0 … N-1; -1 for those of no object.
 
     In a map with classes about which the views agree, the instances are the connected components of each class, cut at
     their necks; in others, the shape and the colors of the surface divide it.
+    segment: gives the masks of a keyframe; with it, the masks of up to ``most`` keyframes divide the surface.
     """
     text_encoder = scan_map.text_encoder
-    instance = _divide_classes(scan_map, text_encoder) if isinstance(text_encoder, LabelWords) else None
+    instance = (
+        _divide_classes(scan_map, text_encoder) if segment is None and isinstance(text_encoder, LabelWords) else None
+    )
     if instance is None:
         from .surface_instances import divide_surface
 
-        instance = divide_surface(scan_map)
+        instance = divide_surface(scan_map, segment, most)
     found = instance >= 0
     instance[found] = np.unique(instance[found], return_inverse=True)[1]
     return instance

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from ...core.types import Frame
 from ...settings.option_types import PositiveInt
 from ...settings.typed_options import TypedOptions
 
 if TYPE_CHECKING:
     from ..best_views import RegionView
     from ..oriented_boxes import OrientedBox
+
+
+Segment = Callable[[Frame], NDArray[np.integer]]
+"""Gives the (H, W) number of the mask at each pixel of a frame, from 1; 0 = none."""
 
 
 class Options(TypedOptions, frozen=True):
@@ -25,6 +32,13 @@ class Options(TypedOptions, frozen=True):
     """Most names of an object."""
     views: PositiveInt = 3
     """Most keyframes of an object."""
+    masks: str = ""
+    """Folder of a model of kind "prompts" or "sam", or its name: masks of keyframes then divide the surface into
+    things. Empty = class images or the surface alone do."""
+    mask_keyframes: PositiveInt = 40
+    """Most keyframes of which masks are made: the time is proportional."""
+    mask_points: Annotated[int, Meta(ge=1, le=64)] = 16
+    """Points along the longer side of a keyframe at which the model is asked for masks."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from ...core.transforms import transform
 from ...core.types import Occupancy
 from ...storage.saved_map import SavedMap
 from .agglomeration import agglomerate
+from .object import Segment
 from .structure import find_floor, find_structure
 from .surfels import Surfels, take_surfels
 
@@ -29,13 +30,21 @@ _LIGHTNESS = 0.5
 _LEAST_WEIGHT = -4.0  # one corner must not outweigh a long smooth seam
 
 
-def divide_surface(scan_map: SavedMap) -> NDArray[np.int64]:
-    """Returns the (V,) thing of each occupied voxel; -1 for those of floor, walls and ceiling."""
+def divide_surface(scan_map: SavedMap, segment: Segment | None = None, most: int = 1) -> NDArray[np.int64]:
+    """Returns the (V,) thing of each occupied voxel; -1 for those of floor, walls and ceiling.
+
+    segment: gives the masks of a keyframe, which then divide the surface: those of up to ``most`` keyframes; see
+    ``mask_votes``.
+    """
     occupancy = scan_map.occupancy
     if not len(scan_map.gaussians):
         return np.full(len(occupancy.occupied_voxels()), -1)
     surfels = take_surfels(scan_map)
-    thing = divide_surfels(surfels, occupancy, scan_map.T_gravity_map)
+    outside = ~_find_bounds(surfels, occupancy, scan_map.T_gravity_map)
+    if segment is None:
+        thing = _merge_alike(surfels, find_parts(surfels, outside, _PART))
+    else:
+        thing = _divide_by_masks(scan_map, surfels, outside, segment, most)
     centers = occupancy.centers(occupancy.occupied_voxels(), occupancy.occupied_edges())
     return _vote(surfels.points, thing, transform(scan_map.T_gravity_map, centers))
 
@@ -45,20 +54,45 @@ def divide_surfels(surfels: Surfels, occupancy: Occupancy, T_gravity_map: NDArra
 
     T_gravity_map: (4, 4) from the frame of the occupancy to that of the surfels.
     """
+    outside = ~_find_bounds(surfels, occupancy, T_gravity_map)
+    return _merge_alike(surfels, find_parts(surfels, outside, _PART))
+
+
+def _find_bounds(surfels: Surfels, occupancy: Occupancy, T_gravity_map: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Returns the (N,) surfels of floor, walls and ceiling."""
     floor = find_floor(surfels, occupancy.voxel_size)
     smooth = find_parts(surfels, ~floor, _SMOOTH)
     bounds = find_structure(surfels, smooth, occupancy, T_gravity_map) & ~floor
-    structure = floor | (bounds & ~_differs(surfels, np.where(bounds, smooth, -1)))
-    return _merge_alike(surfels, find_parts(surfels, ~structure, _PART))
+    return np.asarray(floor | (bounds & ~_differs(surfels, np.where(bounds, smooth, -1))))
+
+
+def _divide_by_masks(
+    scan_map: SavedMap,
+    surfels: Surfels,
+    chosen: NDArray[np.bool_],
+    segment: Segment,
+    most: int,
+) -> NDArray[np.int64]:
+    """Returns the (N,) thing of each chosen surfel by the masks of keyframes, -1 for others."""
+    from .mask_votes import count_votes, weigh_votes
+
+    pairs = surfels.pairs[chosen[surfels.pairs].all(axis=1)]
+    votes = count_votes(scan_map, pairs, segment, most)
+    shape = np.clip(_weigh_shape(surfels, pairs, _PART), -1, 1)
+    return np.where(chosen, agglomerate(len(surfels), pairs, weigh_votes(*votes, shape)), -1)
 
 
 def find_parts(surfels: Surfels, chosen: NDArray[np.bool_], concavity: float) -> NDArray[np.int64]:
     """Returns the (N,) part of each chosen surfel, -1 for others: surface without corners or steps."""
     pairs = surfels.pairs[chosen[surfels.pairs].all(axis=1)]
-    steps = np.maximum(surfels.steps(pairs) - _STEP, 0)
-    weights = 1 - np.maximum(surfels.concavities(pairs), 0) / concavity - steps
-    part = agglomerate(len(surfels), pairs, np.maximum(weights, _LEAST_WEIGHT))
+    part = agglomerate(len(surfels), pairs, np.maximum(_weigh_shape(surfels, pairs, concavity), _LEAST_WEIGHT))
     return np.where(chosen, part, -1)
+
+
+def _weigh_shape(surfels: Surfels, pairs: NDArray[np.int64], concavity: float) -> NDArray[np.float64]:
+    """(P,) up to 1, for pairs of one part; negative beyond a concavity, or a step."""
+    steps = np.maximum(surfels.steps(pairs) - _STEP, 0)
+    return np.asarray(1 - np.maximum(surfels.concavities(pairs), 0) / concavity - steps)
 
 
 def _differs(surfels: Surfels, wall: NDArray[np.int64]) -> NDArray[np.bool_]:
