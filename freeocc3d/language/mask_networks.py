@@ -100,7 +100,7 @@ def measure_stability(logits: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def suppress_masks(masks: NDArray[np.bool_], scores: NDArray[np.float32]) -> NDArray[np.int64]:
     """Rows of the (M, h, w) masks that are not nearly the same as one with a higher score, best first."""
-    flat = masks.reshape(len(masks), -1).astype(np.float32)
+    flat = masks.reshape(len(masks), masks.shape[1] * masks.shape[2]).astype(np.float32)
     shared, size = flat @ flat.T, flat.sum(axis=1)
     same = shared > _SAME * (size[:, None] + size - shared)
     kept = np.ones(len(masks), bool)

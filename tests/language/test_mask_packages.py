@@ -83,6 +83,8 @@ def test_masks_are_stable_different_and_painted_the_smallest_last() -> None:
     assert kept.tolist() == [1, 2]
     painted = mask_networks.paint_masks(masks[kept])
     assert (painted[0, 0], painted[5, 5], painted[8, 8]) == (2, 1, 0)
+    none = masks[:0]
+    assert not mask_networks.paint_masks(none[mask_networks.suppress_masks(none, np.zeros(0, np.float32))]).any()
     logits = np.where(masks[:2], np.array([5.0, 0.5], np.float32)[:, None, None], -5)
     assert mask_networks.measure_stability(logits).tolist() == [1, 0]
     points = mask_networks.spread_points(30, 60, 4)
