@@ -38,9 +38,10 @@ WAYS = {
 }
 MASKED = "colors, own poses"
 MISTAKES = {"true masks": 0.0, "masks, a fifth wrong": 0.2, "masks, two fifths wrong": 0.4}
-"""The same map divided by masks -> the share of masks that is split, the share joined to a neighbor, and the share
-missing: each at random, anew in each keyframe. The masks are the connected components of the capture's class images,
-without their names. A network's mistakes are not random: parts that all views separate are not simulated."""
+"""The same map divided by masks -> the share of masks that is split, of borders over which they are joined, and of
+masks that are missing: each at random, anew in each keyframe. The masks are the connected components of the capture's
+class images, without their names. A network's mistakes are not random: parts that all views separate are not
+simulated."""
 COUNTS: dict[str, tuple[tuple[str, ...], bool]] = {
     "things": (STUFF, True),
     "all_classes": ((), True),
@@ -76,7 +77,7 @@ def _simulate_masks(capture: str, share: float) -> Any:
 
 
 def disturb_masks(classes: Any, share: float, rng: Any) -> Any:
-    """(H, W) masks: the components of a class image, of which that share is joined, split, and missing."""
+    """(H, W) masks: the components of a class image; that share is split, and missing, and of borders joined."""
     from scipy import ndimage
 
     masks = np.zeros(classes.shape, np.int32)
