@@ -83,7 +83,14 @@ class Ranking:
     top: Annotated[int | None, typer.Option("--top", min=1, metavar="K", help="At most K regions for each word.")] = (
         None
     )
-    objects: Annotated[bool, flag("--objects", "Answer with whole objects first, then with what else matches.")] = False
+    objects: Annotated[
+        bool | None,
+        flag(
+            "--objects/--voxels",
+            "Whole objects first and then what else matches, or regions of voxels alone. By default objects, if the "
+            "map keeps them, as maps with words do.",
+        ),
+    ] = None
     threshold: Annotated[
         float | None, typer.Option("--threshold", min=-1, max=1, metavar="T", help="Lowest score of a match, -1 to 1.")
     ] = None

@@ -30,6 +30,7 @@ from ..gaussians.surface_cells import cell_keys
 from ..language.feature_codec import Codec
 from ..occupancy import build, carve, levels, splat
 from ..occupancy.confirmed_depth import hide_unconfirmed
+from ..query.objects.keeping import find_kept_objects
 from ..query.scan_map import Map, load_map
 from ..settings.config import Settings
 from ..storage.manifest import Refined
@@ -160,6 +161,7 @@ def refine_where_needed(
             occupancy,
             Codec.fit(np.asarray(occupancy.features)),
             scan_map.gaussian_features,
+            find_objects=find_kept_objects,
         )
         write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)

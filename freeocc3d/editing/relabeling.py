@@ -19,6 +19,7 @@ from ..language.model_packages import Package
 from ..language.word_models import use_package
 from ..occupancy import build
 from ..query.chance import record_encoder
+from ..query.objects.keeping import find_kept_objects
 from ..query.scan_map import Map, load_map
 from ..storage.work_folder import WorkFolder
 from ..storage.writer import MapParts, write_changed_map
@@ -64,6 +65,7 @@ def relabel_map(
             relabeled,
             Codec.fit(features),
             features,
+            find_objects=lambda folder: find_kept_objects(folder, encoder),
         )
         write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)
@@ -72,6 +74,6 @@ def relabel_map(
 def _report(scan_map: Map, seconds: Mapping[str, float]) -> dict[str, Any]:
     """The report of the run that made the map, but for the time of the features that are gone, with the time that the
     new ones took."""
-    kept = {stage: value for stage, value in scan_map.report["seconds"].items() if stage != "language"}
+    kept = {stage: value for stage, value in scan_map.report["seconds"].items() if stage not in ("language", "objects")}
     own = {stage: round(value, 3) for stage, value in seconds.items()}
     return {**scan_map.report, "seconds": kept, "relabeled": {"map": str(scan_map.path), "seconds": own}}

@@ -22,6 +22,7 @@ from ..core.errors import FreeOccError, MapError
 from ..core.transforms import back_project, transform
 from ..core.types import Gaussians, Trajectory
 from ..core.warnings import read_notices
+from ..query.objects.keeping import find_kept_objects
 from ..query.scan_map import Map, load_map
 from ..settings.config import Settings
 from ..storage import map_files
@@ -65,6 +66,7 @@ def scale_map(scan_map: Map, factor: float, by: str, output: str | Path, *, over
             keyframes=scan_map.keyframes,
             depth_factor=factor,
             draw=lambda folder: draw_pictures(scan_map, folder, trajectory, gaussians, scan_map.up, factor),
+            find_objects=find_kept_objects,
         )
         write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)

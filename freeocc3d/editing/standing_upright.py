@@ -22,6 +22,7 @@ from ..gaussians import anchors
 from ..language.feature_codec import Codec
 from ..occupancy import build
 from ..occupancy.confirmed_depth import hide_unconfirmed
+from ..query.objects.keeping import find_kept_objects
 from ..query.scan_map import Map, load_map
 from ..storage.manifest import Manifest, Upright, matrix
 from ..storage.work_folder import WorkFolder
@@ -63,6 +64,7 @@ def stand_upright(
             gaussians,
             trajectory,
             draw=lambda folder: draw_pictures(scan_map, folder, trajectory, gaussians, np.array((0.0, 0.0, 1.0))),
+            find_objects=find_kept_objects,
         )
         write_changed_map(scan_map, work, Path(output), parts)
     return load_map(output)

@@ -82,7 +82,7 @@ def write_layers(
     low = there.occupancy.centers(voxels)[:, 2] <= highest
     offset = np.rint((grid.origin - there.occupancy.origin[:2]) / grid.size).astype(np.int64)
     every = max(len(scan_map.occupancy.colors), 1)
-    results = scan_map.query_words([one.word for one in avoided], top_k=every)
+    results = scan_map.query_words([one.word for one in avoided], objects=False, top_k=every)
     together, layers, notes = np.zeros(grid.shape, np.uint8), [], []
     for one, result in zip(avoided, results, strict=True):
         if not result.understood:

@@ -17,6 +17,7 @@ from ..gaussians import rendered_views
 from ..language.encoders.base import Encoder
 from ..language.feature_codec import Codec
 from ..query.chance import record_encoder
+from ..query.objects.keeping import find_kept_objects
 from ..storage import map_files
 from ..storage.manifest import (
     CaptureRecord,
@@ -88,7 +89,7 @@ def save(
             codec = Codec.fit(features)
         parts = MapParts(
             facts, settings, report, occupancy, codec, features, gaussians, trajectory, mapper.mapped(trajectory),
-            draw=draw,
+            draw=draw, find_objects=lambda folder: find_kept_objects(folder, encoder),
         )  # fmt: skip
         write_map(work, parts)
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.transforms import invert, project, transform
 from ..core.types import Occupancy, Trajectory
-from ..storage.keyframes import Keyframes
+
+if TYPE_CHECKING:
+    from ..storage.keyframes import Keyframes
 
 MOST = 3
 """Most keyframes to return for a region."""

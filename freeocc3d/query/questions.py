@@ -20,7 +20,8 @@ class Question:
 
     words: words or phrases.  negative: words for what these do not mean.  classes: names of the map's vocabulary.
     image: a picture.  image_box: x0, y0, x1, y1, the pixels of the picture that count, with the last included.
-    where: conditions on the places of regions.  objects: whether the answers are whole objects.
+    where: conditions on the places of regions.  objects: whether the answers are whole objects first; None = to words
+    and pictures, if the map keeps its objects.
     options: fields of ``word_query.Options``.
     """
 
@@ -31,7 +32,7 @@ class Question:
     image_box: tuple[int, int, int, int] | None = None
     where: Where | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
-    objects: bool = False
+    objects: bool | None = None
 
 
 def ask(scan_map: Map, question: Question) -> list[QueryResult]:
@@ -42,7 +43,7 @@ def ask(scan_map: Map, question: Question) -> list[QueryResult]:
     if question.words:
         results += scan_map.query_words(list(question.words), negative=question.negative, **about)
     if question.classes:
-        results += scan_map.query_classes(list(question.classes), **about)
+        results += scan_map.query_classes(list(question.classes), **{**about, "objects": bool(question.objects)})
     if question.image is not None:
         results.append(scan_map.query_image(question.image, question.image_box, **about))
     return results

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,13 +47,13 @@ class Map(SavedMap):
         contrast: Sequence[str] = (),
         negative: Sequence[str] = (),
         where: Where | None = None,
-        objects: bool = False,
+        objects: bool | None = None,
         **options: Any,
     ) -> list[QueryResult]:
         """``query`` for several words. contrast: words for other things in the scan, added to the encoder's own.
         negative: words for what is not meant.  where: conditions on the places of regions; see
-        ``query.conditions.Where``.  objects: whether regions are whole objects where most of an object matches; see
-        ``query.objects.ranking``."""
+        ``query.conditions.Where``.  objects: whether the first regions are whole objects, where most of an object
+        matches (see ``query.objects.ranking``); by default, if the map keeps its objects."""
 
         def ask(occupancy: Occupancy, asked: Options) -> list[QueryResult]:
             return self._words(words, occupancy, asked, contrast, negative)
@@ -63,7 +64,8 @@ class Map(SavedMap):
         self, names: list[str], where: Where | None = None, objects: bool = False, **options: Any
     ) -> list[QueryResult]:
         """Finds the voxels whose nearest name in ``vocabulary`` is each of these; see ``query.class_query``. Of the
-        options, only ``top_k`` and ``narrow`` apply. where, objects: as in ``query_words``."""
+        options, only ``top_k`` and ``narrow`` apply. where: as in ``query_words``.  objects: whether the first regions
+        are whole objects."""
         from .class_query import query_classes
 
         def ask(occupancy: Occupancy, asked: Options) -> list[QueryResult]:
@@ -76,7 +78,7 @@ class Map(SavedMap):
         image: str | Path | NDArray[np.uint8],
         box: tuple[int, int, int, int] | None = None,
         where: Where | None = None,
-        objects: bool = False,
+        objects: bool | None = None,
         **options: Any,
     ) -> QueryResult:
         """Finds where the map looks like a picture, a file or (H, W, 3) RGB, or like a box x0 y0 x1 y1 of its pixels;
@@ -150,9 +152,19 @@ class Map(SavedMap):
 
     @functools.cached_property
     def _objects(self) -> list[Object]:
-        from .objects import finding
+        if (kept := self.kept_objects) is not None:
+            from .objects.keeping import unpack_objects
 
-        return finding.find_objects(self)
+            return unpack_objects(kept)
+        from .objects.finding import find_objects
+
+        return find_objects(self)
+
+    @functools.cached_property
+    def _pooled(self) -> Occupancy:
+        from .objects.ranking import pool_features
+
+        return pool_features(self.occupancy, self._objects)
 
     @functools.cached_property
     def _chance(self) -> ChanceRecord:
@@ -184,26 +196,30 @@ class Map(SavedMap):
         self,
         ask: _Ask,
         where: Where | None,
-        objects: bool,
+        objects: bool | None,
         options: dict[str, Any],
     ) -> list[QueryResult]:
-        """Returns the results with whole objects, if asked for, and only the regions that meet the conditions."""
+        """Returns the results with whole objects, if asked for or kept, and only the regions that meet the
+        conditions."""
         checked = typed_options.build(word_query.Options, options)
+        objects = bool(self.manifest.objects) if objects is None else objects
         if where is None and not objects:
             return ask(self.occupancy, checked)
+        every = checked.changed(top_k=max(len(self.occupancy.colors), 1))
+        if where is None:
+            found = self._with_objects(ask, every)
+            return [replace(result, regions=result.regions[: checked.top_k]) for result in found]
         from . import conditions
 
-        every = checked.changed(top_k=max(len(self.occupancy.colors), 1))
-        where = where or conditions.Where()
         answer = self._with_objects if objects else lambda ask, asked: ask(self.occupancy, asked)
         references = answer(functools.partial(self._words, where.words), every) if where.words else []
         return conditions.only_where(self.occupancy, self.up, answer(ask, every), references, where, checked.top_k)
 
     def _with_objects(self, ask: _Ask, asked: Options) -> list[QueryResult]:
         """Returns the answers with whole objects first."""
-        from .objects.ranking import pool_features, rank_objects
+        from .objects.ranking import rank_objects
 
-        plain, pooled = ask(self.occupancy, asked), ask(pool_features(self.occupancy, self._objects), asked)
+        plain, pooled = ask(self.occupancy, asked), ask(self._pooled, asked)
         return [rank_objects(self.occupancy, *both, self._objects) for both in zip(plain, pooled, strict=True)]
 
 

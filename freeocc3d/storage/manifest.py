@@ -203,6 +203,9 @@ class Manifest(MapFacts, frozen=True, kw_only=True):
     origin: Annotated[Vector, _key("x y z of the lower corner of voxel (0, 0, 0), map's frame, meters")]
     counts: Annotated[MapCounts, _key("numbers of Gaussians, voxels, frames and submaps")]
     keyframes: Annotated[tuple[Frame, ...], _key("the capture's frames that are keyframes, ascending")]
+    objects: Annotated[
+        Count | None, _key("number of objects in objects.npz; absent where objects are found when they are asked for")
+    ] = None
     files: Annotated[dict[str, Count], _key("files of the folder with their sizes, bytes")]
     checksums: Annotated[dict[str, Checksum] | None, _key("the same files with their checksums: XXH3 of 128 bits")] = (
         None

@@ -21,7 +21,8 @@ from ..core.types import Gaussians, Occupancy, Trajectory
 from ..settings import registry
 from .checked_files import CheckedFiles
 from .manifest import Manifest, read_manifest
-from .map_files import CONFIG, FEATURES, GAUSSIANS, KEYFRAMES, MANIFEST, OCCUPANCY, REPORT, TRAJECTORY
+from .map_files import CONFIG, FEATURES, GAUSSIANS, KEYFRAMES, MANIFEST, OBJECTS, OCCUPANCY, REPORT, TRAJECTORY
+from .objects_file import ObjectArrays, read_objects
 from .occupancy_file import read_codec, read_gaussian_codes, read_occupancy
 
 if TYPE_CHECKING:
@@ -125,6 +126,11 @@ class SavedMap:
     def gaussian_features(self) -> NDArray[np.float16]:
         """(N, D) unit features of the Gaussians."""
         return self._codec.decode(read_gaussian_codes(self.files.path(FEATURES), self.manifest, self._codec))
+
+    @functools.cached_property
+    def kept_objects(self) -> ObjectArrays | None:
+        """The objects that the map keeps; None if they are to be found."""
+        return None if self.manifest.objects is None else read_objects(self.files.path(OBJECTS), self.manifest)
 
     @functools.cached_property
     def trajectory(self) -> Trajectory:

@@ -49,7 +49,7 @@ _ANSWERS, _OFFLINE = "vocabulary.stage.json", "offline"
 _STAGE_FILES = (*_TRACKING, _STAGE_FEATURES, _ANSWERS)
 _OWN_FILES = {
     *_STAGE_FILES, _MARKS, LOCK, _OFFLINE, map_files.MANIFEST, map_files.KEYFRAMES, *map_files.ALWAYS,
-    *map_files.PICTURES,
+    *map_files.PICTURES, map_files.OBJECTS,
 }  # fmt: skip
 _LARGEST_MARKS = 1 << 20
 

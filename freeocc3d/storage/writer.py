@@ -26,6 +26,7 @@ from ..settings.config import Settings
 from . import map_files
 from .keyframes import INDEX, Keyframes
 from .manifest import Manifest, MapCounts, MapFacts, VoxelCounts, vector, write_manifest
+from .objects_file import ObjectArrays, write_objects
 from .occupancy_file import write_features, write_occupancy
 from .saved_map import SavedMap
 from .work_folder import WorkFolder
@@ -40,6 +41,7 @@ class MapParts:
     codec: packs the features of the voxels and of the Gaussians.  features: (N, D) of the Gaussians.
     keyframes: those of the trajectory. If they already lie in the work folder, images of other frames are removed.
     draw: draws pictures into a folder, or none.
+    find_objects: finds the objects of the written map in a folder, or None if the map keeps none.
     """
 
     facts: MapFacts
@@ -54,6 +56,7 @@ class MapParts:
     depth_factor: float = 1.0
     """Multiplies the depth of copied keyframes."""
     draw: Callable[[Path], None] | None = None
+    find_objects: Callable[[Path], ObjectArrays | None] | None = None
 
 
 def write_changed_map(source: SavedMap, work: WorkFolder, output: Path, parts: MapParts) -> None:
@@ -68,7 +71,8 @@ def write_map(work: WorkFolder, parts: MapParts, source: SavedMap | None = None)
 
     source: the map that this one is made from. Raises OSError, and MapError for a damaged file of the source."""
     folder = work.folder
-    (folder / map_files.MANIFEST).unlink(missing_ok=True)  # of an earlier try
+    for name in (map_files.MANIFEST, map_files.OBJECTS):  # of an earlier try
+        (folder / name).unlink(missing_ok=True)
     with work.timed("saving"):
         (folder / map_files.CONFIG).write_text(config.dump(parts.settings), encoding="utf-8")
         _write_arrays(folder, parts)
@@ -79,13 +83,25 @@ def write_map(work: WorkFolder, parts: MapParts, source: SavedMap | None = None)
         if parts.keyframes is not None:
             _write_keyframes(folder / map_files.KEYFRAMES, parts.keyframes, parts.depth_factor)
         copied = [] if source is None else _copy_missing(source.path, folder, pictures=parts.draw is None)
-    report = parts.report()
-    (folder / map_files.REPORT).write_text(json.dumps(report), encoding="utf-8")
-    manifest = _manifest(folder, parts, report)
+    manifest = _write_facts(folder, parts, None)
     if source is not None:
         _require_equal(source, manifest, copied, parts.depth_factor)
-    write_manifest(folder, manifest)
+    if parts.find_objects is not None:
+        with work.timed("objects"):
+            objects = parts.find_objects(folder)
+            if objects is not None:
+                write_objects(folder / map_files.OBJECTS, objects)
+        _write_facts(folder, parts, objects)
     sync(folder / map_files.MANIFEST)
+
+
+def _write_facts(folder: Path, parts: MapParts, objects: ObjectArrays | None) -> Manifest:
+    """Write the report and the manifest of the files that lie in the folder."""
+    report = parts.report()
+    (folder / map_files.REPORT).write_text(json.dumps(report), encoding="utf-8")
+    manifest = _manifest(folder, parts, report, objects)
+    write_manifest(folder, manifest)
+    return manifest
 
 
 def _write_arrays(folder: Path, parts: MapParts) -> None:
@@ -125,9 +141,10 @@ def _require_equal(source: SavedMap, made: Manifest, copied: list[str], depth_fa
             raise MapError(f"{source.path / name} is damaged: its checksum is not the stated one. Copy the map again.")
 
 
-def _manifest(folder: Path, parts: MapParts, report: Mapping[str, Any]) -> Manifest:
+def _manifest(folder: Path, parts: MapParts, report: Mapping[str, Any], objects: ObjectArrays | None) -> Manifest:
     """The facts, changed by the parts that are written."""
     said: dict[str, Any] = {name: getattr(parts.facts, name) for name in parts.facts.__struct_fields__}
+    said["objects"] = None if objects is None else len(objects)
     counts: dict[str, Any] = msgspec.structs.asdict(said["counts"]) if "counts" in said else {}
     if "submaps" in report:
         counts["submaps"] = len(report["submaps"])
@@ -141,7 +158,7 @@ def _manifest(folder: Path, parts: MapParts, report: Mapping[str, Any]) -> Manif
     if (trajectory := parts.trajectory) is not None:
         said["keyframes"] = tuple(trajectory.keyframes.tolist())
         counts.update(frames=len(trajectory), frames_with_pose=int(trajectory.has_pose.sum()))
-    names = _file_names(folder)
+    names = [*_file_names(folder), *([map_files.OBJECTS] * (objects is not None))]
     said.update(freeocc3d=__version__, counts=MapCounts(**counts), files=_file_sizes(folder, names))
     said.update(checksums=_checksums(folder, names))
     return Manifest(**said)

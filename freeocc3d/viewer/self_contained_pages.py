@@ -53,7 +53,7 @@ def write_page(path: Path, text: str, overwrite: bool) -> None:
 def crop_view(image: NDArray[np.uint8], view: RegionView, color: tuple[int, ...]) -> str:
     """Returns the box of a view with its surroundings, as the source of an <img>."""
     height, width = image.shape[:2]
-    x0, y0, x1, y1 = view.box
+    x0, y0, x1, y1 = np.minimum(view.box, (width - 1, height - 1) * 2).tolist()  # a map states boxes of objects
     around_x, around_y = (int(_MARGIN * (high + 1 - low)) + 8 for low, high in ((x0, x1), (y0, y1)))
     left, top = max(x0 - around_x, 0), max(y0 - around_y, 0)
     right, bottom = min(x1 + around_x, width - 1), min(y1 + around_y, height - 1)

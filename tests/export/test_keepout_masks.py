@@ -17,7 +17,8 @@ from freeocc3d.export.keepout_masks import Avoided, compute_cost_map, parse_avoi
 def asked(occupancy, regions, **notes):
     """A map whose words are found in voxels: word -> masks of the occupied ones, None = not understood."""
 
-    def query_words(words, top_k):
+    def query_words(words, objects, top_k):
+        assert not objects
         assert top_k >= len(occupancy.colors)  # a robot keeps from all of them
         return [
             SimpleNamespace(

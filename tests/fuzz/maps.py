@@ -203,6 +203,8 @@ def _choose(rng: random.Random, path: Path) -> tuple[str, Change]:
     )[0]  # fmt: skip
     if name == "image":
         return _image(rng, path), rng.choice((mutators.change_bytes, _change_image, _change_image_header))
+    if name == "features.npz" and (path / "objects.npz").exists() and rng.random() < 0.6:
+        name = "objects.npz"
     if rng.random() < 0.15:
         return rng.choice((("map.yaml", _stretch_manifest), ("keyframes/keyframes.json", _stretch_cameras)))
     changes: dict[str, tuple[Change, ...]] = {

@@ -128,10 +128,12 @@ def test_a_relabeled_map_tells_its_own_times(room: Map, hub: Hub, tmp_path: Path
     document = json.loads(run("info", tmp_path / "map", "--json").stdout)
     before = json.loads(run("info", room.path, "--json").stdout)
     assert before["relabeled"] is None
-    assert document["seconds"] == {name: s for name, s in before["seconds"].items() if name != "language"}
+    assert document["seconds"] == {
+        name: s for name, s in before["seconds"].items() if name not in ("language", "objects")
+    }
     assert "language" in before["seconds"]
     assert document["relabeled"]["map"] == str(room.path)
-    assert set(document["relabeled"]["seconds"]) == {"language", "occupancy", "words", "saving"}
+    assert set(document["relabeled"]["seconds"]) == {"language", "occupancy", "words", "saving", "objects"}
     assert all(seconds >= 0 for seconds in document["relabeled"]["seconds"].values())
 
 

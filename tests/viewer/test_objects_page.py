@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from labeled_rooms import labeled_room
+from msgspec import structs
 from test_answer_page import Strict, decoded
 
 from freeocc3d.core.errors import ExportError
@@ -69,7 +70,7 @@ def test_the_plan_shows_each_object_in_its_color_at_its_place(room: Map) -> None
 
 
 def test_an_empty_map_is_not_drawn(room: Map, monkeypatch) -> None:
-    empty = Map(room.path, room.manifest)
+    empty = Map(room.path, structs.replace(room.manifest, objects=None))
     nothing = room.occupancy.replace(
         state=np.zeros_like(room.occupancy.state),
         features=room.occupancy.features[:0],
