@@ -9,8 +9,8 @@ from .. import __version__
 from ..core.errors import DependencyError
 from ..query.scan_map import Map
 from ..query.word_query import QueryResult
-from .distinct_colors import distinct_colors
 from .map_pictures import draw_query
+from .palette import word_colors
 from .self_contained_pages import crop_view, embed_image, fill_template, write_page
 
 
@@ -33,7 +33,7 @@ def _page(scan_map: Map, results: Sequence[QueryResult]) -> str:
     boxes = scan_map.boxes_of(regions)
     row_of = {int(frame): row for row, frame in enumerate(scan_map.trajectory.keyframes)}
     answers, at = [], 0
-    for result, chosen in zip(results, distinct_colors(len(results)), strict=True):
+    for result, chosen in zip(results, word_colors([result.regions for result in results]), strict=True):
         color = tuple(chosen.tolist())
         rows = []
         for region in result.regions:

@@ -12,8 +12,7 @@ from ..core.errors import ExportError
 from ..query.regions import Region
 from ..query.scan_map import Map
 from ..query.word_query import QueryResult
-from .distinct_colors import distinct_colors
-from .palette import assign_class_colors, color_by_height, highlight_regions
+from .palette import assign_class_colors, color_by_height, highlight_regions, word_colors
 
 Color = tuple[int, int, int]
 
@@ -53,12 +52,13 @@ def color_map(scan_map: Map, by: str = "rgb") -> MapColoring:
 def color_answers(scan_map: Map, results: Sequence[QueryResult]) -> MapColoring:
     """Colors the map pale, and the regions of each word strongly. Raises ExportError for an empty map."""
     _refuse_empty(scan_map)
-    colors = highlight_regions(scan_map.occupancy.colors, [result.regions for result in results])
+    found = [result.regions for result in results]
     legend, regions = [], []
-    for result, chosen in zip(results, distinct_colors(len(results)), strict=True):
+    for result, chosen in sorted(zip(results, word_colors(found), strict=True), key=lambda pair: not pair[0].regions):
         color = tuple(chosen.tolist())
         legend.append((_found(result), color))
         regions += [(region, color, result.word) for region in result.regions]
+    colors = highlight_regions(scan_map.occupancy.colors, found)
     return MapColoring(colors, tuple(regions), tuple(legend), _FAINT_PATH)
 
 

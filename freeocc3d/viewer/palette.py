@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +48,19 @@ def assign_class_colors(names: list[str]) -> NDArray[np.uint8]:
     return np.array([_UNKNOWN, *(fixed[name] for name in names)], np.uint8)
 
 
-def highlight_regions(colors: NDArray[np.uint8], words: list[list[Region]]) -> NDArray[np.uint8]:
-    """Returns (V, 3) voxel colors: regions in their word's color of ``distinct_colors``, everything else pale. A voxel
+def word_colors(words: Sequence[list[Region]]) -> NDArray[np.uint8]:
+    """Returns (W, 3) RGB of ``distinct_colors`` for the words with these regions; words that found something have the
+    most different ones."""
+    colors = np.zeros((len(words), 3), np.uint8)
+    colors[sorted(range(len(words)), key=lambda row: not words[row])] = distinct_colors(len(words))
+    return colors
+
+
+def highlight_regions(colors: NDArray[np.uint8], words: Sequence[list[Region]]) -> NDArray[np.uint8]:
+    """Returns (V, 3) voxel colors: regions in their word's color, everything else pale. A voxel
     of several regions has the color of the smallest one, of equal ones that of the first word."""
     out = pale_colors(colors)
-    chosen = distinct_colors(len(words))
+    chosen = word_colors(words)
     found = [(len(region.rows), -number, region.rows) for number, regions in enumerate(words) for region in regions]
     for _, number, rows in sorted(found, key=lambda one: (-one[0], one[1])):
         out[rows] = chosen[-number]

@@ -7,7 +7,7 @@ import pytest
 
 from freeocc3d.viewer import distinct_colors as module
 from freeocc3d.viewer.distinct_colors import GENERATED, distinct_colors, every_color, measure_distances, pale_colors
-from freeocc3d.viewer.palette import assign_class_colors, highlight_regions
+from freeocc3d.viewer.palette import assign_class_colors, highlight_regions, word_colors
 
 
 def least_distance(colors) -> float:
@@ -73,3 +73,8 @@ def test_of_two_regions_in_one_place_the_smaller_one_is_seen() -> None:
     colors = highlight_regions(gray, words)
     np.testing.assert_array_equal(colors[:5], [first, second, first, first, third])
     np.testing.assert_array_equal(colors[5:], pale_colors(gray[:1]))
+
+
+def test_words_that_found_something_have_the_first_colors() -> None:
+    colors = word_colors([[], [SimpleNamespace()], [], [SimpleNamespace()]])
+    np.testing.assert_array_equal(colors[[1, 3, 0, 2]], distinct_colors(4))
