@@ -1,4 +1,4 @@
-"""``freeocc3d view``: pictures and videos of a map."""
+"""``freeocc3d view``: maps in a browser, as one file, as pictures and videos."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..core.atomic_files import refuse_existing
-from .console import ConsoleProgress, MapPath, Overwrite, show
+from .console import ConsoleProgress, Overwrite, flag, say, show
 from .option_groups import grouped
 
 if TYPE_CHECKING:
@@ -52,28 +52,77 @@ class Drawing:
         return [path for path in (self.picture, self.video) if path is not None]
 
 
-@grouped
-def view(map_path: MapPath, drawing: Drawing) -> None:
-    """Draw a map, or what one sees in it from a place; make a video of it."""
-    from ..query.scan_map import load_map
+@dataclass(frozen=True)
+class Browsing:
+    """In a browser."""
 
-    _refuse_conflicts(drawing)
-    for path in drawing.files:
+    html: Annotated[
+        Path | None,
+        typer.Option("--html", metavar="OUT.html", help="Write the viewer and the map as one file to open anywhere."),
+    ] = None
+    live: Annotated[bool, flag("--live", "Follow a map that is being made; it need not exist yet.")] = False
+    host: Annotated[
+        str, typer.Option("--host", metavar="HOST", help="Where to listen: this machine only, unless given.")
+    ] = "127.0.0.1"
+    port: Annotated[
+        int | None,
+        typer.Option("--port", min=0, max=65535, metavar="N", help="Port: 8080 or the next free one; 0 = any."),
+    ] = None
+    no_browser: Annotated[bool, flag("--no-browser", "Only print the address.")] = False
+
+
+@grouped
+def view(
+    map_paths: Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map folders, shown side by side.")],
+    browsing: Browsing,
+    drawing: Drawing,
+) -> None:
+    """Look at maps in a browser; or write one file, a picture or a video.
+
+    Without --html, --picture or --video, opens the viewer and serves it until Ctrl-C.
+    """
+    files = [*drawing.files, *([browsing.html] if browsing.html else [])]
+    _refuse_conflicts(drawing, browsing, files, map_paths)
+    if not files:
+        _serve(map_paths, browsing)
+        return
+    for path in files:
         refuse_existing(path, drawing.overwrite)
     if drawing.video is not None:
         from ..viewer.turntables import check_video_name
 
         check_video_name(drawing.video)
-    loaded = load_map(map_path)
-    _draw(loaded, drawing)
-    for path in drawing.files:
+    from ..query.scan_map import load_map
+
+    loaded = load_map(map_paths[0])
+    if browsing.html is not None:
+        from ..viewer.browser.single_file import write_whole_page
+
+        write_whole_page(loaded, browsing.html, drawing.words or (), drawing.overwrite)
+    if drawing.files:
+        _draw(loaded, drawing)
+    for path in files:
         show(str(path))
 
 
-def _refuse_conflicts(drawing: Drawing) -> None:
+def _serve(map_paths: list[Path], browsing: Browsing) -> None:
+    from ..viewer.browser.serving import serve_maps
+
+    def tell(address: str) -> None:
+        show(address)
+        say("Ctrl-C ends the viewer.")
+
+    serve_maps(map_paths, browsing.host, browsing.port, not browsing.no_browser, tell, browsing.live)
+
+
+def _refuse_conflicts(drawing: Drawing, browsing: Browsing, files: list[Path], map_paths: list[Path]) -> None:
     """Raises BadParameter, which names what to leave out or to add."""
-    if not drawing.files:
-        raise typer.BadParameter("give --picture OUT.png or --video OUT.mp4.")
+    if files and len(map_paths) > 1:
+        raise typer.BadParameter("a file shows one map: give one MAP, or leave the files out to see maps side by side.")
+    if files and browsing.live:
+        raise typer.BadParameter("--live opens the viewer: leave out --html, --picture and --video.")
+    if not files and drawing.words:
+        raise typer.BadParameter("--query needs --picture, --video or --html; in the viewer, type the word.")
     if (drawing.place is None) != (drawing.target is None):
         raise typer.BadParameter("--from and --to go together: give both.")
     if drawing.place is not None and drawing.picture is None:
