@@ -61,9 +61,13 @@ def draw_objects(scan_map: Map, objects: Sequence[Object], shown: Sequence[int])
     for line, row in enumerate(listed):
         thing, y = objects[row], _BAR + 14 + line * _ROW
         cv2.rectangle(picture, (_PLAN, y - 12), (_PLAN + 14, y + 2), colors[row].tolist(), -1)
-        name = thing.name if len(thing.name) <= _LONGEST_NAME else thing.name[: _LONGEST_NAME - 3] + "..."
         size = " x ".join(f"{edge:.2f}" for edge in thing.box.extent)
-        write_text(picture, f"{row + 1} {name}, {size}{' m' if scan_map.metric else ''}", (_PLAN + 22, y), SMALL)
+        write_text(
+            picture,
+            f"{row + 1} {_shortened(thing.name)}, {size}{' m' if scan_map.metric else ''}",
+            (_PLAN + 22, y),
+            SMALL,
+        )
     if len(listed) < len(shown):
         write_text(picture, f"and {len(shown) - len(listed)} more", (_PLAN + 22, _BAR + 14 + len(listed) * _ROW), SMALL)
     return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
@@ -97,13 +101,31 @@ def _draw_plan(
         outline = np.rint(8 * plan.pixel(transform(box.T_map_box, corners))).astype(np.int32)
         dark = (0.6 * colors[row]).tolist()
         cv2.polylines(picture, [outline], True, dark, 2, cv2.LINE_AA, shift=3)
-    taken: list[NDArray[np.float64]] = []
+    taken = np.zeros((0, 2, 2))
     for row in sorted(shown, key=lambda row: -len(objects[row].rows)):
-        place = plan.pixel(objects[row].centroid[None])[0]
-        size = np.array((measure_text(str(row + 1), LEGEND) + 8, LEGEND + 6))
-        free = [place + size * step for step in _AROUND]
-        at = next((one for one in free if all((abs(one - other) >= size).any() for other in taken)), place)
-        taken.append(at)
-        low, high = np.rint(at - size / 2).astype(int), np.rint(at + size / 2).astype(int)
+        thing = objects[row]
+        place, wide = plan.pixel(thing.centroid[None])[0], plan.scale * float(thing.box.extent[:2].max())
+        texts = [f"{row + 1} {_shortened(thing.name)}", str(row + 1)]
+        text = next((text for text in texts if _label_size(text)[0] <= wide), texts[1])
+        label = _free_place(place, _label_size(text), taken)
+        taken = np.concatenate((taken, label[None]))
+        low, high = np.rint(label).astype(int)
         cv2.rectangle(picture, low.tolist(), (high - 1).tolist(), _LABEL, -1)
-        write_text(picture, str(row + 1), (int(low[0]) + 4, int(high[1]) - 5), LEGEND)
+        write_text(picture, text, (int(low[0]) + 4, int(high[1]) - 5), LEGEND)
+
+
+def _label_size(text: str) -> NDArray[np.int64]:
+    return np.array((measure_text(text, LEGEND) + 8, LEGEND + 6))
+
+
+def _free_place(place: NDArray[np.float64], size: NDArray[np.int64], taken: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the (2, 2) lower and upper corner of a label near a place: the nearest that covers no other."""
+    for step in _AROUND:
+        label = place + size * step + np.stack((-size / 2, size / 2))
+        if not ((label[0] < taken[:, 1]) & (label[1] > taken[:, 0])).all(axis=1).any():
+            return label
+    return place + np.stack((-size / 2, size / 2))
+
+
+def _shortened(name: str) -> str:
+    return name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 3] + "..."

@@ -16,7 +16,7 @@ from freeocc3d.core.errors import ExportError
 from freeocc3d.query.scan_map import Map
 from freeocc3d.viewer import objects_page
 from freeocc3d.viewer.distinct_colors import distinct_colors
-from freeocc3d.viewer.object_pictures import draw_objects
+from freeocc3d.viewer.object_pictures import _free_place, draw_objects
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +80,15 @@ def test_an_empty_map_is_not_drawn(room: Map, monkeypatch) -> None:
     assert empty.relations_of(empty.objects()) == []
     with pytest.raises(ExportError, match="no occupied voxels to draw"):
         draw_objects(empty, [], [])
+
+
+def test_labels_of_a_plan_do_not_cover_each_other_while_there_is_room() -> None:
+    taken = np.zeros((0, 2, 2))
+    place = np.array((100.0, 100.0))
+    for width in (60, 20, 40, 20, 20):
+        label = _free_place(place, np.array((width, 20)), taken)
+        assert not ((label[0] < taken[:, 1]) & (label[1] > taken[:, 0])).all(axis=1).any()
+        np.testing.assert_array_equal(label[1] - label[0], (width, 20))
+        taken = np.concatenate((taken, label[None]))
+    everywhere = np.array([[(-1e3, -1e3), (1e3, 1e3)]])
+    np.testing.assert_array_equal(_free_place(place, np.array((20, 20)), everywhere).mean(axis=0), place)
