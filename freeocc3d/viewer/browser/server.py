@@ -104,7 +104,7 @@ def make_app(maps: Sequence[ShownMap], token: str = "", local: bool = True) -> S
         return Response(content, media_type=CONTENT_TYPES[name.rsplit(".", 1)[-1]])
 
     async def listed(request: Request) -> Response:
-        return JSONResponse([{"name": shown.path.resolve().name} for shown in maps])
+        return JSONResponse([{"name": shown.path.resolve().name, "capture": shown.capture} for shown in maps])
 
     def of_map(work: Callable[[ShownMap, Request], Response]) -> Callable[[Request], Awaitable[Response]]:
         async def endpoint(request: Request) -> Response:

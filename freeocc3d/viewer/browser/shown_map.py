@@ -45,6 +45,11 @@ class ShownMap:
             self._current()
             return "-".join(map(str, self._stamp))
 
+    @property
+    def capture(self) -> str:
+        """The name of the capture that the map was made from."""
+        return self.use(lambda scan_map: Path(scan_map.manifest.capture.path).name)
+
     def scene(self) -> bytes:
         """The packet of ``describe_scene``, compressed."""
         return self._packet("scene", lambda scan_map: pack(*self._stated(describe_scene(scan_map))))

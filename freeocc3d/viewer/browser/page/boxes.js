@@ -3,7 +3,7 @@
 import * as THREE from "three";
 
 const EDGES = [[0, 1], [1, 3], [3, 2], [2, 0], [4, 5], [5, 7], [7, 6], [6, 4], [0, 4], [1, 5], [2, 6], [3, 7]];
-const HANDLE_PX = 16;
+const HANDLE_PX = 16, MOST_MOVED_PX = 70; // a name that would be farther from its thing is left out
 
 function boxLines(corners, color) {
   const geometry = new THREE.BufferGeometry();
@@ -66,6 +66,8 @@ export class FoundBoxes {
       let y = place.y;
       const width = label.offsetWidth + 4, height = label.offsetHeight + 2;
       while (taken.some((each) => Math.abs(each.x - place.x) < (each.width + width) / 2 && Math.abs(each.y - y) < height)) y -= height;
+      label.hidden = place.y - y > MOST_MOVED_PX;
+      if (label.hidden) continue;
       taken.push({ x: place.x, y, width });
       label.style.transform = `translate(-50%, -100%) translate(${place.x}px, ${y}px)`;
     }
@@ -172,6 +174,6 @@ export class DraggedBox {
     if (this.face === undefined) return;
     this.face = undefined;
     event.stopImmediatePropagation();
-    this.changed(this.corners);
+    this.changed(this.corners.map((value) => Number(value.toFixed(3))));
   }
 }

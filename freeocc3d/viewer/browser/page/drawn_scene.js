@@ -25,7 +25,7 @@ export class DrawnScene extends EventTarget {
     this.dark = false;
     this.fullMs = 0;
     this.pending = 0;
-    this.free = 1; // share of the canvas's width that no panel covers
+    this.free = { x: 1, y: 1 }; // shares of the canvas that no panel covers
     new ResizeObserver(() => this.fit()).observe(canvas.parentElement);
     this.fit();
   }
@@ -83,7 +83,8 @@ export class DrawnScene extends EventTarget {
     const right = new THREE.Vector3(0, 0, 1).cross(back).normalize();
     if (right.lengthSq() < 0.5) right.set(1, 0, 0);
     const up = back.clone().cross(right);
-    const tanY = Math.tan((this.camera.fov * Math.PI) / 360), tanX = tanY * this.camera.aspect * this.free;
+    const tan = Math.tan((this.camera.fov * Math.PI) / 360);
+    const tanX = tan * this.camera.aspect * this.free.x, tanY = tan * this.free.y;
     let distance = 0.1;
     for (const x of [this.low.x, this.high.x]) for (const y of [this.low.y, this.high.y]) for (const z of [this.low.z, this.high.z]) {
       const corner = new THREE.Vector3(x, y, z).sub(middle);
@@ -158,9 +159,10 @@ export class DrawnScene extends EventTarget {
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     const panel = document.getElementById("panel").getBoundingClientRect();
-    const aside = panel.width < 0.5 * width && panel.height > 0.2 * height ? 0.5 * panel.right : 0;
-    this.camera.setViewOffset(width, height, -aside, 0, width, height); // centers the map beside the panel
-    this.free = (width - 2 * aside) / width;
+    const beside = panel.width < 0.5 * width && panel.height > 0.2 * height ? panel.right : 0;
+    const below = panel.width > 0.9 * width ? height - panel.top : 0;
+    this.camera.setViewOffset(width, height, -0.5 * beside, 0.5 * below, width, height); // the middle of what is free
+    this.free = { x: (width - beside) / width, y: (height - below) / height };
     this.camera.updateProjectionMatrix();
     this.changed();
   }

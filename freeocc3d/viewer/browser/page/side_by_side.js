@@ -11,7 +11,7 @@ export async function start() {
   bar.className = "link-cameras";
   const linked = document.createElement("input");
   linked.type = "checkbox";
-  linked.checked = maps.length > 1;
+  linked.checked = maps.every(({ capture }) => capture === maps[0].capture);
   bar.append(linked, " Link cameras and questions");
   const frames = maps.map(({ name }, number) => {
     const frame = document.createElement("iframe");

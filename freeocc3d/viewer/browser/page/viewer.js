@@ -11,7 +11,7 @@ import { HeldMap, Refusal, ServedMap } from "sources";
 import { Splats } from "splats";
 import { Voxels } from "voxels";
 
-const POLL_MS = 1500, CLICK_PX = 5;
+const POLL_MS = 1500, CLICK_PX = 5, NARROW_PX = 760;
 const UNKNOWN = [150, 150, 160], FREE = [90, 170, 220];
 
 class Viewer {
@@ -393,6 +393,7 @@ class Viewer {
       const corners = [low, high].map((corner, k) => this.scene.toMap(corner.clone().lerp(k ? low : high, 0.25)).toArray());
       this.answers.box = [0, 1, 2].map((k) => Math.min(corners[0][k], corners[1][k]))
         .concat([0, 1, 2].map((k) => Math.max(corners[0][k], corners[1][k])));
+      this.answers.box = this.answers.box.map((value) => Number(value.toFixed(3)));
     } else this.answers.box = undefined;
     this.box.set(this.answers.box);
     this.answers.ask();
@@ -400,7 +401,8 @@ class Viewer {
 
   #linkCameras() {
     if (!this.embedded) return;
-    let quiet = false;
+    let quiet = true; // until someone uses this frame
+    for (const name of ["pointerdown", "wheel", "keydown"]) addEventListener(name, () => { quiet = false; }, { capture: true });
     this.scene.controls.addEventListener("change", () => {
       if (quiet) return;
       const camera = { position: this.scene.camera.position.toArray(), target: this.scene.controls.target.toArray() };
@@ -419,7 +421,6 @@ class Viewer {
         this.answers.form.elements.words.value = data.words;
         this.ask(this.answers.question());
       }
-      quiet = false;
     });
   }
 
@@ -439,6 +440,7 @@ class Viewer {
       this.#cut();
     });
     byId("within").addEventListener("change", () => this.#toggleBox());
+    if (innerWidth <= NARROW_PX) for (const id of ["tools", "classes-details"]) byId(id).open = false;
     byId("overview").addEventListener("click", () => scene.overview());
     byId("look-from").addEventListener("click", () => this.path.lookFrom(scene, this.keyframe));
     const turn = (by) => this.openKeyframe((this.keyframe + by + this.path.count) % this.path.count);
