@@ -59,3 +59,4 @@ def demo(
             map_pictures.write_query_picture(made, [result], written[-1], overwrite)
     real = REAL.format(*(shlex.quote(str(output / name)) for name in ("map", "map-with-words")))
     show("", *real.splitlines(), f"pictures: {', '.join(str(path) for path in written)}")
+    show(f"Walk through it and ask it in a browser: freeocc3d view {shlex.quote(str(output / 'map'))}")

@@ -73,7 +73,7 @@ class Browsing:
 
 @grouped
 def view(
-    map_paths: Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map folders, shown side by side.")],
+    map_paths: Annotated[list[Path], typer.Argument(metavar="MAP", help="Map folders, shown side by side.")],
     browsing: Browsing,
     drawing: Drawing,
 ) -> None:
@@ -121,6 +121,8 @@ def _refuse_conflicts(drawing: Drawing, browsing: Browsing, files: list[Path], m
         raise typer.BadParameter("a file shows one map: give one MAP, or leave the files out to see maps side by side.")
     if files and browsing.live:
         raise typer.BadParameter("--live opens the viewer: leave out --html, --picture and --video.")
+    if browsing.html is not None and browsing.html.suffix.lower() not in (".html", ".htm"):
+        raise typer.BadParameter(f"--html writes a page: use the name {browsing.html.with_suffix('.html')}.")
     if not files and drawing.words:
         raise typer.BadParameter("--query needs --picture, --video or --html; in the viewer, type the word.")
     if (drawing.place is None) != (drawing.target is None):
