@@ -4,7 +4,8 @@ random words decide with the fixed cosine that turns out best.
 A capture is mapped with its class images and given poses, as in ``present_words``; then its keyframes are encoded as
 CLIP would see them. A name that is there is found if its answer's IoU with the truth is at least half of what the
 features allow: of the voxels whose nearest name among all that are there is this one. Nothing of the truth reaches a
-query.
+query. Answers are those that ``query`` gives: whole objects first, found by shape and color. Those of voxels alone
+stand beside.
 """
 
 from __future__ import annotations
@@ -98,11 +99,36 @@ class Scene:
         cosine = compute_cosines(occupancy.features, named)
         nearest = np.where(mask_known(occupancy.features), cosine.argmax(axis=1), -1)
         judged = Judged(self, true, nearest)
-        decided = judged.share(occupancy, text, None)
+        decided = judged.share(occupancy, text, None, self.objects(occupancy))
+        voxels_alone = judged.share(occupancy, text, None)
         lowest, highest = np.quantile(cosine[true < 255], (0.5, 0.999))
         fixed = {round(float(t), 3): judged.share(occupancy, text, float(t)) for t in np.linspace(lowest, highest, 8)}
         best = max(fixed, key=lambda t: fixed[t]["found"] - fixed[t]["absent_answered"])
-        return {**decided, "best_fixed": {"threshold": best, **fixed[best]}}
+        return {**decided, "voxels_alone": voxels_alone, "best_fixed": {"threshold": best, **fixed[best]}}
+
+    def objects(self, occupancy: Any) -> list[Any]:
+        """The things that the map's surface shows by shape and color, in the voxels of ``occupancy``, which lie on
+        another lattice: each belongs to the nearest voxel of the map within an edge."""
+        from scipy.spatial import KDTree
+
+        from freeocc3d.core.transforms import transform
+        from freeocc3d.query.objects.finding import average_features
+        from freeocc3d.query.objects.object import Object
+        from freeocc3d.query.objects.surface_instances import divide_surface
+        from freeocc3d.query.oriented_boxes import OrientedBox
+
+        own, T_world_map = self.scan_map.occupancy, np.array(self.scan_map.manifest.T_world_map)
+        mapped = transform(T_world_map, own.centers(own.occupied_voxels(), own.occupied_edges()))
+        centers = occupancy.centers(occupancy.occupied_voxels())
+        nearest = KDTree(mapped).query(centers, distance_upper_bound=own.voxel_size)[1]
+        instance = np.append(divide_surface(self.scan_map), -1)[nearest]
+        rows = np.flatnonzero(instance >= 0)
+        number = np.unique(instance[rows], return_inverse=True)[1]
+        feature = average_features(occupancy, rows, number)[0]
+        nowhere = OrientedBox(np.zeros(3), 0.0, np.eye(4))
+        return [
+            Object(rows[number == k], feature[k], (), nowhere, 0.0, np.zeros(3), (), 0.0) for k in range(len(feature))
+        ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,13 +139,21 @@ class Judged:
     true: Any
     nearest: Any
 
-    def share(self, occupancy: Any, text: Any, threshold: float | None) -> Figures:
+    def share(self, occupancy: Any, text: Any, threshold: float | None, objects: Any = ()) -> Figures:
         from freeocc3d.query import word_query
+        from freeocc3d.query.objects.ranking import pool_features, rank_objects
+
+        def ask(words: list[str]) -> list[Any]:
+            plain = word_query.query(occupancy, text, words, options)
+            if not objects:
+                return plain
+            pooled = word_query.query(pool_features(occupancy, objects), text, words, options)
+            return [rank_objects(occupancy, *both, objects) for both in zip(plain, pooled, strict=True)]
 
         options = word_query.Options(threshold=threshold, top_k=1000)
         asked, absent = self.scene.asked, self.scene.absent
         known, found, as_oracle, missed = self.true != 255, [], [], []
-        for result in word_query.query(occupancy, text, asked, options):
+        for result in ask(asked):
             answer = np.zeros(len(self.true), bool)
             answer[np.concatenate([np.zeros(0, np.int64), *(region.rows for region in result.regions)])] = True
             of_class = self.true == self.scene.truth.classes.index(result.word)
@@ -127,7 +161,7 @@ class Judged:
             found.append(_iou(answer & known, of_class) >= ENOUGH * _iou(oracle, of_class))
             as_oracle.append(_iou(answer & known, oracle) >= ENOUGH)
             missed += [] if found[-1] else [result.word]
-        answered = [result.word for result in word_query.query(occupancy, text, absent, options) if result.matched]
+        answered = [result.word for result in ask(absent) if result.matched]
         return {
             "absent": len(absent),
             "absent_answered": len(answered) / len(absent),
@@ -164,13 +198,15 @@ def words_by_chance_lines(rows: list[Figures]) -> list[Line]:
             def gain(of: list[Figures]) -> str:
                 return f"{np.mean([own['found'] - own['absent_answered'] for own in of]):.1%}"
 
-            fixed = [own["best_fixed"] for own in asked]
+            fixed, alone = ([own[key] for own in asked] for key in ("best_fixed", "voxels_alone"))
             middle = strength == "middle"
             lines += [
                 (f"{where}: {asked[0]['absent']} absent names that return a region", mean("absent_answered", asked),
                  "≤ 5 %" if middle else ""),
                 (f"{where}: {asked[0]['present']} present names that are found", mean("found", asked),
                  "≥ 90 %" if middle else ""),
+                (f"{where}: the same two without objects",
+                 f"{mean('absent_answered', alone)} and {mean('found', alone)}", ""),
                 (f"{where}: answers with IoU ≥ {ENOUGH} with the nearest present name", mean("as_oracle", asked), ""),
                 (f"{where}: found minus answered in vain, and with the best fixed cosine in hindsight",
                  f"{gain(asked)} and {gain(fixed)}",
