@@ -1,9 +1,10 @@
 #!/bin/sh
-# Installs the Debian programs that open exports in tests, if this user may; otherwise those tests are skipped.
+# Installs the Debian programs that open exports and pages in tests, if this user may; otherwise those tests are skipped.
 missing=""
 command -v compare_octrees >/dev/null 2>&1 || missing="$missing octomap-tools"
 /usr/bin/python3 -c 'import pyopenvdb' >/dev/null 2>&1 || /usr/bin/python3 -c 'import openvdb' >/dev/null 2>&1 ||
     missing="$missing python3-openvdb"
+command -v chromium >/dev/null 2>&1 || missing="$missing chromium"
 [ -z "$missing" ] && exit 0
 command -v apt-get >/dev/null 2>&1 || exit 0
 if [ "$(id -u)" = 0 ]; then as_root=""; else as_root="sudo -n"; fi

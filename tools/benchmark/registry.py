@@ -128,6 +128,13 @@ MEASUREMENTS = {
         "words_by_chance:measure_words_by_chance",
         table="words_by_chance:tabulate_words_by_chance",
     ),
+    "viewer": Measurement(
+        f"the map of {TRUE_CLASSES} and a building of a million voxels in a browser: seconds, memory, bytes",
+        "map",
+        "viewer:measure_viewer",
+        lines="viewer:viewer_lines",
+        map_of=TRUE_CLASSES,
+    ),
     "exports": Measurement(
         "every exporter at 4 cm: seconds, memory, bytes; the plan for robots against the truth's",
         "capture",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ...core.errors import MapError
+from ...core.errors import FreeOccError, MapError
 from ...core.regular_files import IMAGE_BYTES, read_bytes
 from ...query.regions import Region
 from ...query.scan_map import Map, load_map
@@ -51,8 +52,11 @@ class ShownMap:
         return self.use(lambda scan_map: Path(scan_map.manifest.capture.path).name)
 
     def scene(self) -> bytes:
-        """The packet of ``describe_scene``, compressed."""
-        return self._packet("scene", lambda scan_map: pack(*self._stated(describe_scene(scan_map))))
+        """The packet of ``describe_scene``, compressed. Then asks a word, so that the first question of the page finds
+        encoder and kernels loaded."""
+        made = self._packet("scene", lambda scan_map: pack(*self._stated(describe_scene(scan_map))))
+        threading.Thread(target=self._warm_up, daemon=True).start()
+        return made
 
     def space(self) -> bytes:
         """The packet of ``describe_space``, compressed."""
@@ -111,6 +115,11 @@ class ShownMap:
                 made = compress(self.use(make))
                 self._packets[name] = made
             return self._packets[name]
+
+    def _warm_up(self) -> None:
+        with self._lock, contextlib.suppress(FreeOccError):
+            if self._map is not None and not self._asked and self._map.vocabulary:
+                self._map.query_words(self._map.vocabulary[:1])
 
     def _stated(self, described: tuple[dict[str, Any], Arrays]) -> tuple[dict[str, Any], Arrays]:
         meta, arrays = described
