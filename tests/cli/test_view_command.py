@@ -147,7 +147,10 @@ def test_a_map_without_gaussians_shows_its_voxels_alone(room, tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ([], "--picture OUT.png or --video OUT.mp4"),
+        (["--query", "red"], "in the viewer, type the word"),
+        (["--html", "page.txt"], "use the name page.html"),
+        (["--html", "page.html", "--live"], "--live opens the viewer"),
+        (["other", "--html", "page.html"], "a file shows one map"),
         (["--picture", "m.png", "--from", "0", "0", "1"], "give both"),
         (["--video", "m.mp4", "--from", "0", "0", "1", "--to", "1", "1", "1"], "--picture OUT.png, too"),
         (["--picture", "m.png", "--query", "red", "--by", "class"], "leave it out with"),

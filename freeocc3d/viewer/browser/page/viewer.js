@@ -28,6 +28,7 @@ class Viewer {
     this.photograph = new Photograph();
     this.photograph.panel.addEventListener("hidden", () => this.path?.choose(undefined));
     this.results = [];
+    this.keyframe = 0;
     this.asked = 0;
     this.#listen();
     theme((dark) => {
@@ -43,6 +44,7 @@ class Viewer {
     this.meta = meta;
     this.arrays = arrays;
     this.#clear();
+    if (!first) this.photograph.hide();
     document.title = `${meta.title} – freeocc3d`;
     byId("title").textContent = meta.title;
     byId("counts").textContent = `${meta.voxels.count.toLocaleString("en")} voxels of `
@@ -103,6 +105,7 @@ class Viewer {
 
   /** Shows a photograph. @param mark {box, color}: pixels to mark, in a CSS color. */
   async openKeyframe(keyframe, mark, note = "") {
+    if (!this.path?.cameras[keyframe]) return; // of a map that was replaced
     this.path.choose(keyframe);
     this.scene.changed();
     this.keyframe = keyframe;
@@ -442,8 +445,8 @@ class Viewer {
     byId("within").addEventListener("change", () => this.#toggleBox());
     if (innerWidth <= NARROW_PX) for (const id of ["tools", "classes-details"]) byId(id).open = false;
     byId("overview").addEventListener("click", () => scene.overview());
-    byId("look-from").addEventListener("click", () => this.path.lookFrom(scene, this.keyframe));
-    const turn = (by) => this.openKeyframe((this.keyframe + by + this.path.count) % this.path.count);
+    byId("look-from").addEventListener("click", () => this.path?.cameras[this.keyframe] && this.path.lookFrom(scene, this.keyframe));
+    const turn = (by) => this.path && this.openKeyframe((this.keyframe + by + this.path.count) % this.path.count);
     byId("previous").addEventListener("click", () => turn(-1));
     byId("next").addEventListener("click", () => turn(1));
     byId("facts-close").addEventListener("click", () => { byId("facts").hidden = true; });
