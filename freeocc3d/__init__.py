@@ -52,12 +52,20 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     """Each is imported when first used, so that asking for the version imports nothing."""
+    if name not in ("Map", "load_map", "reconstruct"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from .query import scan_map
+
+    scan_map.Map._repr_html_ = _show_in_cell  # type: ignore[attr-defined]
     if name == "reconstruct":
         from .pipeline.run import reconstruct
 
         return reconstruct
-    if name in ("Map", "load_map"):
-        from .query import scan_map
+    return getattr(scan_map, name)
 
-        return getattr(scan_map, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def _show_in_cell(scan_map: Map) -> str:
+    """What a notebook shows of a map. The room of maps stands before that of viewers, so it is given here."""
+    from .viewer.browser.notebooks import show_in_cell
+
+    return show_in_cell(scan_map)

@@ -23,6 +23,7 @@ from ..tracking.pose_check import check_poses
 from ..tracking.rgbd.measured_pairs import MeasuredPair
 from .checks import warn_of_camera, warn_of_scale, warn_of_trajectory
 from .frame_losses import explain_losses
+from .live_snapshots import LiveSnapshots
 from .mapper import Mapper
 from .saving import evenly, save
 from .tracking_choice import GIVEN
@@ -40,11 +41,15 @@ class Run:
     progress: Progress
     tracking_reason: str = ""
     """Why this tracker was chosen; empty if the configuration names it."""
+    snapshots: LiveSnapshots = field(init=False)
     trajectory: Trajectory = field(init=False)
     vocabulary: dict[str, Any] | None = None
     gaussians: Gaussians = field(init=False)
     features: NDArray[np.float16] = field(init=False)
     occupancy: Occupancy = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.snapshots = LiveSnapshots(self.mapper, self.work.folder)
 
     def check_poses(self, pairs: Sequence[MeasuredPair]) -> None:
         """Say how many frames have a pose that is taken as it is, and compare these poses with measured pairs of
@@ -97,6 +102,7 @@ def _track_frames(run: Run, frames: range, first: int) -> None:
             else:
                 mapper.add(frame)
             progress.advance(done)
+            run.snapshots.offer(f"Being made: poses, frame {done} of {len(frames)}")
             if done % _CHECKPOINT_FRAMES == 0:
                 work.save_tracking(mapper.state(done))
     finally:
@@ -127,6 +133,7 @@ def refine_poses(run: Run) -> None:
             mapper.refine()
             work.save_tracking(mapper.state(len(select_frames(mapper.capture))))
         mapper.tracker.release()
+    run.snapshots.offer("Being made: poses are done, Gaussians follow")
     trajectory = mapper.trajectory()
     status = trajectory.status.copy()
     status[list(work.broken)] = "broken"
@@ -155,6 +162,7 @@ def build_gaussians(run: Run) -> None:
     def build() -> Gaussians:
         with run.work.timed("gaussians"):
             anchored = run.mapper.anchor_gaussians(run.progress)
+        run.snapshots.offer("Being made: Gaussians are being fitted; words and voxels follow", anchored)
         with run.work.timed("fitting"):
             return run.mapper.fit_gaussians(anchored, run.progress)
 

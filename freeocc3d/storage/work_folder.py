@@ -26,6 +26,7 @@ from ..gaussians.point_cloud import read_gaussian_ply, write_gaussian_ply
 from ..settings import config
 from ..settings.config import Settings
 from . import map_files
+from .live_snapshot import SNAPSHOT, WATCHED
 from .manifest import read_manifest
 from .output_folder import follow_link, refuse_output
 from .run_lock import LOCK, RunLock
@@ -49,7 +50,7 @@ _ANSWERS, _OFFLINE = "vocabulary.stage.json", "offline"
 _STAGE_FILES = (*_TRACKING, _STAGE_FEATURES, _ANSWERS)
 _OWN_FILES = {
     *_STAGE_FILES, _MARKS, LOCK, _OFFLINE, map_files.MANIFEST, map_files.KEYFRAMES, *map_files.ALWAYS,
-    *map_files.PICTURES, map_files.OBJECTS,
+    *map_files.PICTURES, map_files.OBJECTS, SNAPSHOT, WATCHED,
 }  # fmt: skip
 _LARGEST_MARKS = 1 << 20
 
@@ -295,6 +296,7 @@ class WorkFolder:
         else:
             _drop_leftovers(output)
             old = self._replace(output)
+        (output / WATCHED).unlink(missing_ok=True)  # set after the cleaning above
         sync(output.absolute().parent)
         self._lock.folder = output
         _drop_leftovers(output)

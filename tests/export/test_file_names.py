@@ -22,7 +22,7 @@ FOLDERS = ("poses",)
 def test_planners_find_the_image_whatever_the_name(tmp_path, name) -> None:
     scan_map = map_of(room()[0])
     nowhere = SimpleNamespace(understood=True, regions=[], note="There is no cup.")
-    scan_map.query_words = lambda words, top_k: [nowhere for _ in words]
+    scan_map.query_words = lambda words, top_k, objects: [nowhere for _ in words]
     export_map(scan_map, "nav2", tmp_path / f"{name}.yaml", {"avoid": ["cup"], "min_height": -5})
     for beside in (name, f"{name}.cup", f"{name}.avoid"):
         described = yaml.safe_load((tmp_path / f"{beside}.yaml").read_text(encoding="utf-8"))

@@ -299,7 +299,7 @@ def test_a_real_network_on_real_pictures(tmp_path: Path) -> None:
     score = features.astype(np.float32) @ table
     assert score[70:].mean() > 0.7
     assert score[:20].mean() < 0.4
-    assert made.text_state()["aliases"]["backpack"] == made.classes.index("bag")
+    np.testing.assert_array_equal(words.encode_words(["backpack"]).features, words.encode_words(["bag"]).features)
     assert segmenter.NEEDS_CAPTURE is False
 
 
@@ -316,7 +316,7 @@ def test_a_map_of_a_networks_classes_is_asked_and_refined_without_its_capture(tm
     }
     made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", settings)
     by_color = freeocc3d.reconstruct("builtin:room", tmp_path / "colours", {**settings, "language": {}})
-    red = made.query("red thing")
+    red = made.query_words(["red thing"], objects=False)[0]  # the nearest whole object differs: color is a stand-in
     assert red.matched
     seen = by_color.query("red").regions[0]
     assert np.linalg.norm(red.regions[0].centroid - seen.centroid) < 0.3

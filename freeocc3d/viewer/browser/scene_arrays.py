@@ -42,6 +42,7 @@ def describe_scene(scan_map: Map, most_gaussians: int | None = None) -> tuple[di
         "title": scan_map.path.resolve().name,
         "capture": Path(scan_map.manifest.capture.path).name,
         "metric": scan_map.metric,
+        "upright": True,
         "T_view_map": scan_map.T_gravity_map.tolist(),
         "keyframes": trajectory.keyframes.tolist(),
         "frames": {"posed": counts.frames_with_pose, "all": counts.frames},
@@ -72,23 +73,33 @@ def _voxels(scan_map: Map) -> tuple[dict[str, Any], Arrays]:
     and edge in units of the smallest edge, from the lowest corner; ``colors`` (V, 3) uint8; ``probability`` (V,) uint8
     / 255; ``hits``, ``seen_through`` (V,) uint16, numbers of depth images."""
     occupancy = scan_map.occupancy
-    low = _lowest(occupancy)
+    voxels, edges = occupancy.occupied_voxels(), occupancy.occupied_edges()
+    meta, arrays = describe_voxels(voxels, edges, _lowest(occupancy), occupancy.origin, occupancy.finest)
     block, local = np.nonzero(occupancy.state == OCCUPIED)
-    arrays: Arrays = {
-        "voxels": _packed(occupancy.occupied_voxels(), occupancy.occupied_edges(), low),
+    return meta, arrays | {
         "colors": occupancy.colors,
         "probability": np.rint(255 * np.clip(occupancy.probability[block, local], 0, 1)).astype(np.uint8),
         "hits": occupancy.hits[block, local],
         "seen_through": occupancy.free[block, local],
     }
-    sizes = sorted({float(occupancy.finest * edge) for edge in np.unique(occupancy.occupied_edges()).tolist()})
+
+
+def describe_voxels(
+    voxels: NDArray[np.int32],
+    edges: NDArray[np.int32],
+    low: NDArray[np.int64],
+    origin: NDArray[np.float64],
+    unit: float,
+) -> tuple[dict[str, Any], Arrays]:
+    """Returns what describes (V, 3) lower corners and (V,) edges, in units, and the array ``voxels`` of them, counted
+    from the corner ``low``. origin: (3,) of corner 0, meters.  unit: meters."""
     meta = {
-        "count": len(occupancy.colors),
-        "origin": (occupancy.origin + low * occupancy.finest).tolist(),
-        "unit": occupancy.finest,
-        "sizes": sizes or [occupancy.finest],
+        "count": len(voxels),
+        "origin": (origin + low * unit).tolist(),
+        "unit": unit,
+        "sizes": [unit * edge for edge in np.unique(edges).tolist()] or [unit],
     }
-    return meta, arrays
+    return meta, {"voxels": _packed(voxels, edges, low)}
 
 
 def _lowest(occupancy: Occupancy) -> NDArray[np.int64]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ...core.errors import FreeOccError
+from .live_map import LiveMap
 from .shown_map import ShownMap
 
 PORT = 8080
@@ -36,7 +37,7 @@ def serve_maps(
 
     from .server import make_app
 
-    maps = [ShownMap(path, live) for path in paths]
+    maps = [LiveMap(path) if live else ShownMap(path) for path in paths]
     local = host in _LOCAL
     token = "" if local else secrets.token_urlsafe(16)
     listening = _listen(host, port)

@@ -25,11 +25,11 @@ _KEPT_ANSWERS = 64
 class ShownMap:
     """A map folder as pages see it. ``version`` changes with its content; each packet states the one it is of.
 
-    All methods are safe on any thread. Raises MapError if the folder is no map when it is opened, or later, while
-    nobody has put a map in its place.
+    All methods are safe on any thread. check: open the folder now. Raises MapError if the folder is no map when it is
+    opened, or later, while nobody has put a map in its place.
     """
 
-    def __init__(self, path: Path, live: bool = False):
+    def __init__(self, path: Path, check: bool = True):
         self.path = path
         self._lock = threading.RLock()
         self._stamp: tuple[int, ...] = ()
@@ -37,7 +37,8 @@ class ShownMap:
         self._packets: dict[str, bytes] = {}
         self._answers: OrderedDict[int, list[Region]] = OrderedDict()
         self._asked = 0
-        self._current()
+        if check:
+            self._current()
 
     @property
     def version(self) -> str:

@@ -18,6 +18,7 @@ from PIL import Image
 
 import freeocc3d
 from freeocc3d.query.scan_map import Map
+from freeocc3d.viewer.browser import notebooks
 from freeocc3d.viewer.browser.single_file import write_whole_page
 
 
@@ -107,6 +108,23 @@ def test_the_page_as_a_file_needs_no_network(browser: Any, room: Map, tmp_path: 
     watched.ask("unheard of")
     assert "This file holds no answer to 'unheard of'" in watched.page.inner_text("#answers")
     watched.context.close()
+
+
+def test_a_cell_of_a_notebook_shows_the_map(
+    browser: Any, room: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded = freeocc3d.load_map(room.path)
+    (tmp_path / "cell.html").write_text(loaded._repr_html_())
+    context = browser.new_context(bypass_csp=True, offline=True)
+    page = context.new_page()
+    page.goto((tmp_path / "cell.html").as_uri())
+    page.frame_locator("iframe").locator("html[data-ready=true]").wait_for()
+    context.close()
+    monkeypatch.setattr(notebooks, "MOST_BYTES", 1000)
+    assert loaded._repr_html_().startswith('<img alt="The map" src="data:image/png;base64,')
+    gone = freeocc3d.load_map(shutil.copytree(room.path, tmp_path / "gone"))
+    shutil.rmtree(gone.path)
+    assert str(gone.path) in gone._repr_html_()
 
 
 def test_a_click_tells_of_a_voxel_and_opens_its_photographs(browser: Any, address: str) -> None:

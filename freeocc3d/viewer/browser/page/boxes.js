@@ -76,7 +76,7 @@ export class FoundBoxes {
 
 /** Lines on the floor, one a meter or a round number of units. */
 export function floorGrid(low, high, dark) {
-  const extent = Math.max(high.x - low.x, high.y - low.y), power = 10 ** Math.floor(Math.log10(extent / 4));
+  const extent = Math.max(high.x - low.x, high.y - low.y, 1e-3), power = 10 ** Math.floor(Math.log10(extent / 4));
   const step = extent <= 60 && extent >= 2 ? 1 : [1, 2, 5, 10].map((k) => k * power).find((each) => extent / each <= 20);
   const [x0, x1, y0, y1] = [
     Math.floor(low.x / step), Math.ceil(high.x / step), Math.floor(low.y / step), Math.ceil(high.y / step),

@@ -40,17 +40,16 @@ class Viewer {
   /** Loads what the map's folder holds now; keeps the camera if the map was shown before. */
   async load() {
     const { meta, arrays } = await this.source.scene();
-    const first = !this.meta;
+    const first = !this.meta?.voxels.count || this.meta.upright !== meta.upright;
     this.meta = meta;
     this.arrays = arrays;
     this.#clear();
     if (!first) this.photograph.hide();
     document.title = `${meta.title} – freeocc3d`;
     byId("title").textContent = meta.title;
-    byId("counts").textContent = `${meta.voxels.count.toLocaleString("en")} voxels of `
+    byId("counts").textContent = meta.live ? `${meta.live}. ${meta.voxels.count.toLocaleString("en")} voxels` : `${meta.voxels.count.toLocaleString("en")} voxels of `
       + `${meta.voxels.sizes.map((size) => this.#round(meta.metric ? 100 * size : size)).join(", ")} ${meta.metric ? "cm" : "units"}, `
-      + `${meta.gaussians.drawn.toLocaleString("en")} Gaussians, ${meta.frames.posed} of ${meta.frames.all} frames`
-      + (meta.live ? `. ${meta.live}` : "");
+      + `${meta.gaussians.drawn.toLocaleString("en")} Gaussians, ${meta.frames.posed} of ${meta.frames.all} frames`;
     this.voxels = new Voxels(arrays.voxels, meta.voxels);
     this.splats = new Splats(arrays);
     this.#place(first);
