@@ -12,8 +12,8 @@ from ... import __version__
 from ..self_contained_pages import make_environment
 
 _SCRIPTS = (
-    "three", "packets", "sources", "drawn_scene", "voxels", "splats", "camera_path", "navigation", "boxes", "panels",
-    "answers", "viewer", "side_by_side",
+    "three", "packets", "sources", "drawn_scene", "voxels", "splats", "colorings", "camera_path", "navigation", "boxes",
+    "panels", "answers", "linked_frames", "viewer", "side_by_side",
 )  # fmt: skip
 """Scripts of ``page/``, NAME.js; ``three`` is three.min.js."""
 

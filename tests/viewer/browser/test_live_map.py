@@ -69,9 +69,16 @@ def test_a_map_is_followed_from_before_its_run_to_its_end(tmp_path: Path, monkey
     monkeypatch.setattr(live_snapshots, "_PAUSE_S", 0.0)
     monkeypatch.setattr(live_snapshots, "_LOOK_S", 0.0)
     monkeypatch.setattr(live_snapshots, "_SHARE", 1.0)
+    shown_one = threading.Semaphore(0)
+
+    def write_and_wait(folder: Path, snapshot: Snapshot) -> None:
+        write_snapshot(folder, snapshot)
+        shown_one.acquire(timeout=20)  # so that each one is seen
+
+    monkeypatch.setattr(live_snapshots, "write_snapshot", write_and_wait)
     path = tmp_path / "map"
-    seen: dict[str, dict[str, Any]] = {}
-    taken: dict[str, Any] = {}
+    seen: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
+    version = ""
     with TestClient(make_app([LiveMap(path)]), base_url="http://localhost") as client:
         assert client.get("/maps").json() == [{"name": "map", "capture": ""}]
         meta, _ = unpack(client.get("/maps/0/scene").content)
@@ -83,19 +90,20 @@ def test_a_map_is_followed_from_before_its_run_to_its_end(tmp_path: Path, monkey
         deadline = time.monotonic() + 120
         while run.is_alive():
             assert time.monotonic() < deadline
-            if client.get("/maps/0/state").json()["version"].startswith("making"):
-                answered = client.get("/maps/0/scene")
-                if answered.status_code == 200:  # else the run has ended meanwhile
-                    meta, arrays = unpack(answered.content)
-                    if "live" in meta:
-                        seen[meta["live"].rsplit(",", 1)[0]], taken = meta, arrays
+            state = client.get("/maps/0/state")
+            now = state.json()["version"] if state.status_code == 200 else version  # 422: the map takes its place
+            if now.startswith("making") and now != version:
+                version = now
+                meta, arrays = unpack(client.get("/maps/0/scene").content)
+                seen[meta["live"].rsplit(",", 1)[0]] = meta, arrays
+                shown_one.release()
         run.join()
         meta, arrays = unpack(client.get("/maps/0/scene").content)
         assert "live" not in meta
         assert client.post("/maps/0/query", json={"words": ["red"]}).status_code == 200
     assert any("poses, frame" in stage for stage in seen)
     assert sorted(each.name for each in path.iterdir() if each.name in (SNAPSHOT, live_snapshot.WATCHED)) == []
-    last = seen["Being made: Gaussians are being fitted; words and voxels follow"]
+    last, taken = seen["Being made: Gaussians are being fitted; words and voxels follow"]
     shown = np.array(last["voxels"]["origin"]) + 0.08 * (taken["voxels"][:, :3] + 0.5)
     final = np.array(meta["voxels"]["origin"]) + 0.08 * (arrays["voxels"][:, :3] + 0.5)
     near = [np.abs(final - point).max(axis=1).min() < 0.13 for point in shown[:: max(1, len(shown) // 300)]]

@@ -4,15 +4,17 @@ import * as THREE from "three";
 import { Answers, splitWords } from "answers";
 import { DraggedBox, FoundBoxes, floorGrid } from "boxes";
 import { CameraPath } from "camera_path";
+import { colorVoxels, describeColors } from "colorings";
 import { DrawnScene } from "drawn_scene";
 import { listenToKeys } from "navigation";
-import { Photograph, byId, say, showFacts, theme, viridis } from "panels";
+import { Photograph, byId, say, showFacts, theme } from "panels";
+import { linkFrame, tellWords } from "linked_frames";
 import { HeldMap, Refusal, ServedMap } from "sources";
 import { Splats } from "splats";
 import { Voxels } from "voxels";
 
 const POLL_MS = 1500, CLICK_PX = 5, NARROW_PX = 760;
-const UNKNOWN = [150, 150, 160], FREE = [90, 170, 220];
+const UNSEEN = [150, 150, 160], FREE = [90, 170, 220];
 
 class Viewer {
   constructor(source, embedded) {
@@ -197,65 +199,14 @@ class Viewer {
     this.scene.changed();
   }
 
-  /** Gives each voxel its color: that of the chosen kind, then those of the answers. */
   #recolor() {
-    const { colors, count } = this.voxels, kind = byId("colors").value, { arrays } = this;
-    const put = (row, [r, g, b]) => {
-      colors[4 * row] = r;
-      colors[4 * row + 1] = g;
-      colors[4 * row + 2] = b;
-      colors[4 * row + 3] = 255;
-    };
-    if (kind === "class" && arrays.classes) {
-      const palette = new Map(this.meta.classes.map((each) => [each.number, each.color]));
-      for (let row = 0; row < count; row += 1) put(row, palette.get(arrays.classes[row]) ?? UNKNOWN);
-    } else if (kind === "height") {
-      const { low, high } = this.scene, table = Array.from({ length: 256 }, (_, k) => viridis(k / 255));
-      const T = this.scene.world.matrixWorld.elements;
-      for (let row = 0; row < count; row += 1) {
-        const [x, y, z] = this.voxels.center(row), height = T[2] * x + T[6] * y + T[10] * z + T[14];
-        put(row, table[Math.round(255 * Math.min(Math.max((height - low.z) / (high.z - low.z), 0), 1))]);
-      }
-    } else if (kind === "evidence" || kind === "score") {
-      const table = Array.from({ length: 256 }, (_, k) => viridis(k / 255)), value = this.#values(kind);
-      for (let row = 0; row < count; row += 1) put(row, table[value(row)]);
-    } else {
-      const { colors: own } = arrays;
-      for (let row = 0; row < count; row += 1) put(row, [own[3 * row], own[3 * row + 1], own[3 * row + 2]]);
-    }
-    if (kind !== "score") {
-      if (this.results.length && byId("fade").checked) this.#fade();
-      for (const { rows, color } of this.regions ?? []) for (const row of rows) put(row, color);
-    }
-    byId("legend").textContent = {
-      evidence: "dark: a few depth images end there; yellow: many", score: this.results.length
-        ? `score of '${this.results[0].word}', dark 0 to yellow 1` : "ask for a word to see its score",
-      height: "dark: low; yellow: high",
-    }[kind] ?? "";
-    this.voxels.recolor();
+    const kind = byId("colors").value;
+    colorVoxels(this.voxels, kind, {
+      arrays: this.arrays, classes: this.meta.classes, scene: this.scene, scores: this.scores,
+      answered: this.results[0], regions: this.regions ?? [], fade: this.results.length > 0 && byId("fade").checked,
+    });
+    byId("legend").textContent = describeColors(kind, this.results[0]);
     this.scene.changed();
-  }
-
-  /** Returns 0…255 for a row: evidence on a logarithmic scale, or the score of the first answer. */
-  #values(kind) {
-    if (kind === "evidence") {
-      const { hits } = this.arrays, most = Math.log1p(hits.reduce((a, b) => Math.max(a, b), 1));
-      return (row) => Math.round((255 * Math.log1p(hits[row])) / most);
-    }
-    if (this.scores) return (row) => this.scores[row];
-    const scores = new Uint8Array(this.voxels.count);
-    for (const { rows, region, result } of this.regions ?? []) {
-      if (result === this.results[0]) for (const row of rows) scores[row] = Math.round(255 * region.score);
-    }
-    return (row) => scores[row];
-  }
-
-  #fade() {
-    const { colors } = this.voxels;
-    for (let at = 0; at < colors.length; at += 4) {
-      const gray = (colors[at] + colors[at + 1] + colors[at + 2]) / 3;
-      for (let k = 0; k < 3; k += 1) colors[at + k] = 0.25 * colors[at + k] + 0.35 * gray + 86;
-    }
   }
 
   #answered({ meta, arrays }) {
@@ -384,7 +335,7 @@ class Viewer {
     };
     this.space = {
       free: made(arrays.free, FREE, { opacity: 1, inset: 0.12 }),
-      unknown: made(arrays.unknown, UNKNOWN, { opacity: 0.35, inset: 0.8 }),
+      unknown: made(arrays.unknown, UNSEEN, { opacity: 0.35, inset: 0.8 }),
     };
     this.#cut();
   }
@@ -401,36 +352,11 @@ class Viewer {
     this.answers.ask();
   }
 
-  #linkCameras() {
-    if (!this.embedded) return;
-    let quiet = true; // until someone uses this frame
-    for (const name of ["pointerdown", "wheel", "keydown"]) addEventListener(name, () => { quiet = false; }, { capture: true });
-    this.scene.controls.addEventListener("change", () => {
-      if (quiet) return;
-      const camera = { position: this.scene.camera.position.toArray(), target: this.scene.controls.target.toArray() };
-      parent.postMessage({ camera }, location.origin);
-    });
-    addEventListener("message", ({ data, origin, source }) => {
-      if (origin !== location.origin || source !== parent) return;
-      quiet = true;
-      if (data.camera) {
-        this.scene.camera.position.fromArray(data.camera.position);
-        this.scene.controls.target.fromArray(data.camera.target);
-        this.scene.controls.update();
-        this.scene.moved();
-      }
-      if (data.words !== undefined) {
-        this.answers.form.elements.words.value = data.words;
-        this.ask(this.answers.question());
-      }
-    });
-  }
-
   #listen() {
     const { answers, scene } = this;
     answers.addEventListener("asked", ({ detail }) => {
       this.ask(detail);
-      if (this.embedded) parent.postMessage({ words: answers.form.elements.words.value }, location.origin);
+      if (this.embedded) tellWords(answers);
     });
     answers.addEventListener("chosen", ({ detail }) => this.#choose(detail));
     for (const id of ["show-voxels", "show-splats", "show-path", "show-grid", "show-free", "show-unknown"]) {
@@ -477,7 +403,7 @@ class Viewer {
         byId("facts").hidden = true;
       },
     });
-    this.#linkCameras();
+    if (this.embedded) linkFrame(scene, answers, () => this.ask(answers.question()));
   }
 
   #center(event) {
