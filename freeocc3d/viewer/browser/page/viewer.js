@@ -164,7 +164,7 @@ class Viewer {
     this.grid = lines;
     this.grid.visible = byId("show-grid").checked;
     this.scene.scene.add(lines);
-    byId("grid-step").textContent = `${this.#round(step)} ${this.meta.metric ? "m" : "units"}`;
+    byId("grid-step").textContent = `${this.#round(step)} ${this.meta.metric ? "m" : step === 1 ? "unit" : "units"}`;
     this.scene.changed();
   }
 
