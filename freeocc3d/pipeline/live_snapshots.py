@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import FreeOccError
 from ..core.transforms import back_project, transform
 from ..core.types import Gaussians, Trajectory
 from ..core.voxel_keys import pack_voxels, unpack_voxels
@@ -45,7 +46,7 @@ class LiveSnapshots:
         self._next = now + _LOOK_S
         if not is_watched(self._folder):
             return
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, FreeOccError):  # who watches must not end the run
             write_snapshot(self._folder, self._take(stage, gaussians))
         took = time.monotonic() - now
         self._next = time.monotonic() + max(_PAUSE_S, took / _SHARE)
