@@ -30,6 +30,7 @@ class Viewer {
     this.photograph = new Photograph();
     this.photograph.panel.addEventListener("hidden", () => this.path?.choose(undefined));
     this.results = [];
+    this.regions = [];
     this.keyframe = 0;
     this.asked = 0;
     this.#listen();
@@ -61,7 +62,8 @@ class Viewer {
     this.space = undefined;
     this.#drawGrid();
     this.#setUp();
-    this.results = [];
+    [this.results, this.regions, this.scores] = [[], [], undefined]; // those of another map have other rows
+    this.found.show([]);
     this.#recolor();
     this.#show();
     this.answers.showClasses(meta.classes);
@@ -203,7 +205,7 @@ class Viewer {
     const kind = byId("colors").value;
     colorVoxels(this.voxels, kind, {
       arrays: this.arrays, classes: this.meta.classes, scene: this.scene, scores: this.scores,
-      answered: this.results[0], regions: this.regions ?? [], fade: this.results.length > 0 && byId("fade").checked,
+      answered: this.results[0], regions: this.regions, fade: this.results.length > 0 && byId("fade").checked,
     });
     byId("legend").textContent = describeColors(kind, this.results[0]);
     this.scene.changed();
@@ -272,7 +274,7 @@ class Viewer {
         + `${arrays.seen_through[row]} see through`],
     ];
     if (name) facts.push(["Class", name.name]);
-    const found = (this.regions ?? []).filter(({ rows }) => rows.includes(row)).map(({ result }) => result.word);
+    const found = this.regions.filter(({ rows }) => rows.includes(row)).map(({ result }) => result.word);
     if (found.length) facts.push(["Found as", found.join(", ")]);
     showFacts("Voxel", facts);
     try {
