@@ -45,7 +45,7 @@ class ShownMap:
         """Names the content of the folder now."""
         with self._lock:
             self._current()
-            return "-".join(map(str, self._stamp))
+            return self._read_version()
 
     @property
     def capture(self) -> str:
@@ -67,12 +67,12 @@ class ShownMap:
         """The packet of an answer, compressed. Its document holds ``answer``, for ``views``. Raises FreeOccError."""
 
         with self._lock:
-            found = self.use(lambda scan_map: find_answers(scan_map, asked))
+            found, version = self.use(lambda scan_map: (find_answers(scan_map, asked), self._read_version()))
             self._asked += 1
             self._answers[self._asked] = found.regions
             while len(self._answers) > _KEPT_ANSWERS:
                 self._answers.popitem(last=False)
-            return compress(found.packet({"version": self.version, "answer": self._asked}))
+            return compress(found.packet({"version": version, "answer": self._asked}))
 
     def views(self, number: int, region: int) -> list[dict[str, Any]] | None:
         """The keyframes that show a region of an answer best; None if that answer is no longer kept."""
@@ -104,10 +104,13 @@ class ShownMap:
             while True:
                 scan_map, stamp = self._current(), self._stamp
                 try:
-                    return work(scan_map)
+                    made = work(scan_map)
                 except MapError:
                     if self._current() is scan_map and self._stamp == stamp:
                         raise
+                else:
+                    if self._current() is scan_map:
+                        return made
 
     def _packet(self, name: str, make: Callable[[Map], bytes]) -> bytes:
         with self._lock:
@@ -124,7 +127,11 @@ class ShownMap:
 
     def _stated(self, described: tuple[dict[str, Any], Arrays]) -> tuple[dict[str, Any], Arrays]:
         meta, arrays = described
-        return {**meta, "version": self.version}, arrays
+        return {**meta, "version": self._read_version()}, arrays
+
+    def _read_version(self) -> str:
+        """Names the content that was read, whatever stands in the folder by now."""
+        return "-".join(map(str, self._stamp))
 
     def _current(self) -> Map:
         """Returns the map that is in the folder now."""

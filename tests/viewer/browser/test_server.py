@@ -17,7 +17,7 @@ from test_packets import unpack
 import freeocc3d
 from freeocc3d.core.errors import FreeOccError, MapError
 from freeocc3d.query.scan_map import Map
-from freeocc3d.viewer.browser import page
+from freeocc3d.viewer.browser import page, shown_map
 from freeocc3d.viewer.browser.server import make_app
 from freeocc3d.viewer.browser.serving import serve_maps
 from freeocc3d.viewer.browser.shown_map import ShownMap
@@ -181,3 +181,24 @@ def test_folders_and_ports_that_cannot_be_used_are_refused(room: Map, tmp_path: 
 def test_packets_are_compressed(client: TestClient) -> None:
     with client.stream("GET", "/maps/0/space") as answered:
         assert unpack(gzip.decompress(b"".join(answered.iter_raw())))[1]["free"].shape[1] == 4
+
+
+def test_a_map_that_is_replaced_while_it_is_packed_is_packed_again(
+    room: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {"capture": {"stop": 4, "color_focal": 1.0, "synthetic": {"width": 160, "height": 120}},
+                "tracking": {"backend": "known"}, "fitting": {"passes": 0}}  # fmt: skip
+    other = freeocc3d.reconstruct("builtin:room", tmp_path / "other", settings)
+    folder = shutil.copytree(room.path, tmp_path / "map")
+    shown, describe = ShownMap(folder), shown_map.describe_scene
+
+    def describe_and_replace(scan_map: Map) -> Any:
+        described = describe(scan_map)
+        if not (tmp_path / "old").exists():
+            folder.rename(tmp_path / "old")
+            shutil.copytree(other.path, folder)
+        return described
+
+    monkeypatch.setattr(shown_map, "describe_scene", describe_and_replace)
+    meta, arrays = unpack(gzip.decompress(shown.scene()))
+    assert (len(arrays["voxels"]), meta["version"]) == (len(other.occupancy.colors), shown.version)
