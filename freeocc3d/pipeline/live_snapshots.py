@@ -39,15 +39,18 @@ class LiveSnapshots:
 
     def offer(self, stage: str, gaussians: Gaussians | None = None) -> None:
         """Write a snapshot if it is time for one. stage: what the run does, in words.  gaussians: shown in place of the
-        keyframes' points. A snapshot that cannot be written is left out."""
+        keyframes' points. A snapshot that cannot be written is left out. Raises OSError of a keyframe that could not
+        be written before, as ``Mapper.add`` does."""
         now = time.monotonic()
         if gaussians is None and now < self._next:
             return
         self._next = now + _LOOK_S
         if not is_watched(self._folder):
             return
-        with contextlib.suppress(OSError, FreeOccError):  # who watches must not end the run
-            write_snapshot(self._folder, self._take(stage, gaussians))
+        with contextlib.suppress(FreeOccError):  # who watches must not end the run
+            taken = self._take(stage, gaussians)
+            with contextlib.suppress(OSError):
+                write_snapshot(self._folder, taken)
         took = time.monotonic() - now
         self._next = time.monotonic() + max(_PAUSE_S, took / _SHARE)
 
@@ -58,9 +61,10 @@ class LiveSnapshots:
             points, colors = self._place(trajectory)
         else:
             points, colors = gaussians.means.astype(np.float64), gaussians.colors
-        voxels, mean = color_voxels(points, colors, size, 1 if gaussians is not None else _LEAST)
+        voxels, mean = color_voxels(points - self._mapper.origin, colors, size, 1 if gaussians is not None else _LEAST)
         return Snapshot(
-            stage, self._mapper.upright is not None, self._find_view(trajectory), size, voxels, mean,
+            stage, self._mapper.upright is not None, self._mapper.tracker.metric, self._find_view(trajectory), size,
+            self._mapper.origin, voxels, mean,
             trajectory.T_world_cam[trajectory.has_pose][:, :3, 3].astype(np.float32),
         )  # fmt: skip
 
@@ -99,7 +103,8 @@ class LiveSnapshots:
 def color_voxels(
     points: NDArray[np.float64], colors: NDArray[np.uint8], size: float, least: int
 ) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
-    """Returns the (V, 3) voxels of edge ``size`` with ``least`` or more of (N, 3) points, and their mean colors."""
+    """Returns the (V, 3) voxels of edge ``size`` from the origin with ``least`` or more of (N, 3) points, and
+    their mean colors."""
     index = np.floor(points / size)
     near = (np.abs(index) < _KEY_LIMIT).all(axis=1)
     keys, voxel, count = np.unique(pack_voxels(index[near].astype(np.int64)), return_inverse=True, return_counts=True)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import read_arrays, write_arrays
+from ..core.errors import MapError
 
 SNAPSHOT, WATCHED = "snapshot.npz", "watched"
 _FRESH_S = 10.0
@@ -26,15 +27,19 @@ class Snapshot:
     """A map in the making.
 
     stage: what the run does, in words.  upright: whether the frame is the map's; else the tracker's.
-    T_view_map: (4, 4) to a frame with z up, as well as it is known.  voxel_size: meters.
-    voxels: (V, 3) int32 indices; voxel (i, j, k) covers [i, i+1) * voxel_size.  colors: (V, 3) uint8.
+    metric: whether lengths are meters; if not, their unit is unknown.
+    T_view_map: (4, 4) to a frame with z up, as well as it is known.
+    voxel_size: meters.  origin: (3,) lower corner of voxel (0, 0, 0), meters.
+    voxels: (V, 3) int32 indices.  colors: (V, 3) uint8.
     path: (P, 3) float32 centers of the cameras so far.
     """
 
     stage: str
     upright: bool
+    metric: bool
     T_view_map: NDArray[np.float64]
     voxel_size: float
+    origin: NDArray[np.float64]
     voxels: NDArray[np.int32]
     colors: NDArray[np.uint8]
     path: NDArray[np.float32]
@@ -50,15 +55,15 @@ def read_snapshot(folder: Path) -> Snapshot | None:
     if not (folder / SNAPSHOT).is_file():
         return None
     expected: dict[str, Any] = {
-        "stage": ("U", ()), "upright": ("b", ()), "T_view_map": ("f", (4, 4)), "voxel_size": ("f", ()),
-        "voxels": ("i", (None, 3)), "colors": ("u", (None, 3)), "path": ("f", (None, 3)),
+        "stage": ("U", ()), "upright": ("b", ()), "metric": ("b", ()), "T_view_map": ("f", (4, 4)),
+        "voxel_size": ("f", ()), "origin": ("f", (3,)), "voxels": ("i", (None, 3)),
+        "colors": ("u", (None, 3)), "path": ("f", (None, 3)),
     }  # fmt: skip
     read: dict[str, Any] = read_arrays(folder / SNAPSHOT, expected, most_bytes=_MOST_BYTES)
-    count = min(len(read["voxels"]), len(read["colors"]))
-    return Snapshot(
-        str(read["stage"]), bool(read["upright"]), read["T_view_map"], float(read["voxel_size"]),
-        read["voxels"][:count], read["colors"][:count], read["path"],
-    )  # fmt: skip
+    same = len(read["voxels"]) == len(read["colors"])
+    if not (same and all(np.isfinite(array).all() for array in read.values() if array.dtype.kind == "f")):
+        raise MapError(f"{folder / SNAPSHOT} is damaged: start 'freeocc3d view' again when the map is done.")
+    return Snapshot(**{name: array if array.ndim else array.item() for name, array in read.items()})
 
 
 def watch(folder: Path) -> None:

@@ -11,22 +11,27 @@ import numpy as np
 from ...core.errors import MapError
 from ...query.scan_map import Map
 from ...storage.live_snapshot import SNAPSHOT, Snapshot, read_snapshot, watch
+from ...storage.output_folder import follow_link
+from ...storage.run_lock import is_running
 from .packets import compress, pack
 from .scene_arrays import Arrays, describe_voxels
 from .shown_map import ShownMap
 
 
 class LiveMap(ShownMap):
-    """A map folder that need not be there yet."""
+    """A map folder that need not be there yet. Raises MapError for a path that no map can have."""
 
     def __init__(self, path: Path):
+        path = follow_link(path if path.name else path.resolve())
+        if not path.name:
+            raise MapError(f"'{path}' cannot be the name of a map folder.")
         super().__init__(path, check=False)
         self._work = path.with_name(path.name + ".partial")
 
     @property
     def version(self) -> str:
         """Names what is shown now; tells the run that somebody watches."""
-        if self._work.is_dir():
+        if is_running(self._work):
             watch(self._work)
             try:
                 return f"making-{(self._work / SNAPSHOT).stat().st_mtime_ns}"
@@ -44,12 +49,12 @@ class LiveMap(ShownMap):
         if not self._in_the_making:
             return super().scene()
         version = self.version
-        snapshot = read_snapshot(self._work) if self._work.is_dir() else None
+        snapshot = read_snapshot(self._work) if is_running(self._work) else None
         return compress(pack(*_describe(self.path.name, version, snapshot)))
 
     @property
     def _in_the_making(self) -> bool:
-        return self._work.is_dir() or not self.path.is_dir()
+        return is_running(self._work) or not self.path.is_dir()
 
     def _current(self) -> Map:
         if self._in_the_making:
@@ -61,11 +66,11 @@ def _describe(name: str, version: str, snapshot: Snapshot | None) -> tuple[dict[
     """Returns document and arrays of a packet as ``describe_scene`` gives them, with what there is."""
     if snapshot is None:
         told = "Waiting for a run to begin" if version == "waiting" else "Waiting for the first picture of the run"
-        snapshot = Snapshot(told, False, np.eye(4), 0.08, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8),
-                            np.zeros((0, 3), np.float32))  # fmt: skip
+        snapshot = Snapshot(told, False, True, np.eye(4), 0.08, np.zeros(3), np.zeros((0, 3), np.int32),
+                            np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.float32))  # fmt: skip
     ones, zeros = np.ones(len(snapshot.voxels), np.int32), np.zeros(len(snapshot.voxels), np.uint16)
     low = snapshot.voxels.min(axis=0).astype(np.int64) if len(ones) else np.zeros(3, np.int64)
-    meta, arrays = describe_voxels(snapshot.voxels, ones, low, np.zeros(3), snapshot.voxel_size)
+    meta, arrays = describe_voxels(snapshot.voxels, ones, low, snapshot.origin, snapshot.voxel_size)
     arrays |= {
         "colors": snapshot.colors, "probability": np.full(len(ones), 255, np.uint8), "hits": zeros,
         "seen_through": zeros, "path": snapshot.path, "T_map_cam": np.zeros((0, 16), np.float32),
@@ -75,8 +80,8 @@ def _describe(name: str, version: str, snapshot: Snapshot | None) -> tuple[dict[
     }  # fmt: skip
     count = len(snapshot.path)
     return {
-        "title": name, "capture": "", "metric": True, "T_view_map": snapshot.T_view_map.tolist(), "keyframes": [],
-        "frames": {"posed": count, "all": count}, "gaussians": {"drawn": 0, "all": 0}, "encoder": "", "voxels": meta,
-        "classes": [], "version": version, "upright": snapshot.upright,
+        "title": name, "capture": "", "metric": snapshot.metric, "T_view_map": snapshot.T_view_map.tolist(),
+        "keyframes": [], "frames": {"posed": count, "all": count}, "gaussians": {"drawn": 0, "all": 0}, "encoder": "",
+        "voxels": meta, "classes": [], "version": version, "upright": snapshot.upright,
         "live": f"{snapshot.stage}, {time.strftime('%H:%M:%S')}",
     }, arrays  # fmt: skip

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
+import json
+import os
+import socket
+import subprocess
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +21,13 @@ from test_packets import unpack
 
 import freeocc3d
 from freeocc3d.core.errors import MapError
+from freeocc3d.core.types import Frame
 from freeocc3d.pipeline import live_snapshots
 from freeocc3d.pipeline.live_snapshots import color_voxels
 from freeocc3d.storage import live_snapshot
+from freeocc3d.storage.keyframes import Keyframes
 from freeocc3d.storage.live_snapshot import SNAPSHOT, Snapshot, is_watched, read_snapshot, watch, write_snapshot
+from freeocc3d.storage.run_lock import LOCK
 from freeocc3d.viewer.browser.live_map import LiveMap
 from freeocc3d.viewer.browser.server import make_app
 
@@ -45,14 +54,17 @@ def test_only_a_fresh_mark_counts_as_watching(tmp_path: Path, monkeypatch: pytes
 
 def test_a_snapshot_is_read_as_written_and_damage_is_told(tmp_path: Path) -> None:
     assert read_snapshot(tmp_path) is None
-    made = Snapshot("Being made", True, np.eye(4), 0.08, np.ones((2, 3), np.int32), np.ones((2, 3), np.uint8),
-                    np.zeros((5, 3), np.float32))  # fmt: skip
+    made = Snapshot("Being made", True, False, np.eye(4), 0.08, np.ones(3), np.ones((2, 3), np.int32),
+                    np.ones((2, 3), np.uint8), np.zeros((5, 3), np.float32))  # fmt: skip
     write_snapshot(tmp_path, made)
     read = read_snapshot(tmp_path)
     assert read is not None
     assert {name: np.array(value).tolist() for name, value in vars(read).items()} == {
         name: np.array(value).tolist() for name, value in vars(made).items()
     }
+    write_snapshot(tmp_path, replace(made, origin=np.full(3, np.nan)))
+    with pytest.raises(MapError, match="is damaged"):
+        read_snapshot(tmp_path)
     (tmp_path / SNAPSHOT).write_bytes((tmp_path / SNAPSHOT).read_bytes()[:99])
     with pytest.raises(MapError, match=SNAPSHOT):
         read_snapshot(tmp_path)
@@ -108,6 +120,46 @@ def test_a_map_is_followed_from_before_its_run_to_its_end(tmp_path: Path, monkey
     final = np.array(meta["voxels"]["origin"]) + 0.08 * (arrays["voxels"][:, :3] + 0.5)
     near = [np.abs(final - point).max(axis=1).min() < 0.13 for point in shown[:: max(1, len(shown) // 300)]]
     assert np.mean(near) > 0.9
+
+
+def test_who_watches_does_not_hide_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("_PAUSE_S", 0.0), ("_LOOK_S", 0.0), ("_SHARE", 1.0)):
+        monkeypatch.setattr(live_snapshots, name, value)
+    monkeypatch.setattr(live_snapshots, "is_watched", lambda folder: True)
+    append, written = Keyframes.append, []
+
+    def fail_third(self: Keyframes, frame: Frame) -> None:
+        written.append(frame.index)
+        if len(written) == 3:
+            raise OSError(errno.ENOSPC, "No space left on device", "keyframe")
+        append(self, frame)
+
+    monkeypatch.setattr(Keyframes, "append", fail_third)
+    with pytest.raises(MapError, match="the disk is full"):
+        freeocc3d.reconstruct("builtin:room", tmp_path / "map", SETTINGS)
+
+
+def test_a_folder_that_a_run_left_does_not_hide_the_map(tmp_path: Path) -> None:
+    made = freeocc3d.reconstruct("builtin:room", tmp_path / "map", SETTINGS)
+    left = tmp_path / "map.partial"
+    left.mkdir()
+    live = LiveMap(made.path)
+    assert "live" not in unpack(gzip.decompress(live.scene()))[0]
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    for said in (b"", b"{", json.dumps({"process": ended.pid, "host": socket.gethostname(), "since": ""}).encode()):
+        (left / LOCK).write_bytes(said)
+        assert not live.version.startswith(("making", "begun")), said
+    assert not (left / live_snapshot.WATCHED).exists()
+    (left / LOCK).write_text(json.dumps({"process": os.getpid(), "host": socket.gethostname(), "since": ""}))
+    assert live.version == "begun"
+
+
+def test_a_path_that_names_nothing_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(MapError, match="cannot be the name of a map folder"):
+        LiveMap(Path("/"))
+    monkeypatch.chdir(tmp_path)
+    assert LiveMap(Path(".")).path == tmp_path.resolve()
 
 
 def test_packets_of_what_is_not_there_yet_hold_every_array(tmp_path: Path) -> None:
